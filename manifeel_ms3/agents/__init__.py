@@ -1,0 +1,1 @@
+from .panda_gelsight import PandaGelSight as PandaGelSight

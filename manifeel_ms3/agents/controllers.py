@@ -1,0 +1,143 @@
+"""Controllers that survive contact: a target pose on a leash, and a gripper that holds what it holds.
+
+The arm follows pose targets that accumulate (precise in the air: a commanded millimetre is a millimetre), but before each
+command the target is pulled back to within a leash of where the tool really is. Contact force is then bounded by leash times
+joint stiffness, whatever the policy asks for, as with a task-space impedance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from mani_skill.agents.controllers import (
+    PDEEPoseController,
+    PDEEPoseControllerConfig,
+    PDJointPosController,
+    PDJointPosControllerConfig,
+)
+from mani_skill.utils import common
+from mani_skill.utils.geometry.rotation_conversions import (
+    axis_angle_to_quaternion,
+    quaternion_invert,
+    quaternion_multiply,
+    quaternion_to_axis_angle,
+)
+from mani_skill.utils.structs import Pose
+
+
+def clamp_norm(vector: torch.Tensor, limit: float) -> torch.Tensor:
+    """Shorten the rows of `vector` (N, D) that are longer than `limit`."""
+    norm = torch.linalg.norm(vector, dim=-1, keepdim=True)
+    return vector * (limit / norm.clamp(min=limit))
+
+
+def rotation_between(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
+    """Rotation vector (N, 3), rad, that turns quaternion `start` into `end` about the axes both are expressed in."""
+    turn = quaternion_multiply(end, quaternion_invert(start))
+    turn = torch.where(turn[:, :1] < 0, -turn, turn)  # the short way round
+    return quaternion_to_axis_angle(turn)
+
+
+class LeashedEEPoseController(PDEEPoseController):
+    """Delta pose control of the tool about the base frame's axes, the target on a leash.
+
+    Action +-1 maps to `pos_upper` metres along and `rot_upper` radians about each axis of the base frame, right-hand rule.
+    """
+
+    config: "LeashedEEPoseControllerConfig"
+
+    def _initialize_action_space(self):
+        rotations = len(self.config.rotation_axes)
+        high = np.r_[np.full(3, self.config.pos_upper), np.full(rotations, self.config.rot_upper)].astype(np.float32)
+        self.single_action_space = spaces.Box(-high, high, dtype=np.float32)
+
+    def _clip_and_scale_action(self, action):
+        # not the stock scaling: that one multiplies rotations by their lower bound, which flips their sign
+        return action.clamp(-1.0, 1.0) * self.action_space_high
+
+    def set_action(self, action):
+        delta = self._preprocess_action(action)
+        turn = delta.new_zeros(len(delta), 3)
+        turn[:, list(self.config.rotation_axes)] = delta[:, 3:]
+        leashed = self._pull_back(self._target_pose, self.ee_pose_at_base)
+        self._target_pose = Pose.create_from_pq(
+            leashed.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), leashed.q)
+        )
+        self.set_drive_targets(self.solve_ik(self._target_pose))
+
+    def _pull_back(self, target: Pose, current: Pose) -> Pose:
+        turn = clamp_norm(rotation_between(current.q, target.q), self.config.leash_rot)
+        return Pose.create_from_pq(
+            current.p + clamp_norm(target.p - current.p, self.config.leash_pos),
+            quaternion_multiply(axis_angle_to_quaternion(turn), current.q),
+        )
+
+    def solve_ik(self, pose: Pose, q0: torch.Tensor | None = None, iterations: int = 1) -> torch.Tensor:
+        """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0`.
+
+        On a GPU this takes `iterations` Levenberg-Marquardt steps; on the CPU Gauss-Newton runs to convergence. Where no
+        solution is found the nearest iterate is returned: a target out of reach must not stop the arm dead.
+        """
+        q0 = self.articulation.get_qpos() if q0 is None else q0
+        if self.kinematics.use_gpu_ik:
+            q = q0.clone()
+            for _ in range(iterations):
+                q[:, self.active_joint_indices] = self.kinematics.compute_ik(
+                    pose, q, solver_config=self.config.delta_solver_config
+                )
+            return q[:, self.active_joint_indices]
+        solver = self.kinematics
+        start = q0[0, solver.pmodel_active_joint_indices].cpu().numpy()
+        # dt = 1 makes the damped iteration Gauss-Newton; the stock 0.1 stops 0.1 mm short
+        solution, _, _ = solver.pmodel.compute_inverse_kinematics(
+            solver.end_link_idx, pose.sp, start, solver.qmask, eps=1e-7, max_iterations=30, dt=1.0
+        )
+        limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
+        q = common.to_tensor(solution[solver.pmodel_controlled_joint_indices], device=self.device).float()
+        return q.clamp(limits[:, 0], limits[:, 1])[None]
+
+    def set_state(self, state: dict):
+        self._target_pose = Pose.create(state["target_pose"])
+
+
+@dataclass
+class LeashedEEPoseControllerConfig(PDEEPoseControllerConfig):
+    pos_lower: float = -0.01
+    pos_upper: float = 0.01
+    """Translation of an action of 1, metres (0.01 in the paper's public code)."""
+    rot_lower: float = -0.05
+    rot_upper: float = 0.05
+    """Rotation of an action of 1, radians (0.05 in the paper's public code)."""
+    rotation_axes: Sequence[int] = (0, 1, 2)
+    """Base-frame axes that have a rotation action; (2,) is yaw alone."""
+    leash_pos: float = 0.006
+    """The target may lead the tool by this much before a command is added, metres: the arm's lag at full speed is 5.8 mm
+    (joint time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact it bounds the force near 16 N."""
+    leash_rot: float = 0.04
+    """The same for rotation, radians."""
+    use_target: bool = True
+    controller_cls = LeashedEEPoseController
+
+
+class HoldGripperController(PDJointPosController):
+    """A gripper with no action that keeps the grip that the robot was reset with.
+
+    The fingers stay position controlled, so that a sideways push on the held object meets their stiffness.
+    """
+
+    config: "HoldGripperControllerConfig"
+
+    def _initialize_action_space(self):
+        nothing = np.empty(0, np.float32)
+        self.single_action_space = spaces.Box(nothing, nothing, dtype=np.float32)
+
+    def set_action(self, action):
+        pass
+
+
+@dataclass
+class HoldGripperControllerConfig(PDJointPosControllerConfig):
+    normalize_action: bool = False
+    controller_cls = HoldGripperController

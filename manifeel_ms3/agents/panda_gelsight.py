@@ -1,0 +1,167 @@
+"""The robot of every ManiFeel task: a Franka Panda with a GelSight R1.5 finger on each side and a wrist camera."""
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.agents.base_agent import BaseAgent, Keyframe
+from mani_skill.agents.controllers import (
+    PDJointPosControllerConfig,
+    PDJointPosMimicControllerConfig,
+    deepcopy_dict,
+)
+from mani_skill.agents.registration import register_agent
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.structs import Pose
+
+from .controllers import HoldGripperControllerConfig, LeashedEEPoseControllerConfig
+from .panda_gelsight_urdf import panda_gelsight_urdf
+
+GEL_STIFFNESS = 16000.0  # N/m per contact point; PhysX averages it with the other body's 0: 8 kN/m acts, 0.6 mm at 20 N on a face
+GEL_FRICTION = 1.0
+HOLD_STIFFNESS = 1.0e4  # N/m: a push of 10 N shifts a held object by 0.5 mm between the two fingers
+WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
+WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
+
+
+@register_agent()
+class PandaGelSight(BaseAgent):
+    """Panda arm, Franka hand, two GelSight R1.5 fingers.
+
+    The gel is a compliant contact: PhysX takes a negative restitution as a spring (N/m per contact point). Pads are the links
+    `gel_left` and `gel_right`; the tool centre point lies between their centres, z along the fingers.
+    """
+
+    uid = "panda_gelsight"
+    urdf_config = dict(
+        _materials=dict(
+            gel=dict(static_friction=GEL_FRICTION, dynamic_friction=GEL_FRICTION, restitution=-GEL_STIFFNESS),
+            housing=dict(static_friction=0.3, dynamic_friction=0.3, restitution=0.0),
+        ),
+        link=dict(
+            gel_left=dict(material="gel", patch_radius=0.01, min_patch_radius=0.01),
+            gel_right=dict(material="gel", patch_radius=0.01, min_patch_radius=0.01),
+            panda_leftfinger=dict(material="housing"),
+            panda_rightfinger=dict(material="housing"),
+        ),
+    )
+    arm_joint_names = [f"panda_joint{i}" for i in range(1, 8)]
+    gripper_joint_names = ["panda_finger_joint1", "panda_finger_joint2"]
+    ee_link_name = "panda_hand_tcp"
+    keyframes = dict(
+        # fingers straight down over (0.5, 0), their tips 150 mm above the table: the paper's start
+        tool_down=Keyframe(
+            qpos=np.array([0.0, -0.2086, 0.0, -2.2905, 0.0, 2.0819, np.pi / 4, 0.04, 0.04]), pose=sapien.Pose()
+        ),
+        rest=Keyframe(
+            qpos=np.array([0.0, np.pi / 8, 0, -np.pi * 5 / 8, 0, np.pi * 3 / 4, np.pi / 4, 0.04, 0.04]),
+            pose=sapien.Pose(),
+        ),
+    )
+
+    mounted_cameras: tuple[str, ...] = ("wrist",)
+
+    @property
+    def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return panda_gelsight_urdf()
+
+    @property
+    def _controller_configs(self):
+        pose = dict(
+            joint_names=self.arm_joint_names,
+            stiffness=1e3,
+            damping=1e2,
+            force_limit=100,
+            ee_link=self.ee_link_name,
+            urdf_path=self.urdf_path,
+        )
+        delta_pose = LeashedEEPoseControllerConfig(**pose)
+        delta_yaw = LeashedEEPoseControllerConfig(**pose, rotation_axes=(2,))
+        gripper = PDJointPosMimicControllerConfig(
+            self.gripper_joint_names,
+            lower=-0.01,  # commands a force on thin objects: 1 kN/m times the distance short of it
+            upper=0.04,
+            stiffness=1e3,
+            damping=1e2,
+            force_limit=40,  # N
+            mimic={"panda_finger_joint2": {"joint": "panda_finger_joint1"}},
+        )
+        hold = HoldGripperControllerConfig(
+            self.gripper_joint_names, None, None, stiffness=HOLD_STIFFNESS, damping=2e2, force_limit=100
+        )
+        joints = PDJointPosControllerConfig(
+            self.arm_joint_names, None, None, stiffness=1e3, damping=1e2, force_limit=100, normalize_action=False
+        )
+        return deepcopy_dict(
+            dict(
+                pd_ee_delta_pose=dict(arm=delta_pose, gripper=gripper),  # 7-D
+                pd_ee_delta_pose_fixed_gripper=dict(arm=delta_pose, gripper=hold),  # 6-D
+                pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper),  # 5-D
+                pd_joint_pos=dict(arm=joints, gripper=gripper),
+            )
+        )
+
+    @property
+    def _sensor_configs(self):
+        if "wrist" not in self.mounted_cameras:
+            return []
+        forward = np.array(WRIST_CAMERA_FORWARD)
+        left = np.array([0.0, 1.0, 0.0])
+        rotation = np.stack([forward, left, np.cross(forward, left)], axis=1)  # SAPIEN cameras: x ahead, y left, z up
+        pose = sapien.Pose(np.block([[rotation, np.c_[list(WRIST_CAMERA_POSITION)]], [np.zeros(3), 1.0]]))
+        return [
+            CameraConfig(
+                "wrist",
+                pose=pose,
+                width=256,
+                height=256,
+                fov=np.deg2rad(75),
+                near=0.005,
+                far=10,
+                mount=self.robot.links_map["panda_hand"],
+            )
+        ]
+
+    def _after_init(self):
+        self.tcp = self.robot.links_map[self.ee_link_name]
+        self.gels = {side: self.robot.links_map[f"gel_{side}"] for side in ("left", "right")}
+        self._gel_indices = [int(gel.index[0]) for gel in self.gels.values()]
+        # joint frame -> pad frame -> right pad's frame; pad frames share y and point against each other in x and z
+        to_pad = [gel.joint._objs[0].pose_in_child.to_transformation_matrix()[:3, :3] for gel in self.gels.values()]
+        rotations = np.stack([np.diag([-1.0, 1.0, -1.0]) @ to_pad[0], to_pad[1]])
+        self._joint_to_hand = torch.as_tensor(rotations, dtype=torch.float32, device=self.device)
+
+    def reset(self, init_qpos: torch.Tensor | None = None, grip_force: float = 0.0):
+        """Put the joints (n, 9) of the environments being reset in place, to stay there.
+
+        `grip_force`, N, is what each finger presses with against what it holds at these joint positions.
+        """
+        super().reset(init_qpos)
+        if init_qpos is not None:
+            targets = init_qpos.clone()
+            targets[:, 7:] -= grip_force / self.controller.controllers["gripper"].config.stiffness
+            self.robot.set_joint_drive_targets(targets, self.robot.active_joints, torch.arange(9, device=self.device))
+
+    def get_proprioception(self):
+        return dict(qpos=self.robot.get_qpos(), qvel=self.robot.get_qvel())  # no controller internals
+
+    @property
+    def tcp_pose_at_base(self) -> Pose:
+        """Tool centre point in the robot's base frame."""
+        return self.robot.pose.inv() * self.tcp.pose
+
+    def solve_ik(self, pose: Pose, q0: torch.Tensor) -> torch.Tensor:
+        """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
+        controller = self.controller.controllers["arm"]
+        return controller.solve_ik(pose, q0, iterations=20)
+
+    @property
+    def pad_joint_forces(self) -> torch.Tensor:
+        """What the engine says of both pads' joints, (N, 2, 6), N and N m, in the joints' frames: cheap to collect."""
+        return self.robot.get_link_incoming_joint_forces()[:, self._gel_indices]
+
+    def held_object_force(self, pad_joint_forces: torch.Tensor) -> torch.Tensor:
+        """Size (...), N, of the force that both pads together exert on what they hold; the world pushes back as much.
+
+        `pad_joint_forces` (..., 2, 6) was collected from the property of that name.
+        """
+        return torch.linalg.norm(torch.einsum("...kj,kij->...i", pad_joint_forces[..., :3], self._joint_to_hand), dim=-1)

@@ -1,0 +1,154 @@
+"""The Panda with two GelSight R1.5 fingers as a URDF, derived from the one that ManiSkill ships.
+
+Arm and hand keep their kinematics, inertia and convex collision shapes. Their visual meshes are decimated (a software
+renderer transforms every vertex, and the packaged arm has 150,000 triangles), the fingers are replaced, and a gel pad hangs on
+each finger by a fixed joint, so that the engine reports the whole wrench on the pad.
+
+Frames (metres). A finger link has its origin 58.4 mm ahead of the hand, x across the finger, z along it towards the tip;
+the gel's face lies in its plane y = 0. A gel link (`gel_left`, `gel_right`) is the pad frame itself: origin at the centre of
+the untouched face, x along image rows (across the finger), y along image columns (towards the tip), z out of the gel.
+"""
+
+import hashlib
+import os
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import fast_simplification
+import numpy as np
+import trimesh
+from mani_skill import PACKAGE_ASSET_DIR
+
+from manifeel_ms3.paths import cache_dir
+
+FINGER_SIZE = (0.030, 0.023, 0.100)  # across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
+GEL_SIZE = (0.024, 0.032, 0.003)  # across, along the finger, thick
+GEL_CENTRE = 0.082  # along the finger: the gel ends 2 mm short of the tip
+HAND_TO_FINGER = 0.0584  # hand frame to finger frame, from the Panda's URDF
+HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
+TRIANGLES_PER_MESH = 1200  # a link's silhouette moves by less than a pixel at 256 x 256
+
+_SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
+_FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
+
+
+def panda_gelsight_urdf() -> str:
+    """Path of the derived URDF; it and the low-poly meshes are made on the first call and cached."""
+    # the key covers everything the files are made from: this module, the package's URDF, and where the package lies
+    recipe = Path(__file__).read_bytes() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
+    folder = cache_dir() / f"panda_gelsight-{hashlib.sha256(recipe).hexdigest()[:12]}"
+    if not (folder / "panda.urdf").is_file():
+        _build_into(folder)
+    return str(folder / "panda.urdf")
+
+
+def _build_into(folder: Path) -> None:
+    """Build in a temporary folder and move it in place, so that processes that start together do no harm."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+        work = Path(scratch) / "new"
+        work.mkdir()
+        tree = ET.parse(_SOURCE / "panda_v2.urdf")
+        _derive(tree.getroot(), work)
+        tree.write(work / "panda.urdf")
+        (work / "panda.srdf").write_bytes((_SOURCE / "panda_v2.srdf").read_bytes())
+        try:
+            os.replace(work, folder)
+        except OSError:
+            if not (folder / "panda.urdf").is_file():  # not another process's finished copy: a real error
+                raise
+
+
+def _derive(robot: ET.Element, work: Path) -> None:
+    for element in list(robot):
+        if "pad" in element.get("name", ""):  # the stock pads are bare frames; the gel links replace them
+            robot.remove(element)
+    for link in robot.iter("link"):
+        name = link.get("name", "")
+        if "finger" in name:
+            _replace_finger(link, side=next(side for side, (finger, _) in _FINGERS.items() if finger == name))
+        for mesh in link.iterfind("visual/geometry/mesh"):
+            low_poly = _decimate(_SOURCE / mesh.attrib["filename"], work)
+            mesh.set("filename", low_poly)
+        for mesh in link.iterfind("collision/geometry/mesh"):
+            mesh.set("filename", str(_SOURCE / mesh.attrib["filename"]))
+    tcp = robot.find("joint[@name='panda_hand_tcp_joint']/origin")
+    assert tcp is not None
+    tcp.set("xyz", f"0 0 {HAND_TO_TCP}")
+    for side, (finger, outward) in _FINGERS.items():
+        robot.extend(_gel(side, finger, outward))
+
+
+def _decimate(source: Path, work: Path) -> str:
+    """Write a decimated copy of a mesh file beside the URDF, materials kept; return its name."""
+    scene = trimesh.load(source, force="scene")
+    parts: list[trimesh.Trimesh] = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    total = sum(len(part.faces) for part in parts)
+    out = trimesh.Scene()
+    for part in parts:
+        budget = max(24, TRIANGLES_PER_MESH * len(part.faces) // total)
+        vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
+        if len(faces) > budget:
+            merged = trimesh.Trimesh(vertices, faces)  # seams of the texture are cracks to the decimator
+            merged.merge_vertices(merge_tex=True, merge_norm=True)
+            vertices, faces = fast_simplification.simplify(
+                np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=budget
+            )
+        material = trimesh.visual.material.PBRMaterial(
+            baseColorFactor=part.visual.material.baseColorFactor, metallicFactor=0.1, roughnessFactor=0.5
+        )
+        # unmerged vertices give flat facets with true normals; smooth shading over big facets looks dented
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        out.add_geometry(trimesh.graph.smooth_shade(mesh, angle=np.deg2rad(35)))
+    name = f"{source.stem}.glb"
+    (work / name).write_bytes(out.export(file_type="glb"))
+    return name
+
+
+def _replace_finger(link: ET.Element, side: str) -> None:
+    for tag in ("visual", "collision", "inertial"):
+        for element in link.findall(tag):
+            link.remove(element)
+    _, outward = _FINGERS[side]
+    across, deep, long = FINGER_SIZE
+    centre = (0.0, outward * (GEL_SIZE[2] + deep / 2), long / 2)
+    _add_box(link, FINGER_SIZE, centre, colour="0.16 0.16 0.18 1")
+    _add_inertia(link, mass=0.08, size=FINGER_SIZE, centre=centre)
+
+
+def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element]:
+    name = f"gel_{side}"
+    link = ET.Element("link", name=name)
+    centre = (0.0, 0.0, -GEL_SIZE[2] / 2)
+    _add_box(link, GEL_SIZE, centre, colour="0.75 0.77 0.8 1")
+    _add_inertia(link, mass=0.01, size=GEL_SIZE, centre=centre)
+    joint = ET.Element("joint", name=f"{name}_joint", type="fixed")
+    ET.SubElement(joint, "parent", link=finger)
+    ET.SubElement(joint, "child", link=name)
+    # columns of the rotation: pad x, y, z in the finger frame; roll +90 deg for z = -y (left), -90 deg for z = +y (right)
+    rpy = f"{np.pi / 2} 0 0" if outward > 0 else f"{np.pi / 2} 0 {np.pi}"
+    ET.SubElement(joint, "origin", xyz=f"0 0 {GEL_CENTRE}", rpy=rpy)
+    return link, joint
+
+
+def _add_box(link: ET.Element, size: tuple, centre: tuple, colour: str) -> None:
+    for tag in ("visual", "collision"):
+        shape = ET.SubElement(link, tag)
+        ET.SubElement(shape, "origin", xyz=_text(centre), rpy="0 0 0")
+        ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_text(size))
+        if tag == "visual":
+            ET.SubElement(ET.SubElement(shape, "material", name=link.get("name", "")), "color", rgba=colour)
+
+
+def _add_inertia(link: ET.Element, mass: float, size: tuple, centre: tuple) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_text(centre), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=str(mass))
+    xx, yy, zz = (mass / 12 * (sum(s * s for s in size) - size[axis] ** 2) for axis in range(3))
+    ET.SubElement(inertial, "inertia", ixx=f"{xx}", iyy=f"{yy}", izz=f"{zz}", ixy="0", ixz="0", iyz="0")
+
+
+def _text(values: tuple) -> str:
+    return " ".join(str(v) for v in values)

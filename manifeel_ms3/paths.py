@@ -1,0 +1,19 @@
+"""Where shipped data lies and where derived assets are cached."""
+
+import os
+from pathlib import Path
+
+import platformdirs
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def data_dir() -> Path:
+    """Folder of the data that ships with the package: `manifeel_ms3/data` in a wheel, `data` in a clone."""
+    packaged = _PACKAGE / "data"
+    return packaged if packaged.is_dir() else _PACKAGE.parent / "data"
+
+
+def cache_dir() -> Path:
+    """Folder of derived assets; the environment variable `MANIFEEL_CACHE_DIR` overrides the user cache."""
+    return Path(os.environ.get("MANIFEEL_CACHE_DIR") or platformdirs.user_cache_dir("manifeel_ms3"))

@@ -1,0 +1,6 @@
+from .config import GelConfig as GelConfig
+from .config import OpticsConfig as OpticsConfig
+from .config import TactileSensorConfig as TactileSensorConfig
+from .config import gelsight_mini as gelsight_mini
+from .config import gelsight_r15 as gelsight_r15
+from .tactile_sensor import TactileSensor as TactileSensor

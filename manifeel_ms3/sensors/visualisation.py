@@ -1,0 +1,31 @@
+"""Pictures of touch for people: videos, reports, `render(mode="sensors")`."""
+
+import cv2
+import numpy as np
+import torch
+
+FULL_SCALE = 0.6  # N per taxel, drawn at full brightness and as an arrow of one taxel pitch
+
+
+def force_field_images(force_field: torch.Tensor, size: tuple[int, int] = (240, 320)) -> torch.Tensor:
+    """Force fields (N, rows, cols, 3), N, as pictures uint8 (N, *size, 3): normal force as colour, shear as arrows."""
+    pictures = [_draw(field, size) for field in force_field.cpu().numpy()]
+    return torch.from_numpy(np.stack(pictures)).to(force_field.device)
+
+
+def _draw(field: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    rows, cols = field.shape[:2]
+    level = np.clip(field[..., 0] / FULL_SCALE, 0, 1)
+    colour = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    picture = cv2.resize(np.ascontiguousarray(colour), (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
+    pitch = np.array([size[0] / rows, size[1] / cols])
+    for i in range(rows):
+        for j in range(cols):
+            arrow = np.clip(field[i, j, 1:] / FULL_SCALE, -2, 2) * pitch
+            if np.hypot(*arrow) < 1:
+                continue
+            start = (np.array([i, j]) + 0.5) * pitch
+            tip = start + arrow
+            ends = [tuple(int(round(v)) for v in point[::-1]) for point in (start, tip)]
+            cv2.arrowedLine(picture, *ends, color=(255, 90, 60), thickness=1, line_type=cv2.LINE_AA, tipLength=0.35)
+    return picture

@@ -1,0 +1,26 @@
+"""The whole wrench on a link, friction included, from the force that its joint carries."""
+
+import torch
+from mani_skill.utils.structs import Articulation, Link
+
+
+class WrenchGauge:
+    """Measures the force and moment of the world on one link, in the link's frame about its origin.
+
+    The engine's spatial force of a joint is what the child link puts through it onto its parent, in the joint's frame. SAPIEN's
+    joint frames are turned against the link's (half a turn about x for fixed joints); contact queries would leave friction out.
+    The link's own weight and inertia are in it, unless its gravity is off, as on ManiSkill's robots.
+    """
+
+    def __init__(self, articulation: Articulation, link: Link):
+        self.articulation = articulation
+        self._index = int(link.index[0])
+        joint = link.joint._objs[0].pose_in_child.to_transformation_matrix()
+        self._rotation = torch.as_tensor(joint[:3, :3].T, dtype=torch.float64, device=articulation.device)
+        self._arm = torch.as_tensor(joint[:3, 3], dtype=torch.float64, device=articulation.device)
+
+    def read(self) -> torch.Tensor:
+        """Wrench (N, 6): force, N, and moment, N m."""
+        spatial = self.articulation.get_link_incoming_joint_forces()[:, self._index].to(torch.float64)
+        force, moment = -spatial[:, :3] @ self._rotation, -spatial[:, 3:] @ self._rotation
+        return torch.cat([force, moment + torch.linalg.cross(self._arm.expand_as(force), force)], dim=1)
