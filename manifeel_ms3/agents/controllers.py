@@ -61,11 +61,16 @@ class LeashedEEPoseController(PDEEPoseController):
         delta = self._preprocess_action(action)
         turn = delta.new_zeros(len(delta), 3)
         turn[:, list(self.config.rotation_axes)] = delta[:, 3:]
-        leashed = self._pull_back(self._target_pose, self.ee_pose_at_base)
+        leashed = self.commanded_pose
         self._target_pose = Pose.create_from_pq(
             leashed.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), leashed.q)
         )
         self.set_drive_targets(self.solve_ik(self._target_pose))
+
+    @property
+    def commanded_pose(self) -> Pose:
+        """Pose (base frame) that the next action counts from: the last target, pulled back to the tool by the leash."""
+        return self._pull_back(self._target_pose, self.ee_pose_at_base)
 
     def _pull_back(self, target: Pose, current: Pose) -> Pose:
         turn = clamp_norm(rotation_between(current.q, target.q), self.config.leash_rot)

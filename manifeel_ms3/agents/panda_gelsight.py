@@ -13,6 +13,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.sensors.wrench import WrenchGauge
+
 from .controllers import HoldGripperControllerConfig, LeashedEEPoseControllerConfig
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
@@ -125,6 +127,7 @@ class PandaGelSight(BaseAgent):
         self.tcp = self.robot.links_map[self.ee_link_name]
         self.gels = {side: self.robot.links_map[f"gel_{side}"] for side in ("left", "right")}
         self._gel_indices = [int(gel.index[0]) for gel in self.gels.values()]
+        self._gauges = {side: WrenchGauge(self.robot, gel) for side, gel in self.gels.items()}
         # joint frame -> pad frame -> right pad's frame; pad frames share y and point against each other in x and z
         to_pad = [gel.joint._objs[0].pose_in_child.to_transformation_matrix()[:3, :3] for gel in self.gels.values()]
         rotations = np.stack([np.diag([-1.0, 1.0, -1.0]) @ to_pad[0], to_pad[1]])
@@ -153,6 +156,10 @@ class PandaGelSight(BaseAgent):
         """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
         controller = self.controller.controllers["arm"]
         return controller.solve_ik(pose, q0, iterations=20)
+
+    def pad_wrench(self, side: str) -> torch.Tensor:
+        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame: the sums of its TacFF."""
+        return self._gauges[side].read()
 
     @property
     def pad_joint_forces(self) -> torch.Tensor:

@@ -65,6 +65,7 @@ class PegInsertionEnv(VisuotactileEnv):
         if fit not in HOLES:
             raise ValueError(f"fit={fit!r} is unknown; choose from {list(HOLES)}")
         self.fit = fit
+        self.hole_size = HOLES[fit]
         super().__init__(*args, **kwargs)
 
     def _load_task(self):

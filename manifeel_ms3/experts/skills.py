@@ -1,0 +1,100 @@
+"""Skills that scripted demonstrators share: moving, pressing, feeling.
+
+A skill is a generator that yields actions and sees the world anew after each. It commands the same controller as a policy
+does, within the same limits, and feels through the pads: the load it acts on is the sum of both force fields.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from manifeel_ms3.tasks import VisuotactileEnv
+
+Actions = Iterator[np.ndarray]
+MOVE_GAIN = 0.4  # share of the remaining way that a step covers: a reach that slows down towards its end, as a hand's does
+TOP_SPEED = 0.008  # m a step; actions reach 0.01
+TOP_TURN = 0.04  # rad a step; actions reach 0.05
+SPEED_UP = 0.002  # m a step more than the step before, at most
+
+
+class Skills:
+    """Motion and feeling of one robot in one environment (`num_envs=1`), in its base frame, m, rad and N."""
+
+    def __init__(self, env: VisuotactileEnv):
+        self.env = env
+        self.agent = env.agent
+        self.arm = env.agent.controller.controllers["arm"]
+        self._scale = np.r_[np.full(3, self.arm.config.pos_upper), np.full(3, self.arm.config.rot_upper)]
+        self._speed = 0.0
+        self._no_load = np.zeros(3)
+
+    # ---------------------------------------------------------------- what is seen and felt
+
+    @property
+    def tool(self) -> tuple[np.ndarray, Rotation]:
+        """Where the tool is."""
+        return _position_rotation(self.agent.tcp_pose_at_base.raw_pose)
+
+    @property
+    def commanded(self) -> tuple[np.ndarray, Rotation]:
+        """Where the next action counts from."""
+        return _position_rotation(self.arm.commanded_pose.raw_pose)
+
+    @property
+    def load(self) -> np.ndarray:
+        """Force (3,) of the world on what the fingers hold, felt by both pads, since `tare`."""
+        return self._raw_load() - self._no_load
+
+    def tare(self) -> None:
+        """Take the present load, the held object's weight, as zero."""
+        self._no_load = self._raw_load()
+
+    def _raw_load(self) -> np.ndarray:
+        total = np.zeros(3)
+        for side, gel in self.agent.gels.items():
+            force = self.agent.pad_wrench(side)[0, :3].cpu().numpy()
+            _, pad = _position_rotation(gel.pose.raw_pose)
+            total += pad.apply(force)
+        return total  # the object passes on to the pads what the world does to it
+
+    # ---------------------------------------------------------------- moving
+
+    def command(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
+        """Action (6,) that puts the controller's target at a pose, or as near as the limits allow."""
+        here, facing = self.commanded
+        twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
+        return np.clip(twist / self._scale, -1.0, 1.0)
+
+    def stride(self, position: np.ndarray, rotation: Rotation, top_speed: float = TOP_SPEED) -> np.ndarray:
+        """Action (6,) of a reach towards a pose: gathers speed, slows down at the end."""
+        here, facing = self.commanded
+        way, turn = position - here, (rotation * facing.inv()).as_rotvec()
+        distance, angle = np.linalg.norm(way), np.linalg.norm(turn)
+        self._speed = min(MOVE_GAIN * distance, top_speed, self._speed + SPEED_UP)
+        pace = self._speed / distance if distance > 1e-9 else 1.0
+        sweep = min(MOVE_GAIN, TOP_TURN / angle) if angle > 1e-9 else 1.0
+        return self.command(here + pace * way, Rotation.from_rotvec(sweep * turn) * facing)
+
+    def reach(self, position: np.ndarray, rotation: Rotation, tolerance: float = 5e-4, steps: int = 80) -> Actions:
+        """Move to a pose through free space."""
+        self._speed = 0.0
+        for _ in range(steps):
+            here, facing = self.tool
+            if np.linalg.norm(position - here) < tolerance and (rotation * facing.inv()).magnitude() < 0.006:
+                return
+            yield self.stride(position, rotation)
+
+    def lower_until_contact(self, rotation: Rotation, lowest: float, threshold: float = 2.0, speed: float = 0.002) -> Actions:
+        """Go straight down until something pushes back, or the tool is at height `lowest`."""
+        while True:
+            here, _ = self.commanded
+            tool, _ = self.tool
+            if self.load[2] > threshold or tool[2] < lowest:
+                return
+            yield self.command(here - [0.0, 0.0, speed], rotation)
+
+
+def _position_rotation(raw_pose) -> tuple[np.ndarray, Rotation]:
+    pose = raw_pose[0].cpu().numpy().astype(np.float64)
+    return pose[:3], Rotation.from_quat(pose[[4, 5, 6, 3]])  # SAPIEN has w first
