@@ -1,5 +1,8 @@
 """Height map to TacRGB: the gel's surface around the contact, and the compact shader as one warp kernel."""
 
+import functools
+from pathlib import Path
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -60,17 +63,9 @@ class Optics:
     def __init__(self, config: TactileSensorConfig, device: torch.device):
         self.config = config
         self.device = device
-        shader = Shader.load(config.optics.calibration)
-        rows, cols = config.image_shape
-        place = place_terms(*np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij"))
-        response = np.zeros((rows, cols, len(KNOTS), FOURIER_TERMS, 3), np.float32)
-        response[:, :, 1:] = np.einsum("ijq,cfkq->ijkfc", place, shader.weights, optimize=True)
-        background = (place @ shader.background.T).astype(np.float32)
-        on = warp_device(device)
-        self._response = wp.array(response, dtype=wp.vec3f, device=on)
-        self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=on)
-        self._background = wp.array(background, dtype=wp.vec3f, device=on)
-        self.background = torch.as_tensor(np.clip(background + 0.5, 0, 255).astype(np.uint8), device=device)
+        self._response, self._background = _shading_maps(config.optics.calibration, config.image_shape, device)
+        self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=self._response.device)
+        self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
         self._skirt_kernels = [_gaussian(sigma / (SKIRT_SCALE * config.pixel_size), device) for sigma in SKIRT_SIGMAS]
         self._smoothing_kernel = _gaussian(config.optics.smoothing, device) if config.optics.smoothing > 0 else None
         self._noise = torch.Generator(device).manual_seed(0)
@@ -115,6 +110,19 @@ class Optics:
             grey = torch.randn(image.shape, generator=self._noise, device=self.device) * self.config.optics.noise
             image = (image + grey).round().clamp(0, 255).to(torch.uint8)
         return image
+
+
+@functools.lru_cache(maxsize=4)
+def _shading_maps(calibration: Path, image_shape: tuple[int, int], device: torch.device) -> tuple[wp.array, wp.array]:
+    """The shader at every pixel: response (H, W, knot, Fourier term) and background (H, W), RGB each."""
+    shader = Shader.load(calibration)
+    rows, cols = image_shape
+    place = place_terms(*np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij"))
+    response = np.zeros((rows, cols, len(KNOTS), FOURIER_TERMS, 3), np.float32)
+    response[:, :, 1:] = np.einsum("ijq,cfkq->ijkfc", place, shader.weights, optimize=True)
+    background = (place @ shader.background.T).astype(np.float32)
+    on = warp_device(device)
+    return wp.array(response, dtype=wp.vec3f, device=on), wp.array(background, dtype=wp.vec3f, device=on)
 
 
 def _gaussian(sigma: float, device: torch.device) -> torch.Tensor:

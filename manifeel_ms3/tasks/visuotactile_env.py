@@ -202,7 +202,11 @@ class VisuotactileEnv(BaseEnv):
     # ---------------------------------------------------------------- episode
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None):
-        options = options or {}
+        """As ManiSkill's. With a seed, on the CPU, the scene is built anew (0.1 s): the engine's solver remembers earlier
+        episodes, and only so is an episode a function of its seed alone, bit for bit."""
+        options = dict(options or {})
+        if seed is not None and self.num_envs == 1:
+            options["reconfigure"] = True
         obs, info = super().reset(seed=seed, options=options)
         if "reset_to_env_states" in options:
             return obs, info
@@ -213,7 +217,7 @@ class VisuotactileEnv(BaseEnv):
         return self._last_obs, info
 
     def _settle(self, env_idx: torch.Tensor) -> None:
-        """Let the grip take its load before the first observation; environments that run on are put back as they were."""
+        """Let the grip take its load before the first observation; environments in mid-episode are put back as they were."""
         others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         others[env_idx] = False
         state = self.get_state_dict() if others.any() else None
@@ -223,10 +227,9 @@ class VisuotactileEnv(BaseEnv):
             self.scene._gpu_fetch_all()
         if state is not None:
             running = others.nonzero()[:, 0]
-            kept = {
-                kind: {k: v[running] for k, v in bodies.items()} for kind, bodies in state.items() if kind != "controller"
-            }
-            self.set_state_dict(kept, running)
+            del state["controller"]
+            state = {kind: {k: v[running] for k, v in bodies.items()} for kind, bodies in state.items()}
+            self.set_state_dict(state, running)
         self._touch_is_fresh = False
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict):

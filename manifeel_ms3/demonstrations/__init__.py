@@ -1,0 +1,2 @@
+from .trajectory_file import DemonstrationError as DemonstrationError
+from .trajectory_file import read_demonstrations as read_demonstrations

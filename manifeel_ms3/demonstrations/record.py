@@ -1,0 +1,213 @@
+"""Record demonstrations: `python -m manifeel_ms3.demonstrations.record ManiFeel-PegInsertion-v1 -n 50 --workers 2`.
+
+Seeds are tried in order until `num` episodes have succeeded; any number of workers gives the same episodes. A run that was
+killed goes on where it stopped when the same command is given again.
+"""
+
+import json
+import logging
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from mani_skill.utils import common
+
+from manifeel_ms3.experts import EXPERTS, make_expert
+from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
+
+from .trajectory_file import (
+    DemonstrationError,
+    Episode,
+    consolidate,
+    episode_folder,
+    finished_episodes,
+    read_header,
+    split,
+    write_episode,
+    write_index,
+)
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Args:
+    env_id: tyro.conf.Positional[str]
+    """task, such as ManiFeel-PegInsertion-v1"""
+    num: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 50
+    """successful episodes wanted"""
+    workers: int = 1
+    """processes"""
+    seed: int = 0
+    """first seed"""
+    out: Path | None = None
+    """trajectory file to write; default data/demos/<task>/trajectory.h5"""
+    obs_mode: str = "rgb+tacrgb+tacff"
+    """what to observe; "none" keeps states and actions alone"""
+    cameras: tuple[str, ...] = CAMERAS
+    """cameras to record"""
+    tactile_sensors: tuple[str, ...] = SIDES
+    """pads to record"""
+    env_kwargs: str = "{}"
+    """further arguments of the task as json, such as '{"fit": "loose", "randomization": {"socket_xy": 0.01}}'"""
+    max_tries: int = field(default=10)
+    """give up when this many times `num` seeds have been tried"""
+
+
+def main(args: Args) -> Path:
+    """Record, and return the file's path."""
+    if args.env_id not in EXPERTS:
+        raise ValueError(f"{args.env_id!r} has no demonstrator; there are ones for {sorted(EXPERTS)}")
+    path = args.out or Path("data/demos") / args.env_id / "trajectory.h5"
+    env_kwargs = _env_kwargs(args)
+    header = _header(args.env_id, env_kwargs)
+    infos, failed = _already_there(path, header)
+    if len(infos) >= args.num:
+        log.info("%s already holds %d episodes", path, len(infos))
+        return path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    context = get_context("spawn")  # a forked renderer does not work
+    with (
+        progress_bar() as bar,
+        ProcessPoolExecutor(args.workers, context, _start_worker, (args.env_id, env_kwargs, path)) as pool,
+    ):
+        task = bar.add_task(f"recording {args.env_id}", total=args.num, completed=len(infos))
+        for seed, info in _episodes(pool, args, infos, failed):
+            if info is None:
+                failed.add(seed)
+            else:
+                infos[seed] = info
+                bar.advance(task)
+            write_index(path, header | dict(failed_seeds=sorted(failed)), dict(sorted(infos.items())))
+    consolidate(path)
+    return path
+
+
+def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[int]):
+    """Results (seed, info or None) as they come; a seed is tried only when all before it cannot make up `num` successes."""
+    pending: dict[Future, int] = {}
+    seed = args.seed
+    while len(infos) < args.num:
+        while len(infos) + len(pending) < args.num:
+            if seed not in infos and seed not in failed:
+                if seed - args.seed >= args.max_tries * args.num:
+                    raise RuntimeError(f"{len(failed)} of {seed - args.seed} seeds failed; the demonstrator does not cope with these arguments")
+                pending[pool.submit(_record_seed, seed)] = seed
+            seed += 1
+        for future in wait(pending, return_when=FIRST_COMPLETED).done:
+            yield pending.pop(future), future.result()
+
+
+def _env_kwargs(args: Args) -> dict[str, Any]:
+    try:
+        extra = json.loads(args.env_kwargs)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"--env-kwargs {args.env_kwargs!r} is not json ({error}); quote it like '{{\"fit\": \"loose\"}}'") from error
+    pictures = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
+    return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | extra
+
+
+def _header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    packages = {name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")}
+    limit = gym.spec(env_id).max_episode_steps
+    return dict(
+        # "module:id" is gymnasium's way to import what registers an id: ManiSkill's tools then know it, too
+        env_info=dict(env_id=f"manifeel_ms3:{env_id}", env_kwargs=env_kwargs, max_episode_steps=limit),
+        source_type="scripted",
+        source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
+        versions=packages,
+    )
+
+
+def _already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
+    """Episodes and failed seeds that an earlier run has left."""
+    if not path.is_file() and not episode_folder(path).is_dir():
+        return {}, set()
+    failed: set[int] = set()
+    if path.is_file():
+        before = read_header(path)
+        if before["env_info"] != header["env_info"]:
+            raise DemonstrationError(
+                f"{path} was recorded with {before['env_info']}, this run asks for {header['env_info']}; give another --out, "
+                "or delete the file"
+            )
+        failed = set(before.get("failed_seeds", []))
+        if not episode_folder(path).is_dir():
+            split(path)
+    return finished_episodes(path), failed
+
+
+# -------------------------------------------------------------------- in the workers
+
+_worker: dict[str, Any] = {}
+
+
+def _start_worker(env_id: str, env_kwargs: dict[str, Any], path: Path) -> None:
+    torch.set_num_threads(1)  # processes share the cores
+    import manifeel_ms3  # noqa: F401
+
+    _worker.update(env_id=env_id, path=path, env=gym.make(env_id, **env_kwargs))
+
+
+def _record_seed(seed: int) -> dict[str, Any] | None:
+    """Record one episode; write it if it succeeded, and return its info, else None."""
+    episode = demonstrate(_worker["env"], _worker["env_id"], seed)
+    if not episode.info["success"]:
+        return None
+    write_episode(_worker["path"], episode)
+    return episode.info | dict(episode_seed=seed)
+
+
+def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
+    """Run the demonstrator through one episode."""
+    base = env.unwrapped
+    obs, _ = env.reset(seed=seed)
+    observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
+    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[])
+    peak = 0.0
+    for action in make_expert(env_id, base, seed).actions():
+        action = action.astype(np.float32)
+        obs, _, terminated, truncated, info = env.step(action)
+        observations.append(common.to_numpy(obs))
+        states.append(common.to_numpy(base.get_state_dict()))
+        flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
+        for name, value in (dict(actions=action) | {k: bool(v) for k, v in flags.items()}).items():
+            steps[name].append(value)
+        peak = max(peak, float(info["contact_force"]))
+        if terminated or truncated:
+            break
+    arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}
+    if observations[0]:
+        arrays["obs"] = _stack(observations)
+    arrays["env_states"] = _stack(states)
+    info = dict(
+        reset_kwargs=dict(seed=seed, options={}),
+        control_mode=base.control_mode,
+        elapsed_steps=len(steps["actions"]),
+        success=steps["success"][-1],
+        fail=steps["fail"][-1],
+        peak_contact_force=round(peak, 3),
+    )
+    return Episode(seed, arrays, info)
+
+
+def _stack(trees: list[dict]) -> dict[str, Any]:
+    """A list over time of trees with arrays (1, ...) as one tree with arrays (T, ...)."""
+    first = trees[0]
+    return {
+        key: _stack([tree[key] for tree in trees]) if isinstance(first[key], dict) else np.concatenate([tree[key] for tree in trees])
+        for key in first
+    }
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    main(tyro.cli(Args))

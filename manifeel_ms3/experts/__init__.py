@@ -1,0 +1,34 @@
+"""Scripted demonstrators, one a task."""
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+import numpy as np
+
+from manifeel_ms3.tasks import VisuotactileEnv
+
+from .peg_insertion import PegInsertionExpert as PegInsertionExpert
+
+
+class Expert(Protocol):
+    """A demonstrator for one episode, made after `env.reset(seed=seed)`."""
+
+    def actions(self) -> Iterator[np.ndarray]:
+        """Actions in [-1, 1], one for every step; the iterator is advanced after the step before has been taken."""
+        ...
+
+
+EXPERTS: dict[str, Callable[[VisuotactileEnv, int], Expert]] = {
+    "ManiFeel-PegInsertion-v1": PegInsertionExpert,  # pyright: ignore[reportAssignmentType]
+}
+
+
+def make_expert(env_id: str, env: VisuotactileEnv, seed: int) -> Expert:
+    """The demonstrator of a task.
+
+    Raises:
+        ValueError: the task has none.
+    """
+    if env_id not in EXPERTS:
+        raise ValueError(f"{env_id!r} has no demonstrator; there are ones for {sorted(EXPERTS)}")
+    return EXPERTS[env_id](env, seed)
