@@ -14,10 +14,17 @@ HOVER = 0.010  # m above the socket
 LEAN = np.deg2rad([5.0, 7.0])  # of the peg while it feels for the hole, about x and y: its lowest corner is (+x, +y)
 CORNER_AIM = (0.0028, 0.0017)  # m inside the hole's (+x, +y) corner, more than the eye may be off
 FEEL_FORCE = 2.5  # N: a wall is felt
+UPRIGHT = np.deg2rad(0.7)
+STAND_UP_TURN = 0.012  # rad a step
+STAND_UP_STEPS = 25
+STAND_UP_PUSH = np.array([0, 0, -5e-4])  # m that the command leads into the hole's corner meanwhile
 PRESS = 0.003  # m that the command leads into a contact: about 8 N
+PRESS_FORCE = 10.0  # N: enough
 GIVE = 1.5e-4  # m/N: how far the hand gives way to a sideways push
 WRIGGLE = 4e-4  # m
 DOWN = np.array([0.0, 0.0, -1.0])
+DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the peg in it: frames with their z down
+CORNER = np.array(PEG_SIZE) / 2 * [1, 1, -1]  # of the peg, that goes ahead
 
 
 class PegInsertionExpert:
@@ -35,9 +42,7 @@ class PegInsertionExpert:
         socket = env.socket.pose.raw_pose[0, :3].cpu().numpy().astype(np.float64)
         self.hole = socket + radius * np.array([np.cos(angle), np.sin(angle), 0.0])  # floor's centre, as seen
         self._misjudged = Rotation.from_euler("y", rng.uniform(-1, 1) * GRASP_ERROR)
-        self.half = np.array(PEG_SIZE) / 2
-        hole_size = env.hole_size
-        self.hole_half = np.array(hole_size) / 2
+        self.hole_half = np.array(env.hole_size) / 2
 
     # ---------------------------------------------------------------- the peg in the hand
 
@@ -49,9 +54,8 @@ class PegInsertionExpert:
     def _tool_for(self, point_on_peg: np.ndarray, place: np.ndarray, lean: Rotation) -> tuple[np.ndarray, Rotation]:
         """Tool pose that puts a point of the peg (its frame, end down) at a place, the peg leaning by `lean`."""
         position, rotation = self._peg_in_tool()
-        upright = Rotation.from_euler("x", np.pi)  # the peg's z points down in the hand
-        facing = lean * upright * rotation.inv()
-        return place - facing.apply(position + rotation.apply(upright.apply(point_on_peg))), facing
+        facing = lean * DOWNWARD * rotation.inv()
+        return place - facing.apply(position + rotation.apply(DOWNWARD.apply(point_on_peg))), facing
 
     # ---------------------------------------------------------------- the demonstration
 
@@ -60,33 +64,31 @@ class PegInsertionExpert:
         skills = self.skills
         yield np.zeros(6)
         skills.tare()
-        corner = np.array([self.half[0], self.half[1], -self.half[2]])
         lean = Rotation.from_euler("xy", [-LEAN[0], LEAN[1]])
         rim = np.array([0.0, 0.0, SOCKET_DEPTH])
         inner = np.array([*(self.hole_half - CORNER_AIM), 0.0])
         over = self.hole + rim + inner
-        yield from skills.reach(*self._tool_for(corner, over + [0, 0, HOVER], lean), tolerance=1e-3)
-        yield from self._touch_down(corner, over, lean)
+        yield from skills.reach(*self._tool_for(CORNER, over + [0, 0, HOVER], lean), tolerance=1e-3)
+        yield from self._touch_down(over, lean)
         yield from self._feel_corner(lean)
         yield from self._stand_up(lean)
         yield from self._press()
 
-    def _corner_height(self, corner: np.ndarray) -> float:
-        """Height of a peg's point above the socket's rim, m."""
+    def _place(self, point_on_peg: np.ndarray) -> np.ndarray:
+        """Where a point of the peg is, going by the hand's pose and the tactile images."""
         position, rotation = self._peg_in_tool()
         tool, facing = self.skills.tool
-        flip = Rotation.from_euler("x", np.pi)
-        return (tool + facing.apply(position + rotation.apply(flip.apply(corner))))[2] - SOCKET_DEPTH
+        return tool + facing.apply(position + rotation.apply(DOWNWARD.apply(point_on_peg)))
 
-    def _touch_down(self, corner: np.ndarray, over: np.ndarray, lean: Rotation) -> Actions:
+    def _touch_down(self, over: np.ndarray, lean: Rotation) -> Actions:
         """Lower the leading corner; where it lands on the rim instead of in the hole, try the next place of a spiral."""
         skills = self.skills
         for ring, angle in [(0.0, 0.0), *((0.0012, a) for a in np.arange(6) * np.pi / 3)]:
             shift = ring * np.array([np.cos(angle), np.sin(angle), 0.0])
-            start, facing = self._tool_for(corner, over + shift + [0, 0, 0.003], lean)
+            start, facing = self._tool_for(CORNER, over + shift + [0, 0, 0.003], lean)
             yield from skills.reach(start, facing, tolerance=1e-3)
             yield from skills.lower_until_contact(facing, lowest=start[2] - 0.006)
-            if self._corner_height(corner) < -0.0004:
+            if self._place(CORNER)[2] < SOCKET_DEPTH - 0.0004:
                 return
 
     def _feel_corner(self, lean: Rotation) -> Actions:
@@ -108,21 +110,25 @@ class PegInsertionExpert:
     def _facing(self, lean: Rotation) -> Rotation:
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
 
-    def _stand_up(self, lean: Rotation, steps: int = 14) -> Actions:
-        """Turn the peg upright about its leading corner, which stays pushed into the hole's corner and down."""
+    def _stand_up(self, lean: Rotation) -> Actions:
+        """Turn the peg upright about its leading corner, which stays lightly pushed into the hole's corner and down."""
         skills = self.skills
-        corner = np.array([self.half[0], self.half[1], -self.half[2]])
-        position, rotation = self._peg_in_tool()
-        tool, facing = skills.tool
-        flip = Rotation.from_euler("x", np.pi)
-        place = tool + facing.apply(position + rotation.apply(flip.apply(corner)))
-        for i in range(1, steps + 1):
-            left = Rotation.from_rotvec(lean.as_rotvec() * (1 - i / steps))
-            target, turned = self._tool_for(corner, place, left)
-            yield skills.command(target + [0.0008, 0.0008, -0.0015], turned)
+        place = self._place(CORNER)
+        for _ in range(STAND_UP_STEPS):
+            if self._tilt() < UPRIGHT:
+                return
+            facing = skills.towards(self._facing(Rotation.identity()), STAND_UP_TURN)
+            position, rotation = self._peg_in_tool()
+            target = place - facing.apply(position + rotation.apply(DOWNWARD.apply(CORNER)))
+            yield skills.command(target + STAND_UP_PUSH, facing)
+
+    def _tilt(self) -> float:
+        """Angle of the peg from upright, rad, going by the hand's pose and the tactile images."""
+        _, facing = self.skills.tool
+        return (self._facing(Rotation.identity()) * facing.inv()).magnitude()
 
     def _press(self) -> Actions:
-        """Press down, giving way to what pushes sideways; where it sticks, ease off and wriggle."""
+        """Press down, giving way to what pushes sideways and to what tilts; where it sticks, ease off and wriggle."""
         skills = self.skills
         stuck, best = 0, np.inf
         for step in range(10_000):
@@ -131,7 +137,8 @@ class PegInsertionExpert:
             stuck = 0 if here[2] < best - 1e-4 else stuck + 1
             best = min(best, here[2])
             aside = np.clip(GIVE * load * [1, 1, 0], -0.001, 0.001)
-            push = PRESS if load[2] < 12.0 else 0.001
+            push = PRESS if load[2] < PRESS_FORCE and self._tilt() < 3 * UPRIGHT else 0.0
             if stuck > 4:
                 aside[:2] += WRIGGLE * np.array([np.cos(1.3 * step), np.sin(1.3 * step)])
-            yield skills.command(here + push * DOWN + aside, self._facing(Rotation.identity()))
+            facing = skills.towards(self._facing(Rotation.identity()), STAND_UP_TURN)
+            yield skills.command(here + push * DOWN + aside, facing)

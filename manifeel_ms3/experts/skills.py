@@ -66,6 +66,12 @@ class Skills:
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
         return np.clip(twist / self._scale, -1.0, 1.0)
 
+    def towards(self, rotation: Rotation, rate: float) -> Rotation:
+        """Orientation of the command, turned towards another by `rate` rad at most."""
+        _, facing = self.commanded
+        way = (rotation * facing.inv()).as_rotvec()
+        return Rotation.from_rotvec(way * min(1.0, rate / max(np.linalg.norm(way), 1e-9))) * facing
+
     def stride(self, position: np.ndarray, rotation: Rotation, top_speed: float = TOP_SPEED) -> np.ndarray:
         """Action (6,) of a reach towards a pose: gathers speed, slows down at the end."""
         here, facing = self.commanded
