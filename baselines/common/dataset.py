@@ -1,0 +1,72 @@
+"""Demonstrations in memory, and sequences of them by index arithmetic."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from manifeel_ms3.demonstrations import read_demonstrations
+from manifeel_ms3.progress import progress_bar
+
+from .observation import ObservationSpec, prepare
+
+
+class SequenceDataset:
+    """All frames of all episodes on one device, images as uint8; a sample is an index into them.
+
+    A sample at step t holds the observations t - obs_horizon + 1 .. t and the actions that begin with the first of them,
+    `pred_horizon` in all. Before the start and after the end, the first and last are repeated.
+
+    Args:
+        files: trajectory files of `env_id`.
+        num_demos: how many episodes to take, over all files; None: all.
+
+    Raises:
+        DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
+    """
+
+    def __init__(
+        self,
+        files: Iterable[Path],
+        env_id: str,
+        spec: ObservationSpec,
+        obs_horizon: int,
+        pred_horizon: int,
+        num_demos: int | None,
+        device: torch.device,
+    ):
+        episodes = []
+        with progress_bar() as bar:
+            for file in files:
+                left = None if num_demos is None else num_demos - len(episodes)
+                if left == 0:
+                    break
+                track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
+                for episode in read_demonstrations(file, spec.keys, env_id, left, track):
+                    prepared = {key: prepare(key, episode[key], spec) for key in spec.keys}
+                    episodes.append(prepared | dict(actions=episode["actions"]))
+        self.spec, self.device, self.num_episodes = spec, device, len(episodes)
+        lengths = np.array([len(episode["actions"]) for episode in episodes])
+        self.actions = self._load([episode["actions"] for episode in episodes])  # (S, A)
+        # the observation after the last action has no action: it is left out, so that frames and actions share an index
+        self.observations = {key: self._load([episode[key][:-1] for episode in episodes]) for key in spec.keys}
+        ends = np.cumsum(lengths)
+        starts = ends - lengths
+        step = np.arange(ends[-1])
+        episode_of = np.repeat(np.arange(len(lengths)), lengths)
+        first, last = starts[episode_of][:, None], ends[episode_of][:, None] - 1
+        begin = step[:, None] - obs_horizon + 1
+        self._obs_index = torch.as_tensor(np.clip(begin + np.arange(obs_horizon), first, last), device=device)
+        self._action_index = torch.as_tensor(np.clip(begin + np.arange(pred_horizon), first, last), device=device)
+
+    def _load(self, parts: list[np.ndarray]) -> torch.Tensor:
+        return torch.as_tensor(np.concatenate(parts), device=self.device)
+
+    def __len__(self) -> int:
+        return len(self._obs_index)
+
+    def sample(self, index: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """Observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) at sample numbers `index` (B,)."""
+        obs_index = self._obs_index[index]
+        return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]

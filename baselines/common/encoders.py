@@ -1,0 +1,144 @@
+"""Observation encoders: one network per camera, pad and modality, their features joined."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+from transformers import ResNetConfig, ResNetModel
+
+from .observation import POSE, ObservationSpec
+
+POSE_FEATURES = 9
+IMAGE_FEATURES = 64  # per image: 32 key points
+
+
+@dataclass
+class EncoderConfig:
+    image: str = "resnet18"
+    """network of each camera and TacRGB image, by its name in IMAGE_ENCODERS"""
+    force_field: str = "resnet18"
+    """network of each TacFF field, by its name in FIELD_ENCODERS"""
+    crop: int = 0
+    """random crops of this size in training, the middle in evaluation; 0: whole images"""
+
+
+class SpatialSoftmax(nn.Module):
+    """Expected image coordinates of `points` learned features (Levine et al. 2016): (B, C, H, W) -> (B, 2 points)."""
+
+    def __init__(self, channels: int, points: int = IMAGE_FEATURES // 2):
+        super().__init__()
+        self.score = nn.Conv2d(channels, points, 1)
+
+    def forward(self, features: torch.Tensor) -> torch.Tensor:
+        heat = self.score(features)
+        weight = heat.flatten(2).softmax(-1).view_as(heat)
+        y, x = (torch.linspace(-1, 1, n, device=heat.device) for n in heat.shape[2:])
+        return torch.cat([(weight.sum(2) * x).sum(-1), (weight.sum(3) * y).sum(-1)], dim=1)
+
+
+class ResNet18(nn.Module):
+    """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy (EMA and batch statistics do not go together)."""
+
+    def __init__(self):
+        super().__init__()
+        config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", hidden_sizes=[64, 128, 256, 512], embedding_size=64)
+        self.net = _with_group_norm(ResNetModel(config))
+        self.out_channels = 512
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return self.net(image).last_hidden_state
+
+
+def _with_group_norm(module: nn.Module) -> nn.Module:
+    for name, child in module.named_children():
+        if isinstance(child, nn.BatchNorm2d):
+            setattr(module, name, nn.GroupNorm(child.num_features // 16, child.num_features))
+        else:
+            _with_group_norm(child)
+    return module
+
+
+class SmallCNN(nn.Sequential):
+    """Four convolutions: a small image network for a CPU, stride 4 in all, so that key points stay sharp."""
+
+    def __init__(self):
+        super().__init__(
+            *_conv(3, 24, kernel=5, stride=2), *_conv(24, 48, stride=2), *_conv(48, 48), *_conv(48, 64)
+        )
+        self.out_channels = 64
+
+
+def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> list[nn.Module]:
+    return [nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
+
+
+class SmallFieldNet(nn.Module):
+    """A force field's 10 x 14 taxels through two convolutions, then all of them at once: its places carry meaning."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Sequential(
+            *_conv(3, 32), *_conv(32, 32, stride=2), nn.Flatten(), nn.Linear(32 * 5 * 7, IMAGE_FEATURES), nn.SiLU()
+        )
+
+    def forward(self, field: torch.Tensor) -> torch.Tensor:
+        return self.net(field)
+
+
+def _key_points(backbone: nn.Module) -> nn.Module:
+    return nn.Sequential(backbone, SpatialSoftmax(backbone.out_channels))
+
+
+IMAGE_ENCODERS: dict[str, Callable[[], nn.Module]] = {
+    "resnet18": lambda: _key_points(ResNet18()),
+    "small_cnn": lambda: _key_points(SmallCNN()),
+}
+FIELD_ENCODERS: dict[str, Callable[[], nn.Module]] = {
+    "resnet18": lambda: _key_points(ResNet18()),  # the paper's: the field as a small image
+    "small": SmallFieldNet,
+}
+
+
+class ObservationEncoder(nn.Module):
+    """Features (B, obs_horizon * F) of a window of observations; networks are shared over time, not over sensors.
+
+    Raises:
+        ValueError: an encoder's name is unknown.
+    """
+
+    def __init__(self, config: EncoderConfig, spec: ObservationSpec, obs_horizon: int):
+        super().__init__()
+        for name, table in ((config.image, IMAGE_ENCODERS), (config.force_field, FIELD_ENCODERS)):
+            if name not in table:
+                raise ValueError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
+        self.crop, self.spec = config.crop, spec
+        self.images = nn.ModuleList(IMAGE_ENCODERS[config.image]() for _ in spec.images)
+        self.fields = nn.ModuleList(FIELD_ENCODERS[config.force_field]() for _ in spec.force_fields)
+        per_step = IMAGE_FEATURES * (len(self.images) + len(self.fields)) + POSE_FEATURES
+        self.out_features = obs_horizon * per_step
+
+    def forward(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
+        """`obs`: {key: (B, obs_horizon, ...)}: images uint8, the rest normalised floats."""
+        batch, horizon = obs[POSE].shape[:2]
+        features = [obs[POSE].flatten(0, 1)]
+        for key, net in zip(self.spec.images, self.images, strict=True):
+            features.append(net(self._cropped(obs[key]).flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0))
+        for key, net in zip(self.spec.force_fields, self.fields, strict=True):
+            features.append(net(obs[key].flatten(0, 1).movedim(-1, 1)))
+        return torch.cat(features, dim=-1).view(batch, horizon, -1).flatten(1)
+
+    def _cropped(self, images: torch.Tensor) -> torch.Tensor:
+        """Crop (B, T, H, W, 3): in training at random, the same over a window's time; else the middle."""
+        size = images.shape[2]
+        if not 0 < self.crop < size:
+            return images
+        free = size - self.crop
+        if not self.training:
+            return images[:, :, free // 2 : free // 2 + self.crop, free // 2 : free // 2 + self.crop]
+        batch = torch.arange(len(images), device=images.device)
+        top, left = torch.randint(free + 1, (2, len(images)), device=images.device)
+        span = torch.arange(self.crop, device=images.device)
+        rows, cols = (top[:, None] + span)[:, :, None], (left[:, None] + span)[:, None, :]
+        return images.movedim(1, 3)[batch[:, None, None], rows, cols].movedim(3, 1)

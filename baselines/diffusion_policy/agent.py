@@ -1,0 +1,77 @@
+"""A trained Diffusion Policy as evaluation wants it: an environment's observations in, one action out."""
+
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from mani_skill.utils import common
+
+from baselines.common.checkpoint import CheckpointError, load_weights, read_config, read_tensors
+from baselines.common.encoders import EncoderConfig
+from baselines.common.observation import ObservationSpec, observation_spec, prepare
+
+from .policy import DiffusionPolicy, PolicyConfig
+
+
+def build_policy(config: dict[str, Any]) -> DiffusionPolicy:
+    """The untrained network of a checkpoint's config.
+
+    Raises:
+        CheckpointError: the config is not one of this policy.
+    """
+    try:
+        fields = dict(config["policy"])
+        policy = PolicyConfig(**fields | dict(encoder=EncoderConfig(**fields["encoder"]), channels=tuple(fields["channels"])))
+        return DiffusionPolicy(policy, spec_of(config), config["action_dim"])
+    except (KeyError, TypeError) as error:
+        raise CheckpointError(f"config is not one of a Diffusion Policy ({error!r}); evaluate it with its own script") from error
+
+
+def spec_of(config: dict[str, Any]) -> ObservationSpec:
+    cameras, pads = tuple(config["cameras"]), tuple(config["tactile_sensors"])
+    return observation_spec(config["obs_mode"], cameras, pads, config["image_size"])
+
+
+class DiffusionPolicyAgent:
+    """Carries out `action_horizon` actions of a prediction, then predicts anew from the last `obs_horizon` observations.
+
+    Args:
+        checkpoint: folder with config.json and model.safetensors.
+        inference_steps: denoising steps; None: as trained (DDPM).
+        seed: of the sampled noise; `reset` starts it anew, so that an episode depends on its observations alone.
+    """
+
+    def __init__(self, checkpoint: Path, inference_steps: int | None = None, seed: int = 0, device: str = "cpu"):
+        self.config = read_config(checkpoint)
+        self.policy = build_policy(self.config).to(device).eval()
+        load_weights(self.policy, read_tensors(Path(checkpoint) / "model.safetensors"), checkpoint)
+        self.device, self.seed = torch.device(device), seed
+        self.inference_steps = inference_steps or self.config["inference_steps"]
+        self.reset()
+
+    def reset(self) -> None:
+        self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.policy.config.obs_horizon)
+        self._queue: deque[np.ndarray] = deque()
+        self._generator = torch.Generator(self.device).manual_seed(self.seed)
+
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        """Action (A,) for an environment's observation (`num_envs=1`)."""
+        self._window.append(self._prepared(obs))
+        if not self._queue:
+            window = [self._window[0]] * (self._window.maxlen - len(self._window)) + list(self._window)
+            batch = {
+                key: torch.as_tensor(np.stack([step[key] for step in window])[None], device=self.device) for key in window[0]
+            }
+            self._queue.extend(self.policy.sample(batch, self.inference_steps, self._generator)[0].cpu().numpy())
+        return self._queue.popleft().clip(-1.0, 1.0)
+
+    def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
+        prepared = {}
+        for key in self.policy.spec.keys:
+            value = obs
+            for part in key.split("/"):
+                value = value[part]
+            prepared[key] = prepare(key, common.to_numpy(value), self.policy.spec)[0]
+        return prepared
