@@ -11,11 +11,9 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
-
-
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be used as asked."""
 
 
 def save_checkpoint(
@@ -36,21 +34,6 @@ def save_checkpoint(
     (partial / CONFIG).write_text(json.dumps(config, indent=2))
     shutil.rmtree(folder, ignore_errors=True)
     os.replace(partial, folder)
-
-
-def read_config(folder: Path) -> dict[str, Any]:
-    """A checkpoint's config.
-
-    Raises:
-        CheckpointError: the folder is not a checkpoint.
-    """
-    path = Path(folder) / CONFIG
-    if not path.is_file():
-        raise CheckpointError(f"{folder} is not a checkpoint: it has no {CONFIG}; give a folder like runs/<name>/checkpoints/last")
-    try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise CheckpointError(f"{path} is not json ({error}); the checkpoint is broken, use another") from error
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:

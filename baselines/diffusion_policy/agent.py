@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from mani_skill.utils import common
 
-from baselines.common.checkpoint import CheckpointError, load_weights, read_config, read_tensors
+from baselines.common.checkpoint import load_weights, read_tensors
 from baselines.common.encoders import EncoderConfig
 from baselines.common.observation import ObservationSpec, observation_spec, prepare
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 
 from .policy import DiffusionPolicy, PolicyConfig
 
@@ -44,7 +45,7 @@ class DiffusionPolicyAgent:
     """
 
     def __init__(self, checkpoint: Path, inference_steps: int | None = None, seed: int = 0, device: str = "cpu"):
-        self.config = read_config(checkpoint)
+        self.config = checkpoint_config(checkpoint)
         self.policy = build_policy(self.config).to(device).eval()
         load_weights(self.policy, read_tensors(Path(checkpoint) / "model.safetensors"), checkpoint)
         self.device, self.seed = torch.device(device), seed

@@ -19,11 +19,12 @@ from diffusers.optimization import get_scheduler
 from diffusers.training_utils import EMAModel
 from torch.utils.tensorboard import SummaryWriter
 
-from baselines.common.checkpoint import as_json, pack, read_config, read_tensors, require_same_config, save_checkpoint, unpack
+from baselines.common.checkpoint import as_json, pack, read_tensors, require_same_config, save_checkpoint, unpack
 from baselines.common.dataset import SequenceDataset
 from baselines.common.encoders import EncoderConfig
 from baselines.diffusion_policy.agent import spec_of
 from baselines.diffusion_policy.policy import DiffusionPolicy, PolicyConfig
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.progress import progress_bar
 
 
@@ -114,7 +115,7 @@ def main(args: Args) -> Path:
     optimizer = torch.optim.AdamW(policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay)
     start = 0
     if args.resume:
-        saved = read_config(last)
+        saved = checkpoint_config(last)
         require_same_config(saved, config, FREE_ON_RESUME, last)
         unpack(read_tensors(last / "training.safetensors"), optimizer, policy, last)
         start = saved["step"]

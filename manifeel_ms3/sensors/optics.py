@@ -12,8 +12,9 @@ from .config import TactileSensorConfig
 from .shader import FOURIER_TERMS, KNOTS, Shader, place_terms
 from .warp_device import warp_device
 
-SKIRT_SCALE = 4  # the free surface is smooth: it is computed on cells of 4 x 4 pixels
-SKIRT_SIGMAS = (0.9e-3, 0.46e-3, 0.24e-3)  # m; Taxim's Gaussian pyramid (its larger kernels at 0.0295 mm per pixel)
+SKIRT_SCALE = 4  # coarse cells are 4 x 4 pixels
+WIDE_SIGMAS = (0.9e-3, 0.46e-3)  # m; these three are the larger kernels of Taxim's pyramid at its 0.0295 mm per pixel
+NARROW_SIGMA = 0.24e-3  # m
 SEGMENTS = len(KNOTS) - 1
 
 
@@ -66,7 +67,8 @@ class Optics:
         self._response, self._background = _shading_maps(config.optics.calibration, config.image_shape, device)
         self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=self._response.device)
         self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
-        self._skirt_kernels = [_gaussian(sigma / (SKIRT_SCALE * config.pixel_size), device) for sigma in SKIRT_SIGMAS]
+        self._wide_kernels = [_gaussian(sigma / (SKIRT_SCALE * config.pixel_size), device) for sigma in WIDE_SIGMAS]
+        self._narrow_kernel = _gaussian(NARROW_SIGMA / config.pixel_size, device)
         self._smoothing_kernel = _gaussian(config.optics.smoothing, device) if config.optics.smoothing > 0 else None
         self._noise = torch.Generator(device).manual_seed(0)
 
@@ -77,18 +79,20 @@ class Optics:
     def surface(self, penetration: torch.Tensor) -> torch.Tensor:
         """Gel surface (N, H, W), m into the gel, around an object that sits `penetration` (N, H, W), m, in it.
 
-        In contact the gel follows the object; around it, it rises back in a skirt, by blurs from coarse to fine, each
-        followed by putting the contact back.
+        In contact the gel follows the object; around it, it rises back in a skirt, by blurs from wide to narrow, after each of
+        which the object pushes the gel down to where it is itself (after Taxim's pyramid; by the maximum, so that the rim of a
+        shallow contact hangs in the skirt of the deep). The wide blurs are smooth: they are computed on coarse cells.
         """
-        coarse = F.max_pool2d(penetration[:, None], SKIRT_SCALE)
+        coarse = F.avg_pool2d(penetration[:, None], SKIRT_SCALE)
         skirt = coarse
-        for kernel in self._skirt_kernels:
-            skirt = torch.where(coarse > 0, coarse, _blur(skirt, kernel))
-        skirt = F.interpolate(skirt, size=penetration.shape[1:], mode="bilinear", align_corners=False)[:, 0]
-        surface = torch.where(penetration > 0, penetration, skirt)
+        for kernel in self._wide_kernels:
+            skirt = torch.maximum(coarse, _blur(skirt, kernel))
+        surface = F.interpolate(skirt, size=penetration.shape[1:], mode="bilinear", align_corners=False)
+        surface = torch.maximum(penetration[:, None], surface)
+        surface = torch.maximum(penetration[:, None], _blur(surface, self._narrow_kernel))
         if self._smoothing_kernel is not None:
-            surface = _blur(surface[:, None], self._smoothing_kernel)[:, 0]
-        return surface
+            surface = _blur(surface, self._smoothing_kernel)
+        return surface[:, 0]
 
     def shade(self, surface: torch.Tensor) -> torch.Tensor:
         """TacRGB uint8 (N, H, W, 3) of a gel surface (N, H, W), m."""

@@ -1,0 +1,45 @@
+# make demo: from an empty machine to a trained visuotactile policy and its report. make test: the whole test suite.
+# Both install what is missing first, and do again only what is out of date.
+SHELL := /bin/bash
+PYTHON := .venv/bin/python
+RUN := runs/demo
+DEMOS := $(RUN)/demos/trajectory.h5
+TASK := ManiFeel-PegInsertion-v1
+# the loose fit, and half ranges that a small network can learn from 60 demonstrations in minutes; the report states them
+TASK_ARGS := {"fit": "loose", "randomization": {"socket_xy": 0.02, "start_xy": 0.03, "start_z": 0.02, "start_rotation": 0.05, "in_hand_pitch": 0.09}}
+READY := .venv/.ready
+
+.PHONY: setup demo test lint types
+setup: $(READY)
+
+$(READY): pyproject.toml scripts/setup.sh
+	scripts/setup.sh
+	touch $@
+
+demo: $(RUN)/report.html
+	@echo "The report: $(abspath $<)"
+
+$(DEMOS): | $(READY)
+	$(PYTHON) -m manifeel_ms3.demonstrations.record $(TASK) -n 60 --workers 2 --out $@ \
+		--obs-mode rgb+tacff --cameras wrist --tactile-sensors right --env-kwargs '$(TASK_ARGS)'
+
+$(RUN)/.trained: | $(DEMOS)
+	$(PYTHON) baselines/diffusion_policy/train.py cpu --demos $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
+		$$(test -f $(RUN)/checkpoints/last/config.json && echo --resume)
+	touch $@
+
+$(RUN)/evaluation.json: $(RUN)/.trained
+	$(PYTHON) -m manifeel_ms3.evaluation.run --checkpoint $(RUN)/checkpoints/last --episodes 10 --workers 2 \
+		--out $@ --env-kwargs '$(TASK_ARGS)'
+
+$(RUN)/report.html: $(RUN)/evaluation.json
+	$(PYTHON) -m manifeel_ms3.evaluation.report --run-dir $(RUN)
+
+test: $(READY)
+	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile
+
+lint: $(READY)
+	.venv/bin/ruff check . && .venv/bin/ruff format --check .
+
+types: $(READY)
+	.venv/bin/pyright

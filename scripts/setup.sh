@@ -1,0 +1,85 @@
+#!/usr/bin/env bash
+# Installs what the project needs on Debian 12 or Ubuntu 22.04/24.04: Vulkan libraries, a virtual environment in .venv, the
+# package with its extras. Safe to run again. Without root it says what is missing and goes on: what needs no picture works.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+TORCH_CPU_VERSION=2.13.0
+TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
+MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
+
+say() { printf '\033[1m%s\033[0m\n' "$*"; }
+has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
+installed() { dpkg-query -W -f='${Status}' "$1" 2>/dev/null | grep -q 'ok installed'; }
+
+as_root() {
+  if [ "$(id -u)" = 0 ]; then "$@"; elif sudo -n true 2>/dev/null; then sudo "$@"; else return 1; fi
+}
+
+new_enough_mesa() {
+  local version
+  version=$(dpkg-query -W -f='${Version}' mesa-vulkan-drivers 2>/dev/null) || return 1
+  dpkg --compare-versions "$version" ge "$MIN_MESA"
+}
+
+add_mesa_source() { # a release of Mesa that is new enough, where the system's own is not
+  . /etc/os-release
+  case "$ID-$VERSION_ID" in
+  debian-12)
+    # the suite's address is that of the machine's own sources
+    local uri
+    uri=$(cat /etc/apt/sources.list /etc/apt/sources.list.d/* 2>/dev/null |
+      awk '/^URIs:/ && /debian/ && !/security/ {print $2; exit} /^deb / && !/security/ {for (i = 2; i <= NF; i++) if ($i ~ /^https?:/) {print $i; exit}}')
+    echo "deb ${uri:-http://deb.debian.org/debian} bookworm-backports main" |
+      as_root tee /etc/apt/sources.list.d/manifeel-backports.list >/dev/null
+    as_root apt-get update -q
+    MESA_RELEASE=(-t bookworm-backports)
+    ;;
+  ubuntu-22.04)
+    as_root apt-get install -y -q software-properties-common
+    as_root add-apt-repository -y ppa:kisak/kisak-mesa
+    as_root apt-get update -q
+    ;;
+  esac
+}
+
+install_system_packages() {
+  local wanted=(libvulkan1 libegl1 libgl1 libglib2.0-0) missing=() MESA_RELEASE=()
+  python3 -c 'import ensurepip, venv' 2>/dev/null || wanted+=(python3-venv)
+  for package in "${wanted[@]}"; do installed "$package" || missing+=("$package"); done
+  local mesa=true
+  has_gpu || new_enough_mesa || mesa=false
+  [ ${#missing[@]} = 0 ] && $mesa && return
+  if ! command -v apt-get >/dev/null || ! as_root true; then
+    say "No root: please have these installed: ${missing[*]} $($mesa || echo "mesa-vulkan-drivers (>= $MIN_MESA)")"
+    say "Until then only what needs no picture works: obs_mode='state' or 'tacff' with render_backend='none'."
+    return
+  fi
+  export DEBIAN_FRONTEND=noninteractive
+  as_root apt-get update -q
+  [ ${#missing[@]} = 0 ] || as_root apt-get install -y -q --no-install-recommends "${missing[@]}"
+  if ! $mesa; then
+    as_root apt-get install -y -q --no-install-recommends mesa-vulkan-drivers || true
+    if ! new_enough_mesa; then
+      add_mesa_source
+      as_root apt-get install -y -q --no-install-recommends "${MESA_RELEASE[@]}" mesa-vulkan-drivers
+    fi
+  fi
+}
+
+install_python_packages() {
+  [ -x .venv/bin/python ] || python3 -m venv .venv
+  local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet)
+  if ! has_gpu && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
+    say "Installing torch for the CPU"
+    "${pip[@]}" "torch==$TORCH_CPU_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" torch
+  fi
+  say "Installing the package and its extras"
+  "${pip[@]}" -e ".[train,report,dev]"
+  # without libGL the opencv that mani-skill brings does not import; the headless one does
+  .venv/bin/python -c 'import cv2' 2>/dev/null || "${pip[@]}" --force-reinstall --no-deps opencv-python-headless
+}
+
+install_system_packages
+install_python_packages
+say "Ready. Renderer: $(.venv/bin/python -c 'from manifeel_ms3.tasks.rendering import available_render_backend as b; print(b())' 2>/dev/null)"

@@ -1,0 +1,142 @@
+"""Gel mechanics against closed forms."""
+
+import math
+
+import pytest
+import torch
+
+from manifeel_ms3.sensors.config import GelConfig
+from manifeel_ms3.sensors.contact import ContactGrid, penetration, solve_indentation, solve_shear, taxel_weights
+
+GEL = GelConfig()
+GRID = ContactGrid.covering(GEL.size, 3.5e-4, torch.device("cpu"))
+K = GEL.normal_stiffness
+
+
+def sphere(radius: float, x: float = 0.0, y: float = 0.0, gap: float = 0.0) -> torch.Tensor:
+    """Height (1, C) of a ball whose lowest point is `gap` above the face at (x, y)."""
+    r2 = (GRID.x - x) ** 2 + (GRID.y - y) ** 2
+    return torch.where(r2 < radius**2, (radius**2 - r2).clamp(min=0).sqrt() - radius - gap, torch.full_like(r2, -5e-3))[None]
+
+
+def wrench(normal: float, x: float = 0.0, y: float = 0.0, fx: float = 0.0, fy: float = 0.0, mz: float = 0.0) -> torch.Tensor:
+    """Wrench (1, 6) of a normal load that acts at (x, y), and of shear."""
+    return torch.tensor([[fx, fy, -normal, -normal * y, normal * x, mz]], dtype=torch.float64)
+
+
+def pressure(height: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
+    plane = solve_indentation(height, load, GRID, K)
+    return penetration(height, plane, GRID.x, GRID.y, GEL.max_penetration) * K * GRID.area
+
+
+@pytest.mark.parametrize("force", [1.0, 3.0, 10.0])
+def test_sphere_on_winkler_layer_sinks_as_the_closed_form(force):
+    radius = 0.02
+    plane = solve_indentation(sphere(radius), wrench(force), GRID, K)
+    depth = plane[0, 0].item()
+    assert math.pi * K * depth**2 * (radius - depth / 3) == pytest.approx(force, rel=5e-3)  # K times the cap's volume
+
+
+@pytest.mark.parametrize("gap", [-1e-3, 0.0, 1e-3])
+def test_depth_follows_the_force_and_not_where_the_engine_has_the_object(gap):
+    field = pressure(sphere(0.01, gap=gap), wrench(5.0))
+    assert torch.allclose(field, pressure(sphere(0.01), wrench(5.0)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (4e-3, -6e-3), (-7e-3, 9e-3)])
+def test_pressure_carries_the_normal_force_where_it_acts(x, y):
+    field = pressure(sphere(0.006, x, y), wrench(3.0, x, y))
+    assert field.sum().item() == pytest.approx(3.0, rel=1e-3)
+    assert (field * GRID.x).sum().item() / 3.0 == pytest.approx(x, abs=2e-4)
+    assert (field * GRID.y).sum().item() / 3.0 == pytest.approx(y, abs=2e-4)
+
+
+def test_moment_tilts_a_flat_object():
+    flat = torch.zeros(1, len(GRID.x), dtype=torch.float64)
+    field = pressure(flat, wrench(10.0, y=1e-3))
+    assert (field * GRID.y).sum().item() / 10.0 == pytest.approx(1e-3, abs=1e-5)
+
+
+def test_untouched_pad_has_no_pressure():
+    assert pressure(sphere(0.01, gap=1e-3), wrench(0.0)).abs().max() == 0
+    assert pressure(sphere(0.01, gap=4e-3), wrench(5.0)).abs().max() == 0  # a force from elsewhere is not put on the gel
+
+
+def shear_of_loads(field: torch.Tensor, loads: list[torch.Tensor]) -> list[torch.Tensor]:
+    bristle, out = torch.zeros(1, field.shape[1], 2, dtype=torch.float64), []
+    for load in loads:
+        q = solve_shear(bristle, field, load, GRID, GEL.shear_stiffness, GEL.friction)
+        bristle = q / (GEL.shear_stiffness * GRID.area)
+        out.append(q)
+    return out
+
+
+@pytest.mark.parametrize("load", [(1.0, 0.0, 0.0), (-2.0, 3.0, 0.0), (0.5, 0.5, 4e-3), (0.0, 0.0, -6e-3)])
+def test_shear_sums_to_the_measured_shear_and_twist(load):
+    fx, fy, mz = load
+    field = pressure(sphere(0.02), wrench(8.0))
+    (q,) = shear_of_loads(field, [wrench(8.0, fx=fx, fy=fy, mz=mz)])
+    assert q[..., 0].sum().item() == pytest.approx(fx, abs=0.01)
+    assert q[..., 1].sum().item() == pytest.approx(fy, abs=0.01)
+    assert (GRID.x * q[..., 1] - GRID.y * q[..., 0]).sum().item() == pytest.approx(mz, abs=4e-5)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 2.0])
+def test_coulombs_cone_is_never_violated(share):
+    field = pressure(sphere(0.02), wrench(8.0))
+    (q,) = shear_of_loads(field, [wrench(8.0, fx=share * 8.0 * GEL.friction)])
+    assert (torch.linalg.norm(q, dim=-1) <= GEL.friction * field + 1e-9).all()
+
+
+@pytest.mark.parametrize("share", [0.12, 0.5, 0.8, 0.95])
+def test_stick_fraction_of_a_pressed_sphere(share):
+    """On a Winkler paraboloid slip starts at the rim: stuck share of the area = sqrt(1 - Q / mu P)."""
+    field = pressure(sphere(0.02), wrench(8.0))
+    (q,) = shear_of_loads(field, [wrench(8.0, fx=share * 8.0 * GEL.friction)])
+    touching = field > 0
+    sticking = touching & (torch.linalg.norm(q, dim=-1) < 0.9999 * GEL.friction * field)
+    assert (sticking.sum() / touching.sum()).item() == pytest.approx(math.sqrt(1 - share), abs=0.02)
+
+
+def test_load_and_unload_dissipate_and_held_load_keeps_its_field():
+    field = pressure(sphere(0.02), wrench(8.0))
+    up = [wrench(8.0, fx=f) for f in (2.0, 4.0, 6.0)]
+    held = [wrench(8.0, fx=6.0)] * 20
+    back = [wrench(8.0, fx=f) for f in (4.0, 2.0, 0.0)]
+    q = shear_of_loads(field, up + held + back)
+    assert torch.allclose(q[2], q[22], atol=1e-6)  # 20 more calls at the same load
+    assert (q[1][..., 0] - q[23][..., 0]).abs().max() > 1e-4  # 4 N on the way back is another field than on the way up
+    assert q[-1][..., 0].abs().max() > 1e-4  # and at no load some stays locked in
+
+
+def test_twist_gives_an_antisymmetric_swirl():
+    field = pressure(sphere(0.02), wrench(8.0))
+    (q,) = shear_of_loads(field, [wrench(8.0, mz=5e-3)])
+    grid = q.view(*GRID.shape, 2)
+    assert torch.allclose(grid, -grid.flip(0, 1), atol=1e-5)
+
+
+def test_lost_contact_forgets_its_shear():
+    field = pressure(sphere(0.02), wrench(8.0))
+    loaded, released = shear_of_loads(field, [wrench(8.0, fx=4.0)])[0], None
+    bristle = loaded / (GEL.shear_stiffness * GRID.area)
+    released = solve_shear(bristle, torch.zeros_like(field), wrench(0.0), GRID, GEL.shear_stiffness, GEL.friction)
+    assert released.abs().max() == 0
+
+
+def test_rows_of_a_batch_are_independent():
+    heights = torch.cat([sphere(r, x) for r, x in ((0.01, 0.0), (0.02, 2e-3), (0.005, -4e-3))])
+    loads = torch.cat([wrench(1.0, fx=0.3), wrench(10.0, 2e-3, fy=-2.0), wrench(0.0)])
+    field = pressure(heights, loads)
+    shear = solve_shear(torch.zeros(*field.shape, 2, dtype=torch.float64), field, loads, GRID, GEL.shear_stiffness, 1.0)
+    for i in range(3):
+        alone = pressure(heights[i : i + 1], loads[i : i + 1])
+        assert torch.allclose(field[i], alone[0], atol=1e-9)
+        q = solve_shear(torch.zeros(*alone.shape, 2, dtype=torch.float64), alone, loads[i : i + 1], GRID, GEL.shear_stiffness, 1.0)
+        assert torch.allclose(shear[i], q[0], atol=1e-9)
+
+
+def test_taxels_own_the_whole_gel():
+    weights = taxel_weights(GRID, (10, 14), 1.634e-3)
+    assert torch.allclose(weights.sum(0), torch.ones(len(GRID.x), dtype=weights.dtype))
+    assert (weights >= 0).all()
