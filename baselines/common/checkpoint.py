@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,7 @@ def save_checkpoint(
     save_file({name: t.contiguous() for name, t in training.items()}, partial / TRAINING)
     (partial / CONFIG).write_text(json.dumps(config, indent=2))
     shutil.rmtree(folder, ignore_errors=True)
-    os.replace(partial, folder)
+    partial.replace(folder)
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -69,7 +68,9 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
     differing = {k: (saved.get(k), v) for k, v in wanted.items() if k not in free and saved.get(k) != v}
     if differing:
         lines = ", ".join(f"{k}: {old!r} there, {new!r} now" for k, (old, new) in differing.items())
-        raise CheckpointError(f"{source} was trained with other settings ({lines}); resume with the same, or choose another --run-dir")
+        raise CheckpointError(
+            f"{source} was trained with other settings ({lines}); resume with the same, or choose another --run-dir"
+        )
 
 
 def pack(optimizer: torch.optim.Optimizer, model: torch.nn.Module) -> dict[str, torch.Tensor]:

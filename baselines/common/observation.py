@@ -61,7 +61,7 @@ def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:
 def pose_features(pose: np.ndarray) -> np.ndarray:
     """Position and first two columns of the rotation matrix (T, 9) of poses (T, 7) with wxyz quaternions.
 
-    q and -q are the same rotation, and so are their features (Zhou et al. 2019, "On the continuity of rotation representations").
+    q and -q are one rotation and have the same features (Zhou et al. 2019, "On the continuity of rotation representations").
     """
     w, x, y, z = (pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)).T
     first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)

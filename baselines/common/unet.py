@@ -1,4 +1,4 @@
-"""The 1-D convolutional U-Net over an action sequence of Diffusion Policy (Chi et al. 2023, section III-A), with FiLM conditioning."""
+"""The 1-D U-Net over an action sequence of Diffusion Policy (Chi et al. 2023, section III-A), conditioned by FiLM."""
 
 import math
 
@@ -75,12 +75,14 @@ class ConditionalUnet1D(nn.Module):
     def forward(self, actions: torch.Tensor, step: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         condition = torch.cat([self.embed(step), condition], dim=-1)
         x, skips = actions.movedim(1, 2), []
-        for first, second, shrink in self.down:
+        for block in self.down:
+            first, second, shrink = block.children()
             x = second(first(x, condition), condition)
             skips.append(x)
             x = shrink(x)
-        for block in self.middle:
-            x = block(x, condition)
-        for first, second, grow in self.up:
+        for residual in self.middle:
+            x = residual(x, condition)
+        for block in self.up:
+            first, second, grow = block.children()
             x = grow(second(first(torch.cat([x, skips.pop()], dim=1), condition), condition))
         return self.out(x).movedim(1, 2)

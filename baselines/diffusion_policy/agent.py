@@ -27,7 +27,9 @@ def build_policy(config: dict[str, Any]) -> DiffusionPolicy:
         policy = PolicyConfig(**fields | dict(encoder=EncoderConfig(**fields["encoder"]), channels=tuple(fields["channels"])))
         return DiffusionPolicy(policy, spec_of(config), config["action_dim"])
     except (KeyError, TypeError) as error:
-        raise CheckpointError(f"config is not one of a Diffusion Policy ({error!r}); evaluate it with its own script") from error
+        raise CheckpointError(
+            f"config is not one of a Diffusion Policy ({error!r}); evaluate it with its own script"
+        ) from error
 
 
 def spec_of(config: dict[str, Any]) -> ObservationSpec:
@@ -61,7 +63,7 @@ class DiffusionPolicyAgent:
         """Action (A,) for an environment's observation (`num_envs=1`)."""
         self._window.append(self._prepared(obs))
         if not self._queue:
-            window = [self._window[0]] * (self._window.maxlen - len(self._window)) + list(self._window)
+            window = [self._window[0]] * (self.policy.config.obs_horizon - len(self._window)) + list(self._window)
             batch = {
                 key: torch.as_tensor(np.stack([step[key] for step in window])[None], device=self.device) for key in window[0]
             }

@@ -28,6 +28,8 @@ class PolicyConfig:
     groups: int = 8
     step_embedding: int = 128
     diffusion_steps: int = 100
+    pose_noise: float = 0.0
+    """standard deviation added to the normalised tool pose in training: a few demonstrations are else told apart by it alone"""
     noise_draws: int = 1
     """noises per observation in a loss; more is cheap where the encoder is the cost"""
 
@@ -54,15 +56,17 @@ class DiffusionPolicy(nn.Module):
             self.obs_normalizers[_name(key)].fit(observations[key])
         self.action_normalizer.fit(actions)
 
-    def condition(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
+    def condition(self, obs: dict[str, torch.Tensor], pose_noise: float = 0.0) -> torch.Tensor:
         """Features (B, C) of observations {key: (B, obs_horizon, ...)}."""
         normalised = {key: self.obs_normalizers[_name(key)].normalize(obs[key]) for key in (POSE, *self.spec.force_fields)}
+        if pose_noise > 0:
+            normalised[POSE] = normalised[POSE] + pose_noise * torch.randn_like(normalised[POSE])
         return self.encoder({**obs, **normalised})
 
     def loss(self, obs: dict[str, torch.Tensor], actions: torch.Tensor) -> torch.Tensor:
         """Mean squared error of the predicted noise; actions (B, pred_horizon, A)."""
         draws = self.config.noise_draws
-        condition = self.condition(obs).repeat_interleave(draws, dim=0)
+        condition = self.condition(obs, self.config.pose_noise).repeat_interleave(draws, dim=0)
         clean = self.action_normalizer.normalize(actions).repeat_interleave(draws, dim=0)
         noise = torch.randn_like(clean)
         step = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)

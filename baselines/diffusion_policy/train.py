@@ -1,7 +1,7 @@
 """Train a Diffusion Policy on demonstrations.
 
-    python baselines/diffusion_policy/train.py paper --demos data/demos/ManiFeel-PegInsertion-v1/trajectory.h5 --obs-mode rgb+tacff
-    python baselines/diffusion_policy/train.py cpu --demos ... --obs-mode rgb+tacff
+    python baselines/diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
+    python baselines/diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
 
 `paper` has the paper's hyperparameters, `cpu` a small network that learns on two cores in minutes.
 """
@@ -74,21 +74,34 @@ PRESETS = {
             demos=(),
             image_size=80,
             policy=PolicyConfig(
-                encoder=EncoderConfig(image="small_cnn", force_field="small", crop=72),
+                obs_horizon=1,  # with two, its own motion tells a policy what to do next, and it stops looking
+                encoder=EncoderConfig(image="small_cnn", force_field="small", crop=76),
                 channels=(64, 128, 256),
                 step_embedding=64,
-                noise_draws=4,
+                pose_noise=0.2,
+                noise_draws=2,
             ),
             inference_steps=16,
-            batch_size=32,
-            steps=3000,
+            batch_size=64,
+            steps=2000,
             lr=5e-4,
             warmup_steps=100,
             save_every=1000,
         ),
     ),
 }
-FREE_ON_RESUME = {"steps", "device", "run_dir", "save_every", "log_every", "resume", "wandb_project", "inference_steps", "step", "demos"}
+FREE_ON_RESUME = {
+    "steps",
+    "device",
+    "run_dir",
+    "save_every",
+    "log_every",
+    "resume",
+    "wandb_project",
+    "inference_steps",
+    "step",
+    "demos",
+}
 
 
 def main(args: Args) -> Path:
@@ -119,9 +132,7 @@ def main(args: Args) -> Path:
         require_same_config(saved, config, FREE_ON_RESUME, last)
         unpack(read_tensors(last / "training.safetensors"), optimizer, policy, last)
         start = saved["step"]
-    schedule = get_scheduler(
-        "cosine", optimizer, num_warmup_steps=args.warmup_steps, num_training_steps=total_steps
-    )
+    schedule = get_scheduler("cosine", optimizer, num_warmup_steps=args.warmup_steps, num_training_steps=total_steps)
     for _ in range(start):
         schedule.step()
     ema = EMAModel(policy.parameters(), args.ema_max_decay, use_ema_warmup=True, power=args.ema_power, inv_gamma=1.0)

@@ -18,7 +18,9 @@ from manifeel_ms3.sensors.wrench import WrenchGauge
 from .controllers import HoldGripperControllerConfig, LeashedEEPoseControllerConfig
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
-GEL_STIFFNESS = 16000.0  # N/m per contact point; PhysX averages it with the other body's 0: 8 kN/m acts, 0.6 mm at 20 N on a face
+GEL_STIFFNESS = (
+    16000.0  # N/m per contact point; PhysX averages it with the other body's 0: 8 kN/m acts, 0.6 mm at 20 N on a face
+)
 GEL_FRICTION = 1.0
 HOLD_STIFFNESS = 1.0e4  # N/m: a push of 10 N shifts a held object by 0.5 mm between the two fingers
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
@@ -51,9 +53,7 @@ class PandaGelSight(BaseAgent):
     ee_link_name = "panda_hand_tcp"
     keyframes = dict(
         # fingers straight down over (0.5, 0), their tips 150 mm above the table: the paper's start
-        tool_down=Keyframe(
-            qpos=np.array([0.0, -0.2086, 0.0, -2.2905, 0.0, 2.0819, np.pi / 4, 0.04, 0.04]), pose=sapien.Pose()
-        ),
+        tool_down=Keyframe(qpos=np.array([0.0, -0.2086, 0.0, -2.2905, 0.0, 2.0819, np.pi / 4, 0.04, 0.04]), pose=sapien.Pose()),
         rest=Keyframe(
             qpos=np.array([0.0, np.pi / 8, 0, -np.pi * 5 / 8, 0, np.pi * 3 / 4, np.pi / 4, 0.04, 0.04]),
             pose=sapien.Pose(),

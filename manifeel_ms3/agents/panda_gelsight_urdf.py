@@ -10,7 +10,6 @@ the untouched face, x along image rows (across the finger), y along image column
 """
 
 import hashlib
-import os
 import tempfile
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -54,7 +53,7 @@ def _build_into(folder: Path) -> None:
         tree.write(work / "panda.urdf")
         (work / "panda.srdf").write_bytes((_SOURCE / "panda_v2.srdf").read_bytes())
         try:
-            os.replace(work, folder)
+            work.replace(folder)
         except OSError:
             if not (folder / "panda.urdf").is_file():  # not another process's finished copy: a real error
                 raise
@@ -92,7 +91,7 @@ def _decimate(source: Path, work: Path) -> str:
         if len(faces) > budget:
             merged = trimesh.Trimesh(vertices, faces)  # seams of the texture are cracks to the decimator
             merged.merge_vertices(merge_tex=True, merge_norm=True)
-            vertices, faces = fast_simplification.simplify(
+            vertices, faces, *_ = fast_simplification.simplify(
                 np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=budget
             )
         material = trimesh.visual.material.PBRMaterial(

@@ -99,7 +99,9 @@ def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[in
         while len(infos) + len(pending) < args.num:
             if seed not in infos and seed not in failed:
                 if seed - args.seed >= args.max_tries * args.num:
-                    raise RuntimeError(f"{len(failed)} of {seed - args.seed} seeds failed; the demonstrator does not cope with these arguments")
+                    raise RuntimeError(
+                        f"{len(failed)} of {seed - args.seed} seeds failed; the demonstrator does not cope with these arguments"
+                    )
                 pending[pool.submit(_record_seed, seed)] = seed
             seed += 1
         for future in wait(pending, return_when=FIRST_COMPLETED).done:
@@ -110,7 +112,9 @@ def _env_kwargs(args: Args) -> dict[str, Any]:
     try:
         extra = json.loads(args.env_kwargs)
     except json.JSONDecodeError as error:
-        raise ValueError(f"--env-kwargs {args.env_kwargs!r} is not json ({error}); quote it like '{{\"fit\": \"loose\"}}'") from error
+        raise ValueError(
+            f'--env-kwargs {args.env_kwargs!r} is not json ({error}); quote it like \'{{"fit": "loose"}}\''
+        ) from error
     pictures = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | extra
 
@@ -203,7 +207,9 @@ def _stack(trees: list[dict]) -> dict[str, Any]:
     """A list over time of trees with arrays (1, ...) as one tree with arrays (T, ...)."""
     first = trees[0]
     return {
-        key: _stack([tree[key] for tree in trees]) if isinstance(first[key], dict) else np.concatenate([tree[key] for tree in trees])
+        key: _stack([tree[key] for tree in trees])
+        if isinstance(first[key], dict)
+        else np.concatenate([tree[key] for tree in trees])
         for key in first
     }
 

@@ -1,4 +1,4 @@
-"""Prove that recorded episodes succeed again from their actions: `python -m manifeel_ms3.demonstrations.replay trajectory.h5`."""
+"""Prove that episodes succeed again from their actions: `python -m manifeel_ms3.demonstrations.replay trajectory.h5`."""
 
 import logging
 import sys
@@ -47,7 +47,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
             group = file[f"traj_{info['episode_id']}"]
             env.reset(**info["reset_kwargs"])
             success = False
-            for action in group["actions"][()]:
+            for action in np.asarray(group["actions"]):
                 *_, outcome = env.step(action)
                 success |= bool(outcome["success"])
             actors = common.to_numpy(env.unwrapped.get_state_dict()["actors"])

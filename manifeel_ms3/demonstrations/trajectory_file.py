@@ -6,7 +6,6 @@ links into them, replaced as a whole after each episode. It opens at any time li
 """
 
 import json
-import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,7 +46,7 @@ def write_episode(path: Path, episode: Episode) -> None:
     partial = folder / f"{name}.h5.partial"
     with h5py.File(partial, "w") as file:
         _write_tree(file.create_group("traj_0", track_order=True), episode.arrays)
-    os.replace(partial, folder / f"{name}.h5")
+    partial.replace(folder / f"{name}.h5")
     write_json(folder / f"{name}.json", episode.info | dict(episode_seed=episode.seed))  # last: it says the rest is there
 
 
@@ -66,7 +65,7 @@ def write_json(path: Path, content: Any) -> None:
     """Write a json file that appears whole or not at all."""
     partial = path.with_name(path.name + ".partial")
     partial.write_text(json.dumps(content, indent=2))
-    os.replace(partial, path)
+    partial.replace(path)
 
 
 def finished_episodes(path: Path) -> dict[int, dict[str, Any]]:
@@ -82,7 +81,7 @@ def write_index(path: Path, header: dict[str, Any], infos: dict[int, dict[str, A
     with h5py.File(partial, "w") as index:
         for i, seed in enumerate(infos):
             index[f"traj_{i}"] = h5py.ExternalLink(f"{folder.name}/seed_{seed:08d}.h5", "traj_0")
-    os.replace(partial, path)
+    partial.replace(path)
     write_json(path.with_suffix(".json"), header | dict(episodes=_numbered(infos)))
 
 
@@ -92,7 +91,7 @@ def consolidate(path: Path) -> None:
     with h5py.File(path, "r") as index, h5py.File(partial, "w") as whole:
         for i in range(len(index)):
             index.copy(index[f"traj_{i}"], whole, f"traj_{i}")
-    os.replace(partial, path)
+    partial.replace(path)
     shutil.rmtree(episode_folder(path), ignore_errors=True)
 
 
@@ -105,7 +104,7 @@ def split(path: Path) -> None:
             folder.mkdir(parents=True, exist_ok=True)
             with h5py.File(folder / f"{name}.h5.partial", "w") as file:
                 whole.copy(f"traj_{i}", file, "traj_0")
-            os.replace(folder / f"{name}.h5.partial", folder / f"{name}.h5")
+            (folder / f"{name}.h5.partial").replace(folder / f"{name}.h5")
             write_json(folder / f"{name}.json", info)
 
 
@@ -130,9 +129,11 @@ def read_header(path: Path) -> dict[str, Any]:
             )
     try:
         header = json.loads(path.with_suffix(".json").read_text())
-        header["env_info"]["env_id"], header["episodes"]  # noqa: B018
+        _ = header["env_info"]["env_id"], header["episodes"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise DemonstrationError(f"{path.with_suffix('.json')} is not a trajectory's json ({error}); record it again") from error
+        raise DemonstrationError(
+            f"{path.with_suffix('.json')} is not a trajectory's json ({error}); record it again"
+        ) from error
     return header
 
 
@@ -170,7 +171,9 @@ def read_demonstrations(
         raise DemonstrationError(f"{path} holds demonstrations of {found}, not of {env_id}; give one recorded for {env_id}")
     count = len(header["episodes"]) if num is None else num
     if not 0 < count <= len(header["episodes"]):
-        raise DemonstrationError(f"{path} holds {len(header['episodes'])} episodes, {count} are wanted; record more, or ask for fewer")
+        raise DemonstrationError(
+            f"{path} holds {len(header['episodes'])} episodes, {count} are wanted; record more, or ask for fewer"
+        )
     with open_trajectories(path) as file:
         return [_read_episode(file, i, keys, path, header) for i in progress(range(count))]
 
@@ -187,4 +190,6 @@ def _read_episode(file: h5py.File, i: int, keys: list[str], path: Path, header: 
             )
         return dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
     except (KeyError, OSError) as error:
-        raise DemonstrationError(f"episode {i} of {path} cannot be read ({error}); the file is truncated: record it again") from error
+        raise DemonstrationError(
+            f"episode {i} of {path} cannot be read ({error}); the file is truncated: record it again"
+        ) from error

@@ -17,7 +17,9 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
     """
     path = Path(checkpoint) / "config.json"
     if not path.is_file():
-        raise CheckpointError(f"{checkpoint} is not a checkpoint: it has no config.json; give a folder like runs/<name>/checkpoints/last")
+        raise CheckpointError(
+            f"{checkpoint} is not a checkpoint: it has no config.json; give a folder like runs/<name>/checkpoints/last"
+        )
     try:
         return json.loads(path.read_text())
     except json.JSONDecodeError as error:

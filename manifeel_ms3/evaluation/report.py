@@ -105,7 +105,11 @@ def training_curve(log_file: Path) -> str:
     entries = [json.loads(line) for line in log_file.read_text().splitlines()]
     figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e["loss"] for e in entries], mode="lines"))
     figure.update_layout(
-        xaxis_title="gradient step", yaxis_title="loss", yaxis_type="log", height=340, margin=dict(l=60, r=20, t=20, b=50)
+        xaxis_title="gradient step",
+        yaxis_title="loss",
+        yaxis_type="log",
+        height=340,
+        margin=dict(l=60, r=20, t=20, b=50),
     )
     return figure.to_html(full_html=False, include_plotlyjs=True)
 

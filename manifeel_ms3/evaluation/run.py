@@ -1,4 +1,4 @@
-"""Evaluate a checkpoint on the fixed evaluation seeds: `python -m manifeel_ms3.evaluation.run --checkpoint runs/x/checkpoints/last`.
+"""Evaluate a checkpoint on fixed seeds: `python -m manifeel_ms3.evaluation.run --checkpoint runs/x/checkpoints/last`.
 
 Writes one json: versions, git commit, the policy's config, the outcome of every episode, success rates with Wilson intervals.
 """
@@ -115,7 +115,9 @@ def _env_kwargs(config: dict[str, Any], extra: str) -> dict[str, Any]:
 
 
 def _git_commit() -> str | None:
-    answer = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False)
+    answer = subprocess.run(
+        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
+    )
     return answer.stdout.strip() or None
 
 

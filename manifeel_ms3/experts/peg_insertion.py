@@ -12,7 +12,7 @@ SIGHT_ERROR = 0.0015  # m: how far off the eye places the hole, about two pixels
 GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the peg's pitch in the hand
 HOVER = 0.010  # m above the socket
 LEAN = np.deg2rad([5.0, 7.0])  # of the peg while it feels for the hole, about x and y: its lowest corner is (+x, +y)
-CORNER_AIM = (0.0028, 0.0017)  # m inside the hole's (+x, +y) corner, more than the eye may be off
+CORNER_AIM = (0.0045, 0.0033)  # m inside the hole's (+x, +y) corner: near its middle, for what the eye may be off
 FEEL_FORCE = 2.5  # N: a wall is felt
 UPRIGHT = np.deg2rad(0.7)
 STAND_UP_TURN = 0.012  # rad a step
@@ -100,11 +100,13 @@ class PegInsertionExpert:
             load = skills.load
             if load[0] < -FEEL_FORCE and load[1] < -FEEL_FORCE:
                 return
-            step = np.array([
-                0.0006 if load[0] > -FEEL_FORCE else 0.0,
-                0.0006 if load[1] > -FEEL_FORCE else 0.0,
-                -0.0006 if load[2] < 3.0 else (0.0006 if load[2] > 6.0 else 0.0),
-            ])
+            step = np.array(
+                [
+                    0.0006 if load[0] > -FEEL_FORCE else 0.0,
+                    0.0006 if load[1] > -FEEL_FORCE else 0.0,
+                    -0.0006 if load[2] < 3.0 else (0.0006 if load[2] > 6.0 else 0.0),
+                ]
+            )
             yield skills.command(here + step, self._facing(lean))
 
     def _facing(self, lean: Rotation) -> Rotation:

@@ -21,7 +21,7 @@ def rectangular_socket(fit: str) -> Part:
     (x, y), (hole_x, hole_y) = SOCKET_OUTER, HOLES[fit]
     wall_x, wall_y = (x - hole_x) / 2, (y - hole_y) / 2
     up = SOCKET_DEPTH / 2
-    walls = [
-        Box((wall_x, y, SOCKET_DEPTH), (side * (hole_x + wall_x) / 2, 0.0, up)) for side in (-1.0, 1.0)
-    ] + [Box((hole_x, wall_y, SOCKET_DEPTH), (0.0, side * (hole_y + wall_y) / 2, up)) for side in (-1.0, 1.0)]
+    walls = [Box((wall_x, y, SOCKET_DEPTH), (side * (hole_x + wall_x) / 2, 0.0, up)) for side in (-1.0, 1.0)] + [
+        Box((hole_x, wall_y, SOCKET_DEPTH), (0.0, side * (hole_y + wall_y) / 2, up)) for side in (-1.0, 1.0)
+    ]
     return Part("socket", tuple(walls), colour=(0.25, 0.35, 0.55))

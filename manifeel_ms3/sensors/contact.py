@@ -121,7 +121,12 @@ def _depth(surface: torch.Tensor, load: torch.Tensor, start: torch.Tensor) -> to
 
 
 def solve_shear(
-    bristle: torch.Tensor, pressure: torch.Tensor, wrench: torch.Tensor, grid: ContactGrid, stiffness: float, friction: float
+    bristle: torch.Tensor,
+    pressure: torch.Tensor,
+    wrench: torch.Tensor,
+    grid: ContactGrid,
+    stiffness: float,
+    friction: float,
 ) -> torch.Tensor:
     """Shear traction force (N, C, 2), N, of every cell such that the field carries the measured shear and twist.
 

@@ -1,4 +1,4 @@
-"""Fit the compact shader to a look-up table in Taxim's format: `python -m manifeel_ms3.sensors.fit_shader --table polycalib.npz`.
+"""Fit the compact shader to a table in Taxim's format: `python -m manifeel_ms3.sensors.fit_shader --table polycalib.npz`.
 
 The table (Taxim, section III) lies in portrait: u = column along our rows, v = row against our columns. A bin pair (slope m,
 direction phi) holds, per channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. Any number of bins.

@@ -1,3 +1,5 @@
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+# (warp reads a kernel's annotations as its own types)
 """Height map to TacRGB: the gel's surface around the contact, and the compact shader as one warp kernel."""
 
 import functools
@@ -37,14 +39,14 @@ def _shade(
     if t > 1.0e-7:
         cosine = gr / t
         sine = gc / t
-        segment = int(0)
+        segment = 0
         while segment < wp.static(SEGMENTS - 1) and t > knots[segment + 1]:
             segment += 1
         upper = wp.min((t - knots[segment]) / (knots[segment + 1] - knots[segment]), 1.0)
         low = response[i, j, segment]  # at knot 0, zero slope, all zero
         high = response[i, j, segment + 1]
         for f in range(wp.static(FOURIER_TERMS)):
-            fourier = float(1.0)
+            fourier = 1.0
             if f == 1:
                 fourier = cosine
             elif f == 2:

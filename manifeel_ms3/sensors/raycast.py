@@ -1,3 +1,5 @@
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+# (warp reads a kernel's annotations as its own types)
 """Depth from rays: the orthographic camera in the pad as warp rays against triangle meshes. Needs no renderer."""
 
 import torch

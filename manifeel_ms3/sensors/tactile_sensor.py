@@ -50,7 +50,9 @@ class TactileSensor(BaseSensor):
     ):
         super().__init__(config)
         if config.link not in articulation.links_map:
-            raise ValueError(f"link={config.link!r} of tactile sensor {config.uid!r} is not one of {sorted(articulation.links_map)}")
+            raise ValueError(
+                f"link={config.link!r} of tactile sensor {config.uid!r} is not one of {sorted(articulation.links_map)}"
+            )
         if unknown := set(outputs) - set(OUTPUTS):
             raise ValueError(f"outputs {sorted(unknown)} of tactile sensor {config.uid!r} are unknown; use {OUTPUTS}")
         self.scene, self.articulation, self.outputs = scene, articulation, outputs
@@ -68,7 +70,9 @@ class TactileSensor(BaseSensor):
     def _make_depth(self):
         if self.config.backend == "sapien":
             return CameraDepth(self.config.uid, self.scene, self.pad, self.config.gel.size, self.config.pixel_size)
-        return RaycastDepth(self.scene, self.pad, self.config.gel.size, self._unfelt_links())  # "auto": the faster one on CPU and GPU
+        return RaycastDepth(
+            self.scene, self.pad, self.config.gel.size, self._unfelt_links()
+        )  # "auto": the faster one on CPU and GPU
 
     def _unfelt_links(self) -> set[str]:
         """Links that the gel cannot touch: its own finger, and what carries it as far as the robot's base."""

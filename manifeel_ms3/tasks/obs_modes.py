@@ -4,7 +4,12 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 STATE_TOKENS = ("state", "state_dict")
-WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")  # ManiSkill's names for whole modes; rgbd may be joined with touch
+WHOLE_MODES = (
+    "none",
+    "sensor_data",
+    "pointcloud",
+    "rgbd",
+)  # ManiSkill's names for whole modes; rgbd may be joined with touch
 
 
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:

@@ -12,7 +12,8 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.geometry import rectangular_peg, rectangular_socket
 from manifeel_ms3.geometry.pegs import HOLES, PEG_SIZE, SOCKET_DEPTH
 
-from .visuotactile_env import VisuotactileEnv, start_pose
+from .placement import start_pose
+from .visuotactile_env import VisuotactileEnv
 
 SOCKET_XY = (0.5, 0.0)  # m, nominal
 START_XYZ = (0.5, 0.0, 0.15)  # m, between the pads
@@ -78,7 +79,7 @@ class PegInsertionEnv(VisuotactileEnv):
         socket[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.socket_xy
         self.socket.set_pose(Pose.create_from_pq(socket))
 
-        start = start_pose(env_idx, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), ranges.start_rotation)
+        start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), ranges.start_rotation)
         qpos = torch.tensor(self.agent.keyframes["tool_down"].qpos, dtype=torch.float32).repeat(n, 1)
         qpos[:, :7] = self.agent.solve_ik(start, qpos)
         qpos[:, 7:] = PEG_SIZE[1] / 2 - GRIP_INDENTATION

@@ -8,8 +8,6 @@ import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import Camera, CameraConfig
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_multiply
-from mani_skill.utils.structs import Pose
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 from mani_skill.utils.visualization.misc import tile_images
 
@@ -18,7 +16,9 @@ from manifeel_ms3.geometry import Box, Part
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
 
 from .obs_modes import split_obs_mode
+from .pictures import same_height, same_size
 from .rendering import NO_RENDERER, available_render_backend
+from .viewpoints import looking_at, looking_down
 
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
@@ -161,14 +161,14 @@ class VisuotactileEnv(BaseEnv):
     def _default_sensor_configs(self):
         views = dict(front=((0.68, 0.0, 0.15), (-1.0, 0.0)), side=((0.5, -0.17, 0.17), (0.0, 1.0)))
         return [
-            CameraConfig(name, _looking_down(*views[name]), 256, 256, FIELD_OF_VIEW, near=0.01, far=10)
+            CameraConfig(name, looking_down(*views[name]), 256, 256, FIELD_OF_VIEW, near=0.01, far=10)
             for name in self._camera_names
             if name in views
         ]
 
     @property
     def _default_human_render_camera_configs(self):
-        pose = _looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
+        pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
         return CameraConfig("render_camera", pose, 512, 512, np.deg2rad(45), near=0.01, far=10)
 
     def _load_agent(self, options: dict):
@@ -264,7 +264,9 @@ class VisuotactileEnv(BaseEnv):
                 f"or {(self.num_envs, *shape)}"
             )
         if not torch.isfinite(tensor).all():
-            raise ValueError(f"action {tensor.tolist()} holds NaN or infinity; give finite numbers (they are clipped to [-1, 1])")
+            raise ValueError(
+                f"action {tensor.tolist()} holds NaN or infinity; give finite numbers (they are clipped to [-1, 1])"
+            )
         return tensor.float()
 
     def _after_simulation_step(self):
@@ -296,7 +298,10 @@ class VisuotactileEnv(BaseEnv):
     def _flatten_raw_obs(self, obs: Any):
         if self._tactile_outputs and self.obs_mode_struct.state:
             flat = super()._flatten_raw_obs
-            mode, self._obs_mode = self._obs_mode, "state+touch"  # not the whole-observation flattening of plain "state"
+            mode, self._obs_mode = (
+                self._obs_mode,
+                "state+touch",
+            )  # not the whole-observation flattening of plain "state"
             obs = flat(obs)
             self._obs_mode = mode
             return obs
@@ -339,10 +344,10 @@ class VisuotactileEnv(BaseEnv):
 
     def render_all(self):
         sensors = self.render_sensors()
-        return torch.cat(_same_height([self.render_rgb_array(), sensors]), dim=2)
+        return torch.cat(same_height([self.render_rgb_array(), sensors]), dim=2)
 
     def _sensor_pictures(self) -> list[torch.Tensor]:
-        return _same_size([image for sensor in self.get_sensor_images().values() for image in sensor.values()])
+        return same_size([image for sensor in self.get_sensor_images().values() for image in sensor.values()])
 
 
 def _known(argument: str, given: Iterable[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
@@ -351,50 +356,3 @@ def _known(argument: str, given: Iterable[str], allowed: tuple[str, ...]) -> tup
         if value not in allowed:
             raise ValueError(f"{argument}: {value!r} is unknown; choose from {list(allowed)}")
     return given
-
-
-def _same_size(images: list[torch.Tensor]) -> list[torch.Tensor]:
-    """Pictures (N, H, W, 3) framed in black to one size."""
-    height, width = (max(image.shape[axis] for image in images) for axis in (1, 2))
-    return [_framed(image, height, width) for image in images]
-
-
-def _same_height(images: list[torch.Tensor]) -> list[torch.Tensor]:
-    height = max(image.shape[1] for image in images)
-    return [_framed(image, height, image.shape[2]) for image in images]
-
-
-def _framed(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    return torch.nn.functional.pad(image, (0, 0, 0, width - image.shape[2], 0, height - image.shape[1]))
-
-
-def _looking_at(eye: np.ndarray, target: np.ndarray) -> sapien.Pose:
-    """Camera pose at `eye` that looks at `target`, upright (SAPIEN: x ahead, y left, z up)."""
-    ahead = (target - eye) / np.linalg.norm(target - eye)
-    left = np.cross([0.0, 0.0, 1.0], ahead)
-    left /= np.linalg.norm(left)
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.stack([ahead, left, np.cross(ahead, left)], axis=1)
-    matrix[:3, 3] = eye
-    return sapien.Pose(matrix)
-
-
-def _looking_down(position: tuple[float, float, float], heading: tuple[float, float]) -> sapien.Pose:
-    """Camera pose that looks along `heading` and 30 degrees down."""
-    eye = np.array(position)
-    return _looking_at(eye, eye + np.array([*heading, -np.tan(np.deg2rad(30))]))
-
-
-def start_pose(
-    env_idx: torch.Tensor, position: tuple[float, float, float], ranges: tuple[float, float, float], rotation: float
-) -> Pose:
-    """Random tool poses (n,) that point down: `position` +- `ranges`, m, turned by +- `rotation`, rad, about each base axis."""
-    n = len(env_idx)
-    offset = (2 * torch.rand(n, 3) - 1) * torch.tensor(ranges)
-    return Pose.create_from_pq(torch.tensor(position) + offset, random_downward(n, rotation))
-
-
-def random_downward(n: int, rotation: float) -> torch.Tensor:
-    """Quaternions (n, 4) of a tool that points down with its x along the base's, turned by +- `rotation` about each axis."""
-    turn = axis_angle_to_quaternion((2 * torch.rand(n, 3) - 1) * rotation)
-    return quaternion_multiply(turn, torch.tensor([0.0, 1.0, 0.0, 0.0]).expand(n, 4))

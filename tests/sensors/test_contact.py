@@ -132,7 +132,9 @@ def test_rows_of_a_batch_are_independent():
     for i in range(3):
         alone = pressure(heights[i : i + 1], loads[i : i + 1])
         assert torch.allclose(field[i], alone[0], atol=1e-9)
-        q = solve_shear(torch.zeros(*alone.shape, 2, dtype=torch.float64), alone, loads[i : i + 1], GRID, GEL.shear_stiffness, 1.0)
+        q = solve_shear(
+            torch.zeros(*alone.shape, 2, dtype=torch.float64), alone, loads[i : i + 1], GRID, GEL.shear_stiffness, 1.0
+        )
         assert torch.allclose(shear[i], q[0], atol=1e-9)
 
 

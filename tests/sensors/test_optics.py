@@ -43,7 +43,9 @@ def test_untouched_regions_stay_background(optics):
 def test_colour_has_no_seam_over_the_direction_of_the_gradient():
     shader = Shader.load(CONFIG.optics.calibration)
     phi = np.linspace(-np.pi, np.pi, 721)
-    terms = np.einsum("pf,k,q->pfkq", fourier_terms(phi), slope_terms(np.array(0.3)), place_terms(np.array(0.2), np.array(-0.4)))
+    terms = np.einsum(
+        "pf,k,q->pfkq", fourier_terms(phi), slope_terms(np.array(0.3)), place_terms(np.array(0.2), np.array(-0.4))
+    )
     colour = np.einsum("cfkq,pfkq->pc", shader.weights, terms)
     assert np.allclose(colour[0], colour[-1], atol=1e-4)
     assert np.abs(np.diff(colour, axis=0)).max() < 1.5  # grey levels per half degree

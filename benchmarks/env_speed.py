@@ -1,0 +1,92 @@
+"""Steps per second of one environment in one process, by what it observes: `python benchmarks/env_speed.py`.
+
+Beside it, in the same run, ManiSkill's own PegInsertionSide-v1 with its two cameras.
+"""
+
+import cProfile
+import pstats
+import time
+from dataclasses import dataclass
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import manifeel_ms3  # noqa: F401
+from manifeel_ms3.tasks.rendering import available_render_backend
+
+TARGETS = {"state": 150, "rgb": 50, "rgb+tacff": 35, "rgb+tacrgb+tacff": 25}
+PARTS = {  # where the time goes, by the function that spends it
+    "physics": "sapien.pysapien.step",
+    "rendering": "get_picture",
+    "rays": "heights",
+    "gel mechanics": ("solve_indentation", "_feel"),
+    "optics": ("surface", "shade"),
+    "control": "set_action",
+}
+
+
+@dataclass
+class Args:
+    steps: int = 200
+    """steps timed for each mode"""
+    env_id: str = "ManiFeel-PegInsertion-v1"
+
+
+def steps_per_second(env: gym.Env, steps: int, scale: float) -> float:
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-scale, scale, (steps, *env.unwrapped.single_action_space.shape)).astype(np.float32)
+    env.reset(seed=0)
+    for action in actions[:10]:
+        env.step(action)
+    begin = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    return steps / (time.perf_counter() - begin)
+
+
+def shares(env: gym.Env, steps: int) -> dict[str, float]:
+    """Share of a step's time by part, cumulative."""
+    profile = cProfile.Profile()
+    profile.enable()
+    for _ in range(steps):
+        env.step(np.zeros(env.unwrapped.single_action_space.shape, np.float32))
+    profile.disable()
+    stats = pstats.Stats(profile).stats  # pyright: ignore[reportAttributeAccessIssue]
+    total = sum(entry[2] for entry in stats.values())
+    spent = {}
+    for part, names in PARTS.items():
+        names = (names,) if isinstance(names, str) else names
+        spent[part] = sum(entry[3] for (_, _, name), entry in stats.items() if any(_matches(name, n) for n in names)) / total
+    return spent
+
+
+def _matches(function: str, name: str) -> bool:
+    return function == name or function.endswith((f"{name}>", f"{name}}}")) or f".{name}" in function
+
+
+def main(args: Args) -> None:
+    console = Console()
+    console.print(f"{torch.get_num_threads()} torch threads, renderer {available_render_backend()!r}")
+    table = Table("environment", "observes", "steps/s", "wanted", *PARTS)
+    for mode, target in TARGETS.items():
+        env = gym.make(args.env_id, obs_mode=mode, sim_backend="physx_cpu")
+        speed = steps_per_second(env, args.steps, scale=0.3)
+        parts = shares(env, 50)
+        table.add_row(args.env_id, mode, f"{speed:.0f}", f">= {target}", *(f"{100 * share:.0f} %" for share in parts.values()))
+        env.close()
+    if available_render_backend() != "none":
+        stock = gym.make(
+            "PegInsertionSide-v1", obs_mode="rgb", sim_backend="physx_cpu", render_backend=available_render_backend()
+        )
+        speed = steps_per_second(stock, args.steps // 4, scale=0.3)
+        table.add_row("PegInsertionSide-v1 (ManiSkill's)", "rgb, 2 x 128 x 128", f"{speed:.1f}", "")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

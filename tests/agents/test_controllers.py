@@ -1,0 +1,121 @@
+"""Controllers: what an action means, in the air and in contact."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+ACTION_DIMS = {"pd_ee_delta_pose_fixed_gripper": 6, "pd_ee_delta_pose": 7, "pd_ee_delta_yaw": 5}
+
+
+@pytest.fixture(scope="module")
+def env(make_env):
+    return make_env(obs_mode="none", render_backend="none", fit="loose")
+
+
+def tool(env) -> tuple[np.ndarray, Rotation]:
+    pose = env.unwrapped.agent.tcp_pose_at_base.raw_pose[0].double().numpy()
+    return pose[:3], Rotation.from_quat(pose[[4, 5, 6, 3]])
+
+
+def settle(env, action=None, steps=8):
+    for _ in range(steps):
+        env.step(np.zeros(6) if action is None else action)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_translation_action_is_ten_millimetres_along_the_base_axis(env, axis):
+    env.reset(seed=0)
+    before, facing = tool(env)
+    for _ in range(3):
+        env.step(np.eye(6)[axis])
+    settle(env)
+    after, turned = tool(env)
+    assert after - before == pytest.approx(0.03 * np.eye(3)[axis], abs=2e-4)
+    assert (turned * facing.inv()).magnitude() < 2e-3
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_positive_rotation_turns_by_the_right_hand_rule(env, axis, sign):
+    env.reset(seed=0)
+    before, facing = tool(env)
+    for _ in range(3):
+        env.step(sign * np.eye(6)[3 + axis])
+    settle(env)
+    after, turned = tool(env)
+    assert (turned * facing.inv()).as_rotvec() == pytest.approx(sign * 0.15 * np.eye(3)[axis], abs=3e-3)
+    assert np.linalg.norm(after - before) < 3e-4
+
+
+def test_target_is_precise_in_the_air(env):
+    env.reset(seed=1)
+    settle(env)
+    before, _ = tool(env)
+    settle(env, steps=20)
+    after, _ = tool(env)
+    assert np.linalg.norm(after - before) < 1e-5  # it neither sags nor creeps
+
+
+def test_leash_bounds_the_force_however_long_one_pushes(env):
+    env.reset(seed=2)
+    down = -np.eye(6)[2]
+    forces = [float(env.step(0.3 * down)[-1]["contact_force"]) for _ in range(100)]
+    assert max(forces[-20:]) > 5.0  # the peg stands on the table
+    assert max(forces) < 60.0
+    assert np.ptp(forces[-20:]) < 8.0  # and the force does not wind up
+
+
+@pytest.mark.parametrize(("mode", "dim"), ACTION_DIMS.items())
+def test_action_dimensions(make_env, mode, dim):
+    env = make_env(obs_mode="none", render_backend="none", control_mode=mode)
+    assert env.action_space.shape == (dim,)
+
+
+def test_yaw_mode_turns_about_the_vertical_alone(make_env):
+    env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_delta_yaw")
+    env.reset(seed=0)
+    before, facing = tool(env)
+    for _ in range(4):
+        env.step(np.array([0, 0, 0, 1.0, -1.0]))
+    for _ in range(8):
+        env.step(np.array([0, 0, 0, 0, -1.0]))
+    after, turned = tool(env)
+    assert (turned * facing.inv()).as_rotvec() == pytest.approx([0, 0, 0.2], abs=4e-3)
+
+
+def test_gripper_opens_and_closes(make_env):
+    env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_delta_pose")
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(np.r_[np.zeros(6), 1.0])
+    assert env.unwrapped.agent.robot.get_qpos()[0, 7:] == pytest.approx([0.04, 0.04], abs=1e-3)
+    for _ in range(15):
+        env.step(np.r_[np.zeros(6), -1.0])
+    assert env.unwrapped.agent.robot.get_qpos()[0, 7:].max() < 0.005
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_nan_and_infinity_are_refused_before_anything_moves(env, bad):
+    env.reset(seed=0)
+    before = env.unwrapped.get_state()
+    action = np.zeros(6)
+    action[3] = bad
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        env.step(action)
+    assert torch.equal(env.unwrapped.get_state(), before)
+
+
+def test_wrong_shape_is_refused(env):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(7,\).*takes \(6,\)"):
+        env.step(np.zeros(7))
+
+
+def test_out_of_range_actions_are_clipped(env):
+    env.reset(seed=0)
+    env.step(np.full(6, 100.0))
+    clipped = env.unwrapped.get_state()
+    env.reset(seed=0)
+    env.step(np.ones(6))
+    assert torch.equal(env.unwrapped.get_state(), clipped)

@@ -1,0 +1,141 @@
+"""Shared pieces of the baselines."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from baselines.common.dataset import SequenceDataset
+from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18
+from baselines.common.normalizer import Normalizer
+from baselines.common.observation import POSE, observation_spec, pose_features, prepare
+from baselines.common.unet import ConditionalUnet1D
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
+from tests.conftest import PEG
+
+SPEC = observation_spec("tacff", (), ("right",), 64)
+FIELD = SPEC.force_fields[0]
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def dataset(demos):
+    return SequenceDataset([demos], PEG, SPEC, obs_horizon=2, pred_horizon=16, num_demos=None, device=CPU)
+
+
+def test_samples_are_the_windows_of_the_file(demos, dataset):
+    episodes = read_demonstrations(demos, SPEC.keys, PEG)
+    assert len(dataset) == sum(len(e["actions"]) for e in episodes)
+    second = len(episodes[0]["actions"])
+    for sample, episode, t in ((10, 0, 10), (second + 5, 1, 5)):
+        obs, actions = dataset.sample(torch.tensor([sample]))
+        assert np.array_equal(obs[FIELD][0].numpy(), episodes[episode][FIELD][t - 1 : t + 1])
+        assert np.array_equal(actions[0].numpy(), episodes[episode]["actions"][t - 1 : t + 15])
+
+
+def test_windows_do_not_cross_episodes(demos, dataset):
+    episodes = read_demonstrations(demos, SPEC.keys, PEG)
+    last, first = len(episodes[0]["actions"]) - 1, len(episodes[0]["actions"])
+    obs, actions = dataset.sample(torch.tensor([last, first]))
+    assert np.array_equal(actions[0, 2:].numpy(), np.repeat(episodes[0]["actions"][-1:], 14, axis=0))
+    assert np.array_equal(obs[FIELD][1, 0].numpy(), episodes[1][FIELD][0])
+    assert np.array_equal(actions[1, 0].numpy(), episodes[1]["actions"][0])
+
+
+def test_number_of_demonstrations(demos):
+    one = SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=1, device=CPU)
+    assert one.num_episodes == 1
+    assert SequenceDataset([demos, demos], PEG, SPEC, 2, 16, num_demos=3, device=CPU).num_episodes == 3
+    with pytest.raises(DemonstrationError, match="holds 2 episodes, 9 are wanted"):
+        SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=9, device=CPU)
+
+
+def test_pose_features_are_the_rotation_whatever_the_quaternions_sign():
+    rotation = Rotation.random(20, random_state=0)
+    quaternion = rotation.as_quat()[:, [3, 0, 1, 2]]
+    pose = np.c_[np.zeros((20, 3)), quaternion]
+    flipped = np.c_[np.zeros((20, 3)), -quaternion]
+    matrix = rotation.as_matrix()
+    assert np.allclose(pose_features(pose)[:, 3:], np.c_[matrix[:, :, 0], matrix[:, :, 1]], atol=1e-6)
+    assert np.allclose(pose_features(pose), pose_features(flipped), atol=1e-6)
+
+
+def test_images_are_resized_alike_for_training_and_evaluation():
+    spec = observation_spec("rgb", ("wrist",), (), 64)
+    images = np.random.default_rng(0).integers(0, 255, (3, 256, 256, 3), dtype=np.uint8)
+    prepared = prepare(spec.images[0], images, spec)
+    assert prepared.shape == (3, 64, 64, 3)
+    assert np.array_equal(prepare(spec.images[0], images[1:2], spec)[0], prepared[1])
+
+
+@pytest.mark.parametrize("mode", ["state", "rgb+depth", "pointcloud"])
+def test_policies_do_not_take_privileged_or_unknown_modes(mode):
+    with pytest.raises(ValueError, match="policies take"):
+        observation_spec(mode, ("wrist",), ("right",), 64)
+
+
+def test_normalizer_maps_the_datas_range_and_back():
+    data = torch.tensor([[0.0, 5.0, 2.0], [10.0, 7.0, 2.0]])
+    normalizer = Normalizer(3)
+    normalizer.fit(data)
+    assert normalizer.normalize(data)[:, :2].tolist() == [[-1, -1], [1, 1]]
+    assert torch.allclose(normalizer.restore(normalizer.normalize(data)), data)
+    assert normalizer.normalize(data)[:, 2].abs().max() == 0  # what never moved stays small
+
+
+def test_resnet18_has_group_norm_and_the_published_size():
+    net = ResNet18()
+    assert not any(isinstance(m, torch.nn.modules.batchnorm._BatchNorm) for m in net.modules())
+    assert sum(p.numel() for p in net.parameters()) == pytest.approx(11.2e6, rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["resnet18", "small"])
+def test_encoder_sees_every_modality(name):
+    spec = observation_spec("rgb+tacff", ("wrist",), ("right",), 64)
+    image = "resnet18" if name == "resnet18" else "small_cnn"
+    encoder = ObservationEncoder(EncoderConfig(image=image, force_field=name), spec, 2).eval()
+    torch.manual_seed(0)
+    obs = {
+        spec.images[0]: torch.randint(0, 255, (2, 2, 64, 64, 3), dtype=torch.uint8),
+        spec.force_fields[0]: torch.rand(2, 2, 10, 14, 3),
+        POSE: torch.rand(2, 2, 9),
+    }
+    features = encoder(obs)
+    assert features.shape == (2, encoder.out_features)
+    for key in obs:
+        changed = encoder(obs | {key: obs[key].flip(2)})
+        assert not torch.allclose(changed, features)
+
+
+def test_crops_are_random_in_training_and_central_in_evaluation():
+    spec = observation_spec("rgb", ("wrist",), (), 64)
+    encoder = ObservationEncoder(EncoderConfig(image="small_cnn", crop=48), spec, 2)
+    images = torch.randint(0, 255, (4, 2, 64, 64, 3), dtype=torch.uint8)
+    images[:, 1] = images[:, 0]
+    central = encoder.eval()._cropped(images)
+    assert torch.equal(central, images[:, :, 8:56, 8:56])
+    crops = encoder.train()._cropped(images)
+    assert crops.shape == (4, 2, 48, 48, 3)
+    assert torch.equal(crops[:, 0], crops[:, 1])  # the same over a window
+    assert not torch.equal(crops, central)
+    windows = images[0, 0].unfold(0, 48, 1).unfold(1, 48, 1).permute(0, 1, 3, 4, 2).reshape(-1, 48, 48, 3)
+    assert (windows == crops[0, 0]).flatten(1).all(1).any()
+
+
+def test_unknown_encoder_names_those_there_are():
+    with pytest.raises(ValueError, match="resnet18"):
+        ObservationEncoder(EncoderConfig(image="resnet1800"), SPEC, 2)
+
+
+def test_unet_maps_actions_to_noise_and_uses_step_and_condition():
+    net = ConditionalUnet1D(6, 10, channels=(16, 32, 64)).eval()
+    actions, condition = torch.randn(3, 16, 6), torch.randn(3, 10)
+    out = net(actions, torch.tensor([0, 50, 99]), condition)
+    assert out.shape == actions.shape
+    assert not torch.allclose(out, net(actions, torch.tensor([1, 51, 98]), condition))
+    assert not torch.allclose(out, net(actions, torch.tensor([0, 50, 99]), -condition))
+
+
+def test_papers_unet_has_the_published_channels():
+    net = ConditionalUnet1D(6, 146)
+    assert [block[0].second[0].out_channels for block in net.down] == [512, 1024, 2048]

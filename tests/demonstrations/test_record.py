@@ -1,0 +1,173 @@
+"""Recording: reproducible, crash-safe, resumable; files that say what is wrong with them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
+from manifeel_ms3.demonstrations.trajectory_file import episode_folder, read_header
+from tests.conftest import PEG
+
+EASY = dict(fit="loose", render_backend="none")
+KEYS = ["sensor_data/tactile_right/force_field", "extra/tcp_pose"]
+
+
+def run(path: Path, num: int, workers: int = 1, obs_mode: str = "tacff", seed: int = 0) -> Path:
+    args = record.Args(
+        PEG, num, workers, seed, path, obs_mode, cameras=(), tactile_sensors=("right",), env_kwargs=json.dumps(EASY)
+    )
+    return record.main(args)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> Path:
+    return run(tmp_path_factory.mktemp("demos") / "trajectory.h5", num=3)
+
+
+def test_file_holds_what_maniskill_expects(recorded):
+    header = json.loads(recorded.with_suffix(".json").read_text())
+    assert header["env_info"]["env_id"].endswith(PEG)
+    assert [episode["episode_id"] for episode in header["episodes"]] == [0, 1, 2]
+    with h5py.File(recorded) as file:
+        for episode in header["episodes"]:
+            group, steps = file[f"traj_{episode['episode_id']}"], episode["elapsed_steps"]
+            assert group["actions"].shape == (steps, 6)
+            assert group["success"].shape == (steps,)
+            assert group["success"][-1]
+            assert group["obs/sensor_data/tactile_right/force_field"].shape == (steps + 1, 10, 14, 3)
+            assert group["env_states/actors/peg"].shape[0] == steps + 1
+            assert episode["peak_contact_force"] < 60
+    assert not episode_folder(recorded).exists()
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    out = {}
+    with h5py.File(path) as file:
+        file.visititems(
+            lambda name, item: out.__setitem__(name, item[()].tobytes()) if isinstance(item, h5py.Dataset) else None
+        )
+    return out
+
+
+def test_any_number_of_workers_gives_the_same_episodes(recorded, tmp_path):
+    two = run(tmp_path / "trajectory.h5", num=3, workers=2)
+    assert contents(two) == contents(recorded)
+
+
+def test_every_episode_succeeds_again_from_its_actions(recorded):
+    results = replay.replay(recorded)
+    assert all(result.success for result in results)
+    assert max(result.deviation for result in results) == 0.0
+
+
+def test_more_can_be_recorded_later(recorded, tmp_path):
+    path = run(tmp_path / "trajectory.h5", num=2)
+    assert len(read_header(path)["episodes"]) == 2
+    run(path, num=3)
+    assert contents(path) == contents(recorded)
+
+
+def test_killed_run_keeps_every_finished_episode_and_goes_on(recorded, tmp_path):
+    path = tmp_path / "trajectory.h5"
+    command = [
+        sys.executable,
+        "-m",
+        "manifeel_ms3.demonstrations.record",
+        PEG,
+        "-n",
+        "3",
+        "--out",
+        str(path),
+        "--obs-mode",
+        "tacff",
+    ]
+    command += ["--cameras", "--tactile-sensors", "right", "--env-kwargs", json.dumps(EASY)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    for _ in range(600):
+        if path.is_file():
+            break
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    finished = read_demonstrations(path, KEYS, PEG)
+    assert 1 <= len(finished) <= 3
+    run(path, num=3)
+    assert contents(path) == contents(recorded)
+
+
+def test_other_settings_do_not_mix_into_a_file(recorded):
+    with pytest.raises(DemonstrationError, match="another --out"):
+        run(recorded, num=4, obs_mode="none")
+
+
+def test_reader_gives_actions_and_observations(recorded):
+    episodes = read_demonstrations(recorded, KEYS, PEG, num=2)
+    assert len(episodes) == 2
+    for episode in episodes:
+        assert len(episode[KEYS[0]]) == len(episode["actions"]) + 1
+        assert np.isfinite(episode[KEYS[0]]).all()
+
+
+def test_missing_file_says_how_to_record_one(tmp_path):
+    with pytest.raises(DemonstrationError, match="demonstrations.record"):
+        read_demonstrations(tmp_path / "none.h5", KEYS)
+
+
+def test_truncated_file(recorded, tmp_path):
+    broken = tmp_path / "trajectory.h5"
+    broken.write_bytes(recorded.read_bytes()[: recorded.stat().st_size // 2])
+    broken.with_suffix(".json").write_text(recorded.with_suffix(".json").read_text())
+    with pytest.raises(DemonstrationError, match="truncated"):
+        read_demonstrations(broken, KEYS)
+
+
+def test_broken_json(recorded, tmp_path):
+    broken = tmp_path / "trajectory.h5"
+    broken.write_bytes(recorded.read_bytes())
+    broken.with_suffix(".json").write_text("{")
+    with pytest.raises(DemonstrationError, match="not a trajectory's json"):
+        read_demonstrations(broken, KEYS)
+
+
+def test_other_task(recorded):
+    with pytest.raises(DemonstrationError, match=f"of {PEG}, not of ManiFeel-BallSorting-v1"):
+        read_demonstrations(recorded, KEYS, "ManiFeel-BallSorting-v1")
+
+
+def test_other_obs_mode(recorded):
+    with pytest.raises(DemonstrationError, match="obs_mode='tacff'.*sensor_data/wrist/rgb"):
+        read_demonstrations(recorded, ["sensor_data/wrist/rgb"], PEG)
+
+
+def test_too_few_episodes(recorded):
+    with pytest.raises(DemonstrationError, match="holds 3 episodes, 5 are wanted"):
+        read_demonstrations(recorded, KEYS, PEG, num=5)
+
+
+def test_task_without_demonstrator():
+    with pytest.raises(ValueError, match=PEG):
+        record.main(record.Args("PickCube-v1"))
+
+
+def test_maniskill_replays_the_file_unchanged(recorded, tmp_path):
+    for suffix in (".h5", ".json"):
+        (tmp_path / "t").with_suffix(suffix).write_bytes(recorded.with_suffix(suffix).read_bytes())
+    command = [
+        sys.executable,
+        "-m",
+        "mani_skill.trajectory.replay_trajectory",
+        "--traj-path",
+        str(tmp_path / "t.h5"),
+        "--count",
+        "2",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert "2/2=100.00%" in done.stdout + done.stderr

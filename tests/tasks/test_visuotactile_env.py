@@ -1,0 +1,202 @@
+"""The contract of every task's environment: what is observed, what is refused, what is reproducible."""
+
+import numpy as np
+import pytest
+import torch
+
+from manifeel_ms3.sensors import TactileSensor
+from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.rendering import NO_RENDERER
+from tests.conftest import needs_renderer
+
+
+@needs_renderer
+def test_observation_keys_shapes_and_types(make_env):
+    env = make_env(obs_mode="rgb+tacrgb+tacff", cameras=("front", "side", "wrist"), tactile_sensors=("left", "right"))
+    obs, _ = env.reset(seed=0)
+    data = obs["sensor_data"]
+    assert set(data) == {"front", "side", "wrist", "tactile_left", "tactile_right"}
+    for camera in ("front", "side", "wrist"):
+        assert data[camera]["rgb"].shape == (1, 256, 256, 3)
+        assert data[camera]["rgb"].dtype == torch.uint8
+        assert data[camera]["rgb"].float().std() > 5  # a picture, not a blank
+    for side in ("left", "right"):
+        touch = data[f"tactile_{side}"]
+        assert touch["rgb"].shape == (1, 240, 320, 3)
+        assert touch["rgb"].dtype == torch.uint8
+        assert touch["force_field"].shape == (1, 10, 14, 3)
+        assert touch["force_field"].dtype == torch.float32
+        assert touch["penetration"].shape == (1, 10, 14)
+    assert obs["extra"]["tcp_pose"].shape == (1, 7)
+    assert env.observation_space.contains({k: _numpy(v) for k, v in obs.items()})
+
+
+def _numpy(tree):
+    return {k: _numpy(v) for k, v in tree.items()} if isinstance(tree, dict) else tree.cpu().numpy()
+
+
+def leaves(tree, prefix=""):
+    for key, value in tree.items():
+        yield from leaves(value, f"{prefix}{key}/") if isinstance(value, dict) else [f"{prefix}{key}"]
+
+
+@needs_renderer
+@pytest.mark.parametrize("mode", ["rgb", "rgb+tacrgb", "rgb+tacff", "tacff+rgb", "tacff", "tacrgb+tacff", "rgb+depth+tacff"])
+def test_visual_modes_hold_nothing_privileged(make_env, mode):
+    obs, _ = make_env(obs_mode=mode).reset(seed=0)
+    known = {"agent/qpos", "agent/qvel", "extra/tcp_pose"}
+    rest = {leaf for leaf in leaves(obs) if not leaf.startswith(("sensor_data/", "sensor_param/"))}
+    assert rest == known
+    assert any("force_field" in leaf for leaf in leaves(obs)) == ("tacff" in mode)
+    assert any("tactile_right/rgb" in leaf for leaf in leaves(obs)) == ("tacrgb" in mode)
+    assert any("wrist/rgb" in leaf for leaf in leaves(obs)) == ("rgb" in mode.split("+"))
+
+
+@needs_renderer
+def test_visual_observation_does_not_depend_on_what_is_hidden(make_env):
+    """Same robot, other socket: out of the camera's sight, the observation is the same to the bit."""
+    env = make_env(obs_mode="tacff", render_backend="none")
+    obs, _ = env.reset(seed=0)
+    pose = env.unwrapped.socket.pose.raw_pose.clone()
+    pose[:, :2] += 0.03
+    from mani_skill.utils.structs import Pose
+
+    env.unwrapped.socket.set_pose(Pose.create(pose))
+    moved = env.unwrapped.get_obs()
+    for key in ("agent", "extra"):
+        for name, value in obs[key].items():
+            assert torch.equal(value, moved[key][name])
+
+
+def test_state_modes(make_env):
+    state, _ = make_env(obs_mode="state", render_backend="none").reset(seed=0)
+    assert isinstance(state, torch.Tensor)
+    tree, _ = make_env(obs_mode="state_dict", render_backend="none").reset(seed=0)
+    assert {"peg_pose", "socket_pose", "tcp_pose"} <= set(tree["extra"])
+    both, _ = make_env(obs_mode="state+tacff", render_backend="none").reset(seed=0)
+    assert torch.equal(both["state"], state)
+    assert both["sensor_data"]["tactile_right"]["force_field"].abs().max() > 0
+
+
+@pytest.mark.parametrize(
+    ("mode", "word"),
+    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+tacff", "stands alone"), ("", "unknown")],
+)
+def test_bad_obs_modes_name_what_is_known(mode, word):
+    with pytest.raises(ValueError, match=word):
+        split_obs_mode(mode)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "word"),
+    [
+        (dict(obs_mode="rgb+smell"), "tacrgb"),
+        (dict(cameras=("top",)), "wrist"),
+        (dict(tactile_sensors=("middle",)), "left"),
+        (dict(lighting="disco"), "dim"),
+        (dict(occlusion=True), "nothing that could occlude"),
+        (dict(fit="snug"), "tight"),
+        (dict(randomization=dict(colour=1.0)), "socket_xy"),
+        (dict(randomization=dict(socket_xy=-1.0)), "socket_xy"),
+        (dict(randomization=dict(socket_xy=float("nan"))), "finite"),
+    ],
+)
+def test_bad_arguments_name_what_is_allowed(make_env, kwargs, word):
+    with pytest.raises(ValueError, match=word):
+        make_env(render_backend="none", **kwargs)
+
+
+def test_pictures_without_a_renderer_say_what_to_install(make_env):
+    assert "mesa-vulkan-drivers" in NO_RENDERER
+    with pytest.raises(RuntimeError, match="mesa-vulkan-drivers"):
+        make_env(obs_mode="rgb", render_backend="none")
+    with pytest.raises(RuntimeError, match="render_mode"):
+        make_env(obs_mode="state", render_mode="rgb_array", render_backend="none")
+
+
+def rollout(env, seed, steps=6):
+    obs, _ = env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+    out = [obs["sensor_data"]["tactile_right"]]
+    for _ in range(steps):
+        obs, *_ = env.step(rng.uniform(-1, 1, 6))
+        out.append(obs["sensor_data"]["tactile_right"])
+    return out, env.unwrapped.get_state()
+
+
+def test_episode_is_a_function_of_its_seed_bit_for_bit(make_env):
+    env = make_env(obs_mode="tacrgb+tacff", render_backend="none")
+    touch, state = rollout(env, seed=3)
+    rollout(env, seed=4)
+    again, state_again = rollout(env, seed=3)
+    fresh, state_fresh = rollout(make_env(obs_mode="tacrgb+tacff", render_backend="none"), seed=3)
+    assert torch.equal(state, state_again)
+    assert torch.equal(state, state_fresh)
+    for first, second, third in zip(touch, again, fresh, strict=True):
+        for key in first:
+            assert torch.equal(first[key], second[key])
+            assert torch.equal(first[key], third[key])
+
+
+def test_looking_twice_changes_nothing(make_env):
+    env = make_env(obs_mode="tacff", render_backend="none")
+    env.reset(seed=0)
+    obs, *_ = env.step(np.full(6, 0.5))
+    twice = env.unwrapped.get_obs()
+    assert torch.equal(obs["sensor_data"]["tactile_right"]["force_field"], twice["sensor_data"]["tactile_right"]["force_field"])
+
+
+def test_touch_is_computed_once_a_step_and_only_where_asked_for(make_env, monkeypatch):
+    captures = []
+    capture = TactileSensor.capture
+    monkeypatch.setattr(TactileSensor, "capture", lambda self: (captures.append(self.uid), capture(self)))
+    env = make_env(obs_mode="tacff", tactile_sensors=("left",), render_backend="none")
+    env.reset(seed=0)
+    captures.clear()
+    for _ in range(3):
+        env.step(np.zeros(6))
+    assert captures == ["tactile_left"] * 3
+    env = make_env(obs_mode="state", render_backend="none")
+    captures.clear()
+    env.step(np.zeros(6))
+    assert captures == []
+
+
+@needs_renderer
+def test_render_modes_show_cameras_and_touch(make_env):
+    env = make_env(obs_mode="rgb+tacrgb+tacff", render_mode="sensors")
+    env.reset(seed=0)
+    images = env.unwrapped.get_sensor_images()
+    assert set(images["tactile_right"]) == {"rgb", "force_field"}
+    assert images["tactile_right"]["force_field"].shape == (1, 240, 320, 3)
+    assert env.render().dtype == torch.uint8
+    everything = make_env(obs_mode="rgb+tacff", render_mode="all")
+    everything.reset(seed=0)
+    picture = everything.render()
+    assert picture.shape[1] >= 512
+    assert picture.shape[2] > 512 + 256
+
+
+@needs_renderer
+def test_dim_light_is_dim(make_env):
+    normal, _ = make_env(obs_mode="rgb").reset(seed=0)
+    dim, _ = make_env(obs_mode="rgb", lighting="dim").reset(seed=0)
+    ratio = dim["sensor_data"]["wrist"]["rgb"].float().mean() / normal["sensor_data"]["wrist"]["rgb"].float().mean()
+    assert ratio < 0.35
+
+
+def test_force_field_equals_the_wrench_and_the_weight(make_env):
+    env = make_env(obs_mode="tacff", tactile_sensors=("left", "right"), render_backend="none")
+    for seed in range(3):
+        obs, _ = env.reset(seed=seed)
+        for _ in range(5):
+            obs, *_ = env.step(np.zeros(6))
+        base, total = env.unwrapped, torch.zeros(3)
+        for side in ("left", "right"):
+            field = obs["sensor_data"][f"tactile_{side}"]["force_field"][0].sum((0, 1))
+            fx, fy, fz, *_ = base.agent.pad_wrench(side)[0].float()
+            assert field.tolist() == pytest.approx([-fz, fx, fy], rel=0.01, abs=1e-3)
+            rotation = torch.as_tensor(base.agent.gels[side].pose.sp.to_transformation_matrix()[:3, :3]).float()
+            total += rotation @ torch.tensor([field[1], field[2], -field[0]])
+        weight = float(base.peg.mass[0]) * 9.81
+        assert total.tolist() == pytest.approx([0, 0, -weight], abs=0.02 * weight)

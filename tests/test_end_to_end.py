@@ -1,0 +1,53 @@
+"""What `make demo` does, small: record, train, evaluate, report, through the command lines' own entry points."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from baselines.common.encoders import EncoderConfig
+from baselines.diffusion_policy import train
+from baselines.diffusion_policy.policy import PolicyConfig
+from manifeel_ms3.demonstrations import record
+from manifeel_ms3.evaluation import report, run
+from tests.conftest import PEG, needs_renderer
+
+TASK_ARGS = json.dumps(dict(fit="loose", randomization=dict(socket_xy=0.01)))
+
+
+@needs_renderer
+def test_from_demonstrations_to_a_report(tmp_path: Path):
+    demos = record.main(
+        record.Args(PEG, 2, 2, out=tmp_path / "trajectory.h5", obs_mode="rgb+tacff", cameras=("wrist",), env_kwargs=TASK_ARGS)
+    )
+    small = PolicyConfig(encoder=EncoderConfig("small_cnn", "small"), channels=(32, 64), step_embedding=32)
+    args = train.Args(
+        (demos,),
+        policy=small,
+        image_size=48,
+        inference_steps=4,
+        batch_size=16,
+        steps=10,
+        device="cpu",
+        run_dir=tmp_path,
+    )
+    checkpoint = train.main(args)
+    result_file = run.main(run.Args(checkpoint, episodes=1, env_kwargs=TASK_ARGS))
+    result = json.loads(result_file.read_text())
+    assert result["env_id"] == PEG
+    assert len(result["episodes"]) == 1
+    assert result["success_once"]["low"] <= result["success_once"]["rate"] <= result["success_once"]["high"]
+    assert set(result["versions"]) >= {"mani-skill", "sapien", "torch"}
+    again = json.loads(run.main(run.Args(checkpoint, tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text())
+    for name in ("success_once", "length", "peak_contact_force"):
+        assert again["episodes"][0][name] == result["episodes"][0][name]
+    page = report.main(report.Args(tmp_path)).read_text()
+    for needed in ("data:video/mp4;base64,", "data:image/png;base64,", "Wilson", "socket_xy", "TacFF", "plotly"):
+        assert needed in page
+    assert page.count("http") - page.count("http://www.w3.org") >= 0  # plotly's source names addresses, the page loads none
+    assert 'src="http' not in page
+
+
+def test_report_without_an_evaluation(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        report.main(report.Args(tmp_path))
