@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from manifeel_ms3.demonstrations import read_demonstrations
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, read_header
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -36,10 +36,16 @@ class SequenceDataset:
         num_demos: int | None,
         device: torch.device,
     ):
-        episodes = []
+        files, episodes = list(files), []
+        held = [len(read_header(file)["episodes"]) for file in files]
+        wanted = sum(held) if num_demos is None else num_demos
+        if not 0 < wanted <= sum(held):
+            raise DemonstrationError(
+                f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer"
+            )
         with progress_bar() as bar:
-            for file in files:
-                left = None if num_demos is None else num_demos - len(episodes)
+            for file, count in zip(files, held, strict=True):
+                left = min(count, wanted - len(episodes))
                 if left == 0:
                     break
                 track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731

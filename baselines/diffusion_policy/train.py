@@ -128,11 +128,13 @@ def main(args: Args) -> Path:
     policy = DiffusionPolicy(args.policy, spec, dataset.actions.shape[1]).to(device)
     policy.fit_normalizers(dataset.observations, dataset.actions)
     optimizer = torch.optim.AdamW(policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay)
-    start = 0
+    start, order = 0, torch.empty(0, dtype=torch.long, device=device)  # samples left of this epoch
     if args.resume:
         saved = checkpoint_config(last)
         require_same_config(saved, config, FREE_ON_RESUME, last)
-        unpack(read_tensors(last / "training.safetensors"), optimizer, policy, last)
+        training = read_tensors(last / "training.safetensors")
+        order = training.pop("order").to(device)
+        unpack(training, optimizer, policy, last)
         start = saved["step"]
     schedule = get_scheduler("cosine", optimizer, num_warmup_steps=args.warmup_steps, num_training_steps=total_steps)
     for _ in range(start):
@@ -155,11 +157,10 @@ def main(args: Args) -> Path:
     def save(step: int) -> None:
         policy_weights = dict(policy.state_dict())
         policy_weights |= {name: s for (name, _), s in zip(policy.named_parameters(), ema.shadow_params, strict=True)}
-        save_checkpoint(last, config | dict(step=step), policy_weights, pack(optimizer, policy))
+        save_checkpoint(last, config | dict(step=step), policy_weights, pack(optimizer, policy) | dict(order=order))
 
     # training
     policy.train()
-    order = torch.empty(0, dtype=torch.long, device=device)
     running = 0.0
     with progress_bar() as bar:
         task = bar.add_task("training", total=total_steps, completed=start)

@@ -123,12 +123,17 @@ def _header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     packages = {name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")}
     limit = gym.spec(env_id).max_episode_steps
     return dict(
-        # "module:id" is gymnasium's way to import what registers an id: ManiSkill's tools then know it, too
-        env_info=dict(env_id=f"manifeel_ms3:{env_id}", env_kwargs=env_kwargs, max_episode_steps=limit),
+        # "module:id" is gymnasium's way to import what registers an id: ManiSkill's tools then know it, too. What renders is
+        # this machine's affair, and not kept
+        env_info=dict(env_id=f"manifeel_ms3:{env_id}", env_kwargs=_without_renderer(env_kwargs), max_episode_steps=limit),
         source_type="scripted",
         source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
         versions=packages,
     )
+
+
+def _without_renderer(env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in env_kwargs.items() if name != "render_backend"}
 
 
 def _already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:

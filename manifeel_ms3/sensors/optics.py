@@ -39,14 +39,14 @@ def _shade(
     if t > 1.0e-7:
         cosine = gr / t
         sine = gc / t
-        segment = 0
+        segment = int(0)
         while segment < wp.static(SEGMENTS - 1) and t > knots[segment + 1]:
             segment += 1
         upper = wp.min((t - knots[segment]) / (knots[segment + 1] - knots[segment]), 1.0)
         low = response[i, j, segment]  # at knot 0, zero slope, all zero
         high = response[i, j, segment + 1]
         for f in range(wp.static(FOURIER_TERMS)):
-            fourier = 1.0
+            fourier = float(1.0)
             if f == 1:
                 fourier = cosine
             elif f == 2:

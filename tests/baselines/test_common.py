@@ -46,7 +46,7 @@ def test_number_of_demonstrations(demos):
     one = SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=1, device=CPU)
     assert one.num_episodes == 1
     assert SequenceDataset([demos, demos], PEG, SPEC, 2, 16, num_demos=3, device=CPU).num_episodes == 3
-    with pytest.raises(DemonstrationError, match="holds 2 episodes, 9 are wanted"):
+    with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, the files hold"):
         SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=9, device=CPU)
 
 
