@@ -28,7 +28,7 @@ add_mesa_source() { # a release of Mesa that is new enough, where the system's o
   debian-12)
     # the suite's address is that of the machine's own sources
     local uri
-    uri=$(cat /etc/apt/sources.list /etc/apt/sources.list.d/* 2>/dev/null |
+    uri=$({ cat /etc/apt/sources.list /etc/apt/sources.list.d/* 2>/dev/null || true; } |
       awk '/^URIs:/ && /debian/ && !/security/ {print $2; exit} /^deb / && !/security/ {for (i = 2; i <= NF; i++) if ($i ~ /^https?:/) {print $i; exit}}')
     echo "deb ${uri:-http://deb.debian.org/debian} bookworm-backports main" |
       as_root tee /etc/apt/sources.list.d/manifeel-backports.list >/dev/null
