@@ -8,6 +8,7 @@ import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import Camera, CameraConfig
+from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 from mani_skill.utils.visualization.misc import tile_images
 
@@ -296,15 +297,10 @@ class VisuotactileEnv(BaseEnv):
         return obs if unflattened else self._flatten_raw_obs(obs)
 
     def _flatten_raw_obs(self, obs: Any):
-        if self._tactile_outputs and self.obs_mode_struct.state:
-            flat = super()._flatten_raw_obs
-            mode, self._obs_mode = (
-                self._obs_mode,
-                "state+touch",
-            )  # not the whole-observation flattening of plain "state"
-            obs = flat(obs)
-            self._obs_mode = mode
-            return obs
+        if self._tactile_outputs and self.obs_mode_struct.state:  # plain "state" would flatten touch, too
+            tree = dict(agent=obs["agent"], extra=obs["extra"])
+            state = common.flatten_state_dict(tree, use_torch=True, device=self.device)
+            return {name: data for name, data in obs.items() if name not in tree} | dict(state=state)
         return super()._flatten_raw_obs(obs)
 
     def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
