@@ -64,7 +64,7 @@ class PandaGelSight(BaseAgent):
 
     @property
     def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return panda_gelsight_urdf()
+        return panda_gelsight_urdf(visuals=self.scene.can_render())
 
     @property
     def _controller_configs(self):

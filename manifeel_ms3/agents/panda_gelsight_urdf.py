@@ -32,14 +32,17 @@ _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
 
 
-def panda_gelsight_urdf() -> str:
-    """Path of the derived URDF; it and the low-poly meshes are made on the first call and cached."""
+def panda_gelsight_urdf(visuals: bool = True) -> str:
+    """Path of the derived URDF; it and the low-poly meshes are made on the first call and cached.
+
+    Without `visuals` it can be loaded where there is no renderer at all: SAPIEN makes a render material for every visual.
+    """
     # the key covers everything the files are made from: this module, the package's URDF, and where the package lies
     recipe = Path(__file__).read_bytes() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
     folder = cache_dir() / f"panda_gelsight-{hashlib.sha256(recipe).hexdigest()[:12]}"
     if not (folder / "panda.urdf").is_file():
         _build_into(folder)
-    return str(folder / "panda.urdf")
+    return str(folder / ("panda.urdf" if visuals else "panda_bare.urdf"))
 
 
 def _build_into(folder: Path) -> None:
@@ -51,7 +54,12 @@ def _build_into(folder: Path) -> None:
         tree = ET.parse(_SOURCE / "panda_v2.urdf")
         _derive(tree.getroot(), work)
         tree.write(work / "panda.urdf")
-        (work / "panda.srdf").write_bytes((_SOURCE / "panda_v2.srdf").read_bytes())
+        for link in tree.getroot().iter("link"):
+            for visual in link.findall("visual"):
+                link.remove(visual)
+        tree.write(work / "panda_bare.urdf")
+        for name in ("panda.srdf", "panda_bare.srdf"):
+            (work / name).write_bytes((_SOURCE / "panda_v2.srdf").read_bytes())
         try:
             work.replace(folder)
         except OSError:

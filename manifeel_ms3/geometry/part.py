@@ -32,11 +32,12 @@ class Part:
         """Add the part to a scene as a "dynamic", "kinematic" or "static" actor."""
         builder = scene.create_actor_builder()
         material = PhysxMaterial(self.friction, self.friction, 0.0)
-        look = RenderMaterial(base_color=[*self.colour, 1.0], roughness=0.6, specular=0.3)
         for box in self.boxes:
             pose, half_size = sapien.Pose(box.centre), np.asarray(box.size) / 2
             builder.add_box_collision(pose, half_size, material, self.density)
-            builder.add_box_visual(pose, half_size, look)
+            if scene.can_render():  # a render material cannot even be made without a renderer
+                look = RenderMaterial(base_color=[*self.colour, 1.0], roughness=0.6, specular=0.3)
+                builder.add_box_visual(pose, half_size, look)
         builder.initial_pose = initial_pose
         builder.set_physx_body_type(body_type)
         return builder.build(self.name)

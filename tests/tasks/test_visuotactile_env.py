@@ -1,5 +1,9 @@
 """The contract of every task's environment: what is observed, what is refused, what is reproducible."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -112,6 +116,26 @@ def test_pictures_without_a_renderer_say_what_to_install(make_env):
         make_env(obs_mode="rgb", render_backend="none")
     with pytest.raises(RuntimeError, match="render_mode"):
         make_env(obs_mode="state", render_mode="rgb_array", render_backend="none")
+
+
+def test_machine_without_vulkan_runs_what_needs_no_picture():
+    """In a process of its own, which finds no Vulkan driver."""
+    script = """
+import gymnasium as gym, manifeel_ms3
+env = gym.make("ManiFeel-PegInsertion-v1", obs_mode="state")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+obs, _ = gym.make("ManiFeel-PegInsertion-v1", obs_mode="tacrgb+tacff").reset(seed=0)
+assert obs["sensor_data"]["tactile_right"]["force_field"].abs().max() > 0
+try:
+    gym.make("ManiFeel-PegInsertion-v1", obs_mode="rgb")
+except RuntimeError as error:
+    assert "mesa-vulkan-drivers" in str(error)
+    print("as promised")
+"""
+    nowhere = {"VK_ICD_FILENAMES": "/nowhere.json", "VK_DRIVER_FILES": "/nowhere.json", "CUDA_VISIBLE_DEVICES": ""}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=os.environ | nowhere, check=False)
+    assert "as promised" in done.stdout, done.stderr[-2000:]
 
 
 def rollout(env, seed, steps=6):
