@@ -18,6 +18,7 @@ import imageio.v2 as imageio
 import jinja2
 import numpy as np
 import plotly.graph_objects as go
+import torch
 import tyro
 from mani_skill.utils import common
 
@@ -50,6 +51,7 @@ class Frame:
 
 def record_episode(result: dict[str, Any], checkpoint: Path) -> tuple[EpisodeOutcome, list[Frame]]:
     """Roll the first successful episode (or the first) of an evaluation out again, with every picture."""
+    torch.set_num_threads(1)  # as in the evaluation: sums, and with them a rollout, depend on it
     seeds = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (seeds or [result["episodes"][0]["seed"]])[0]
     cameras = tuple(dict.fromkeys([*result["env_kwargs"]["cameras"], "front"]))

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import torch
 
-FULL_SCALE = 0.6  # N per taxel, drawn at full brightness and as an arrow of one taxel pitch
+NORMAL_SCALE = 0.6  # N per taxel, drawn at full brightness
+SHEAR_SCALE = 0.1  # N per taxel, drawn as an arrow of one taxel pitch
 
 
 def force_field_images(force_field: torch.Tensor, size: tuple[int, int] = (240, 320)) -> torch.Tensor:
@@ -15,13 +16,13 @@ def force_field_images(force_field: torch.Tensor, size: tuple[int, int] = (240, 
 
 def _draw(field: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     rows, cols = field.shape[:2]
-    level = np.clip(field[..., 0] / FULL_SCALE, 0, 1)
+    level = np.clip(field[..., 0] / NORMAL_SCALE, 0, 1)
     colour = cv2.applyColorMap((255 * level).astype(np.uint8), cv2.COLORMAP_VIRIDIS)[..., ::-1]
     picture = cv2.resize(np.ascontiguousarray(colour), (size[1], size[0]), interpolation=cv2.INTER_NEAREST)
     pitch = np.array([size[0] / rows, size[1] / cols])
     for i in range(rows):
         for j in range(cols):
-            arrow = np.clip(field[i, j, 1:] / FULL_SCALE, -2, 2) * pitch
+            arrow = np.clip(field[i, j, 1:] / SHEAR_SCALE, -2, 2) * pitch
             if np.hypot(*arrow) < 1:
                 continue
             start = (np.array([i, j]) + 0.5) * pitch
