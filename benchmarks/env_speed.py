@@ -20,13 +20,13 @@ import manifeel_ms3  # noqa: F401
 from manifeel_ms3.tasks.rendering import available_render_backend
 
 TARGETS = {"state": 150, "rgb": 50, "rgb+tacff": 35, "rgb+tacrgb+tacff": 25}
-PARTS = {  # where the time goes, by the function that spends it
-    "physics": "sapien.pysapien.step",
-    "rendering": "get_picture",
-    "rays": "heights",
-    "gel mechanics": ("solve_indentation", "_feel"),
-    "optics": ("surface", "shade"),
-    "control": "set_action",
+PARTS = {  # where the time goes: functions by a part of their file's and their name
+    "physics": [("~", "pysapien.step")],
+    "rendering": [("~", "get_picture"), ("~", "take_picture"), ("~", "update_render")],
+    "control": [("panda_gelsight", "pad_joint_forces"), ("agents/controllers.py", "set_action")],
+    "rays": [("raycast.py", "heights")],
+    "gel mechanics": [("contact.py", "solve_indentation"), ("tactile_sensor.py", "_feel")],
+    "optics": [("optics.py", "surface"), ("optics.py", "shade")],
 }
 
 
@@ -50,23 +50,19 @@ def steps_per_second(env: gym.Env, steps: int, scale: float) -> float:
 
 
 def shares(env: gym.Env, steps: int) -> dict[str, float]:
-    """Share of a step's time by part, cumulative."""
+    """Share of a step's time by part."""
     profile = cProfile.Profile()
     profile.enable()
     for _ in range(steps):
         env.step(np.zeros(env.unwrapped.single_action_space.shape, np.float32))
     profile.disable()
     stats = pstats.Stats(profile).stats  # pyright: ignore[reportAttributeAccessIssue]
-    total = sum(entry[2] for entry in stats.values())
-    spent = {}
-    for part, names in PARTS.items():
-        names = (names,) if isinstance(names, str) else names
-        spent[part] = sum(entry[3] for (_, _, name), entry in stats.items() if any(_matches(name, n) for n in names)) / total
-    return spent
+    total = sum(own_time for _, _, own_time, _, _ in stats.values())
+    return {part: sum(_time_in(stats, *function) for function in functions) / total for part, functions in PARTS.items()}
 
 
-def _matches(function: str, name: str) -> bool:
-    return function == name or function.endswith((f"{name}>", f"{name}}}")) or f".{name}" in function
+def _time_in(stats: dict, file: str, name: str) -> float:
+    return sum(entry[3] for (path, _, function), entry in stats.items() if file in path and name in function)
 
 
 def main(args: Args) -> None:

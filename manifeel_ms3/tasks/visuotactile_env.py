@@ -197,6 +197,7 @@ class VisuotactileEnv(BaseEnv):
             if self._tactile_outputs
         }
         self._touch_is_fresh = False
+        self._measured: dict[str, torch.Tensor] | None = None
         self._steps_at_goal = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         self._contact_force = torch.zeros(self.num_envs, device=self.device)
 
@@ -228,7 +229,7 @@ class VisuotactileEnv(BaseEnv):
             self.scene._gpu_fetch_all()
         if state is not None:
             running = others.nonzero()[:, 0]
-            del state["controller"]
+            state.pop("controller", None)
             state = {kind: {k: v[running] for k, v in bodies.items()} for kind, bodies in state.items()}
             self.set_state_dict(state, running)
         self._touch_is_fresh = False
@@ -238,7 +239,7 @@ class VisuotactileEnv(BaseEnv):
             self._initialize_task(env_idx)
         self._steps_at_goal[env_idx] = 0
         self._contact_force[env_idx] = 0.0
-        self._touch_is_fresh = False
+        self._touch_is_fresh, self._measured = False, None
         for sensor in self._tactile_sensors.values():
             sensor.reset(env_idx)
             sensor.reseed(int(self._episode_seed[0]))
@@ -249,7 +250,8 @@ class VisuotactileEnv(BaseEnv):
         action = super()._step_action(action)
         self._contact_force = self.agent.held_object_force(torch.stack(self._pad_forces)).amax(dim=0)
         self._touch_is_fresh = False
-        reached = self.goal_reached(self.measure())
+        self._measured = self.measure()  # for the `evaluate` that follows
+        reached = self.goal_reached(self._measured)
         self._steps_at_goal = torch.where(reached, self._steps_at_goal + 1, 0)
         return action
 
@@ -277,10 +279,10 @@ class VisuotactileEnv(BaseEnv):
         super().set_state_dict(state, env_idx)
         if "controller" in state:
             self.agent.set_controller_state(state["controller"])
-        self._touch_is_fresh = False
+        self._touch_is_fresh, self._measured = False, None
 
     def evaluate(self) -> dict:
-        measures = self.measure()
+        measures, self._measured = self._measured or self.measure(), None
         held = self._steps_at_goal >= round(HOLD_SECONDS * self._control_freq)
         return dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
 
