@@ -44,7 +44,6 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     page = report.main(report.Args(tmp_path)).read_text()
     for needed in ("data:video/mp4;base64,", "data:image/png;base64,", "Wilson", "socket_xy", "TacFF", "plotly"):
         assert needed in page
-    assert page.count("http") - page.count("http://www.w3.org") >= 0  # plotly's source names addresses, the page loads none
     assert 'src="http' not in page
 
 
