@@ -7,10 +7,11 @@ cd "$(dirname "$0")/.."
 TORCH_CPU_VERSION=2.13.0
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
+WITHOUT_PICTURES="only what needs no picture works: obs_mode='state' or 'tacff' with render_backend='none'."
 
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
-installed() { dpkg-query -W -f='${Status}' "$1" 2>/dev/null | grep -q 'ok installed'; }
+has_library() { ldconfig -p | grep -q "$1"; } # packages have other names from release to release
 
 as_root() {
   if [ "$(id -u)" = 0 ]; then "$@"; elif sudo -n true 2>/dev/null; then sudo "$@"; else return 1; fi
@@ -37,22 +38,23 @@ add_mesa_source() { # a release of Mesa that is new enough, where the system's o
     ;;
   ubuntu-22.04)
     as_root apt-get install -y -q software-properties-common
-    as_root add-apt-repository -y ppa:kisak/kisak-mesa
-    as_root apt-get update -q
+    as_root add-apt-repository -y ppa:kisak/kisak-mesa && as_root apt-get update -q
     ;;
   esac
 }
 
 install_system_packages() {
-  local wanted=(libvulkan1 libegl1 libgl1 libglib2.0-0) missing=() MESA_RELEASE=()
-  python3 -c 'import ensurepip, venv' 2>/dev/null || wanted+=(python3-venv)
-  for package in "${wanted[@]}"; do installed "$package" || missing+=("$package"); done
+  local missing=() MESA_RELEASE=() pair
+  for pair in libvulkan.so.1:libvulkan1 libEGL.so.1:libegl1 libGL.so.1:libgl1 libglib-2.0.so.0:libglib2.0-0; do
+    has_library "${pair%%:*}" || missing+=("${pair##*:}")
+  done
+  python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
   local mesa=true
   has_gpu || new_enough_mesa || mesa=false
   [ ${#missing[@]} = 0 ] && $mesa && return
   if ! command -v apt-get >/dev/null || ! as_root true; then
     say "No root: please have these installed: ${missing[*]} $($mesa || echo "mesa-vulkan-drivers (>= $MIN_MESA)")"
-    say "Until then only what needs no picture works: obs_mode='state' or 'tacff' with render_backend='none'."
+    say "Until then $WITHOUT_PICTURES"
     return
   fi
   export DEBIAN_FRONTEND=noninteractive
@@ -61,9 +63,9 @@ install_system_packages() {
   if ! $mesa; then
     as_root apt-get install -y -q --no-install-recommends mesa-vulkan-drivers || true
     if ! new_enough_mesa; then
-      add_mesa_source
-      as_root apt-get install -y -q --no-install-recommends "${MESA_RELEASE[@]}" mesa-vulkan-drivers
+      { add_mesa_source && as_root apt-get install -y -q --no-install-recommends "${MESA_RELEASE[@]}" mesa-vulkan-drivers; } || true
     fi
+    new_enough_mesa || say "No mesa-vulkan-drivers >= $MIN_MESA could be installed: $WITHOUT_PICTURES"
   fi
 }
 
@@ -72,7 +74,8 @@ install_python_packages() {
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet)
   if ! has_gpu && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
     say "Installing torch for the CPU"
-    "${pip[@]}" "torch==$TORCH_CPU_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" torch
+    "${pip[@]}" "torch==$TORCH_CPU_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" torch ||
+      say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead"
   fi
   say "Installing the package and its extras"
   "${pip[@]}" -e ".[train,report,dev]"

@@ -1,6 +1,8 @@
 from .config import GelConfig as GelConfig
 from .config import OpticsConfig as OpticsConfig
 from .config import TactileSensorConfig as TactileSensorConfig
+from .config import TouchRandomization as TouchRandomization
 from .config import gelsight_mini as gelsight_mini
 from .config import gelsight_r15 as gelsight_r15
+from .config import with_options as with_options
 from .tactile_sensor import TactileSensor as TactileSensor

@@ -1,14 +1,18 @@
 """Configuration of a gel-based tactile sensor: the pad, the gel, the image, the taxels, the optics."""
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import sapien
 from mani_skill.sensors.base_sensor import BaseSensorConfig
 
 from manifeel_ms3.paths import data_dir
 
 DEPTH_BACKENDS = ("auto", "raycast", "sapien")
+UNITS = ("newton", "tacsl")
 
 
 @dataclass
@@ -45,21 +49,49 @@ class OpticsConfig:
     """Height map to RGB."""
 
     calibration: Path = field(default_factory=lambda: data_dir() / "gelsight_r15_shader.npz")
-    """Coefficients of the compact shader, written by `manifeel_ms3.sensors.fit_shader`."""
+    """Coefficients of the compact shader (`manifeel_ms3.sensors.fit_shader`), or a table in Taxim's format, `polycalib.npz`."""
     smoothing: float = 1.0
     """Blur of the gel's surface, pixels (the reflective coat does not follow an edge)."""
+    shadow: float = 0.0
+    """Share of a channel's light that a bump takes from what lies behind it, 0 to 1; the fitted colours hold none."""
     noise: float = 0.0
-    """Standard deviation of seeded read noise, grey levels of 255."""
+    """Standard deviation of seeded read noise, grey levels of 255 (a camera's: 2 to 4)."""
+    markers: bool = False
+    """Whether dots are printed on the skin, which move with its shear and spread where it is pressed."""
+    marker_pitch: float = 2.06e-3
+    """Distance of neighbouring dots, m (GelSight's marker gels: 7 x 9 dots)."""
+    marker_radius: float = 3.5e-4
+    """Radius of a dot, m."""
+
+
+@dataclass
+class TouchRandomization:
+    """What differs from pad to pad and episode to episode: half widths of uniform distributions around the configured values."""
+
+    gain: float = 0.0
+    """Of the colours' change, relative, each channel by itself."""
+    light_phase: float = 0.0
+    """Of the lights' direction, rad (0.17: 10 degrees)."""
+    stiffness: float = 0.0
+    """Of `gel.youngs_modulus`, relative."""
+    friction: float = 0.0
+    """Of `gel.friction`, relative."""
 
 
 @dataclass
 class TactileSensorConfig(BaseSensorConfig):
     """One pad. Pad frame: origin at the centre of the untouched face, x along image rows (across the finger), y along image
-    columns (towards the tip), z out of the gel."""
+    columns (towards the tip), z out of the gel.
+
+    Raises:
+        ValueError: a value that cannot be; the message names the field.
+    """
 
     uid: str = "tactile"
     link: str = "gel_right"
-    """Link of the robot that is the pad; its frame is the pad frame, and it hangs on a fixed joint, whose force is measured."""
+    """Link of the robot that carries the gel and nothing else that is touched: the force of its joint is measured."""
+    pad_pose: sapien.Pose = field(default_factory=sapien.Pose)
+    """The pad frame in the link's frame."""
     gel: GelConfig = field(default_factory=GelConfig)
     image_shape: tuple[int, int] = (240, 320)
     """Rows and columns of the TacRGB image."""
@@ -72,9 +104,15 @@ class TactileSensorConfig(BaseSensorConfig):
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     backend: Literal["auto", "raycast", "sapien"] = "auto"
     """Where depth comes from: rays against the meshes (no renderer needed) or a SAPIEN camera in the pad."""
+    units: Literal["newton", "tacsl"] = "newton"
+    """Of the force field. "tacsl": the paper's own quantities, penetration in m and 0.1 |v_t| in m/s (`TACSL_*` in taxels.py)."""
+    randomization: TouchRandomization = field(default_factory=TouchRandomization)
 
     def __post_init__(self):
         _require_positive(self)
+        _require_in_range(self)
+        if self.units not in UNITS:
+            raise ValueError(f"units={self.units!r} of tactile sensor {self.uid!r} is unknown; use one of {UNITS}")
         if self.backend not in DEPTH_BACKENDS:
             raise ValueError(f"backend={self.backend!r} of tactile sensor {self.uid!r} is unknown; use one of {DEPTH_BACKENDS}")
         for name, shape, pitch in (
@@ -101,12 +139,48 @@ def _require_positive(config: TactileSensorConfig) -> None:
         "pixel_size": (config.pixel_size,),
         "taxel_shape": config.taxel_shape,
         "taxel_pitch": (config.taxel_pitch,),
+        "optics.marker_pitch": (config.optics.marker_pitch,),
+        "optics.marker_radius": (config.optics.marker_radius,),
     }
     for name, value in values.items():
         if any(not v > 0 for v in value):
             raise ValueError(f"{name}={value} of tactile sensor {config.uid!r} must be positive")
-    if not 0 <= gel.poisson_ratio < 0.5:
-        raise ValueError(f"gel.poisson_ratio={gel.poisson_ratio} of tactile sensor {config.uid!r} must lie in [0, 0.5)")
+
+
+def _require_in_range(config: TactileSensorConfig) -> None:
+    optics, randomization = config.optics, config.randomization
+    limits = {
+        "gel.poisson_ratio": (config.gel.poisson_ratio, 0.0, 0.499),
+        "optics.smoothing": (optics.smoothing, 0.0, 20.0),
+        "optics.shadow": (optics.shadow, 0.0, 1.0),
+        "optics.noise": (optics.noise, 0.0, 255.0),
+        "randomization.gain": (randomization.gain, 0.0, 1.0),
+        "randomization.light_phase": (randomization.light_phase, 0.0, 3.15),
+        "randomization.stiffness": (randomization.stiffness, 0.0, 0.99),
+        "randomization.friction": (randomization.friction, 0.0, 0.99),
+    }
+    for name, (value, low, high) in limits.items():
+        if not low <= value <= high:
+            raise ValueError(f"{name}={value} of tactile sensor {config.uid!r} must lie in [{low}, {high}]")
+
+
+def with_options(config: TactileSensorConfig, options: Mapping[str, Any]) -> TactileSensorConfig:
+    """The config with some fields changed, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+
+    Raises:
+        ValueError: a name that is no field, or a value that cannot be.
+    """
+    for name, value in options.items():
+        config = _with(config, name.split("."), value, name)
+    return config
+
+
+def _with(config: Any, path: list[str], value: Any, name: str) -> Any:
+    known = [f.name for f in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
+    if path[0] not in known:
+        raise ValueError(f"tactile option {name!r}: {path[0]!r} is not one of {known}")
+    value = value if len(path) == 1 else _with(getattr(config, path[0]), path[1:], value, name)
+    return dataclasses.replace(config, **{path[0]: value})
 
 
 def _mm(extent: tuple[float, ...]) -> str:

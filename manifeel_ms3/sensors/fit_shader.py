@@ -1,92 +1,118 @@
-"""Fit the compact shader to a table in Taxim's format: `python -m manifeel_ms3.sensors.fit_shader --table polycalib.npz`.
+"""Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.fit_shader {table,presses} ...`.
 
-The table (Taxim, section III) lies in portrait: u = column along our rows, v = row against our columns. A bin pair (slope m,
-direction phi) holds, per channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. Any number of bins.
+From a table in Taxim's format, or from presses of a ball of known radius: a folder with `background.png` (untouched gel), the
+pictures, and `presses.csv`, whose lines say `file,row,col,radius`: the contact circle in pixels.
 """
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import tyro
 
-from .shader import KNOTS, Shader, fourier_terms, place_terms, slope_terms
+from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
+from .taxim_table import fit_table, read_table
 
-MAX_SLOPE = 1.0  # rad; the shader is constant beyond
-TABLE_CHANNELS = ("grad_r", "grad_g", "grad_b")
-# Untouched R1.5 gel, RGB at the picture's centre and its corners (u, v) = (-,-) (+,-) (-,+) (+,+): quadratic through them
-BACKGROUND_CENTRE = (140.0, 149.0, 134.0)
-BACKGROUND_CORNERS = ((107.0, 112.0, 31.0), (93.0, 113.0, 68.0), (106.0, 87.0, 72.0), (102.0, 103.0, 83.0))
+RIDGE = 1e-6  # of the mean diagonal: slopes and places that no press reached stay at zero
 
 
 @dataclass
-class Args:
+class Table:
+    """Fit to a polycalib.npz in Taxim's format."""
+
     table: Path
-    """polycalib.npz with grad_r, grad_g, grad_b, each (bins, bins, 6)"""
-    out: Path = Path("data/gelsight_r15_shader.npz")
+    """npz with grad_r, grad_g, grad_b, each (bins, bins, 6)"""
+    out: Path
     image_shape: tuple[int, int] = (240, 320)
     """rows and columns of our picture, the table's on its side"""
 
 
-def portrait_place(r: np.ndarray, c: np.ndarray, image_shape: tuple[int, int]) -> np.ndarray:
-    """Table terms (..., 6) = (u^2, v^2, u v, u, v, 1) at normalised places (r, c) of our picture."""
-    rows, cols = image_shape
-    u, v = (r + 1) / 2 * (rows - 1), (1 - c) / 2 * (cols - 1)
-    return np.stack([u * u, v * v, u * v, u, v, np.ones_like(u)], axis=-1)
+@dataclass
+class Presses:
+    """Fit to pictures of ball presses."""
+
+    folder: Path
+    ball_radius: float
+    """m"""
+    pixel_size: float
+    """m per pixel"""
+    out: Path
 
 
-def read_table(path: Path) -> np.ndarray:
-    """(3, bins, bins, 6): channel, slope bin, direction bin, term.
+def fit_presses(
+    background: np.ndarray, pictures: np.ndarray, circles: np.ndarray, ball_radius: float, pixel_size: float
+) -> Shader:
+    """Shader of a gel from presses of a ball.
+
+    Within a contact circle the gel has the ball's shape, so that every pixel there is a sample of slope, direction and place.
+
+    Args:
+        background: (H, W, 3), RGB, untouched gel.
+        pictures: (P, H, W, 3), RGB, of presses.
+        circles: (P, 3), row, column and radius of the contact, pixels.
+        ball_radius: m.
+        pixel_size: m per pixel.
 
     Raises:
-        ValueError: the file is missing or not of Taxim's form.
+        ValueError: a contact circle larger than the ball, or pictures of different shapes.
     """
-    if not Path(path).is_file():
-        raise ValueError(f"calibration table {path} does not exist; give a polycalib.npz in Taxim's format")
-    with np.load(path) as stored:
-        missing = [name for name in TABLE_CHANNELS if name not in stored]
-        if missing:
-            raise ValueError(f"calibration table {path} lacks {missing}; it must hold {TABLE_CHANNELS}, each (bins, bins, 6)")
-        table = np.stack([stored[name] for name in TABLE_CHANNELS])
-    if table.ndim != 4 or table.shape[1] != table.shape[2] or table.shape[3] != 6:
-        raise ValueError(f"calibration table {path} has arrays of shape {table.shape[1:]}, not (bins, bins, 6)")
-    return table
+    rows, cols = background.shape[:2]
+    if pictures.shape[1:] != background.shape:
+        raise ValueError(f"pictures have shape {pictures.shape[1:]}, the background {background.shape}; they must be the same")
+    if (circles[:, 2] * pixel_size >= ball_radius).any():
+        raise ValueError(f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball: mend radius or pixel_size")
+    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
+    place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
+    columns = FOURIER_TERMS * (len(KNOTS) - 1) * PLACE_TERMS
+    normal, right = np.zeros((columns, columns)), np.zeros((columns, 3))
+    for picture, (middle_row, middle_col, radius) in zip(pictures, circles, strict=True):
+        y, x = (row - middle_row) * pixel_size, (col - middle_col) * pixel_size
+        r2 = x * x + y * y
+        inside = r2 < (radius * pixel_size) ** 2
+        slope = np.sqrt(r2[inside] / (ball_radius**2 - r2[inside]))
+        phi = np.arctan2(-x[inside], -y[inside])  # uphill, into the gel, is towards the middle
+        design = np.einsum("nf,nk,nq->nfkq", fourier_terms(phi), slope_terms(slope), place[inside]).reshape(-1, columns)
+        normal += design.T @ design
+        right += design.T @ (picture[inside].astype(float) - background[inside])
+    weights = np.linalg.solve(normal + RIDGE * np.trace(normal) / columns * np.eye(columns), right)
+    flat = np.linalg.lstsq(place.reshape(-1, PLACE_TERMS), background.reshape(-1, 3).astype(float), rcond=None)[0]
+    return Shader(weights.T.reshape(3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS), flat.T)
 
 
-def fit(table: np.ndarray, image_shape: tuple[int, int]) -> Shader:
-    """Least squares over all bins up to `MAX_SLOPE`, after taking the table's own zero-slope value off at every place."""
-    bins = table.shape[1]
-    slope = np.arange(bins) * (np.pi / 2 / (bins - 1))
-    phi = np.arange(bins) * (2 * np.pi / (bins - 1)) - np.pi + np.pi / (bins - 1)  # middle of the bin
-    kept = (slope > 0) & (slope <= MAX_SLOPE)
-    flat = table[:, 0, bins // 2]  # |grad| = 0 falls into the bin of phi = 0
-    change = table[:, kept] - flat[:, None, None]  # (3, S, P, 6), portrait terms
-    # a quadratic in (u, v) is one in (r, c): change the terms exactly, on a 3 x 3 grid that determines both
-    r, c = (g.flatten() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"))
-    to_ours = np.linalg.pinv(place_terms(r, c)) @ portrait_place(r, c, image_shape)  # (6, 6)
-    change = change @ to_ours.T
-    # our direction: dh/du = dh/dr, dh/dv = -dh/dc, so that phi_ours = -phi
-    middle = slope[kept] + (slope[1] - slope[0]) / 2
-    design = np.einsum("pf,sk->spfk", fourier_terms(-phi), slope_terms(np.tan(middle)))
-    design = design.reshape(-1, design.shape[2] * design.shape[3])
-    weights = [np.linalg.lstsq(design, change[channel].reshape(len(design), 6), rcond=None)[0] for channel in range(3)]
-    weights = np.stack(weights).reshape(3, fourier_terms(phi).shape[-1], len(KNOTS) - 1, 6)
-    return Shader(weights, _background())
+def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Background, pictures and circles of a folder, as `fit_presses` takes them.
+
+    Raises:
+        ValueError: a file is missing or cannot be read.
+    """
+    listing = folder / "presses.csv"
+    if not listing.is_file():
+        raise ValueError(f"{listing} does not exist; it must say file,row,col,radius of every press")
+    with open(listing, newline="") as lines:
+        presses = list(csv.DictReader(lines))
+    if not presses or set(presses[0]) < {"file", "row", "col", "radius"}:
+        raise ValueError(f"{listing} must have the columns file, row, col, radius and at least one press")
+    circles = np.array([[float(press[name]) for name in ("row", "col", "radius")] for press in presses])
+    return _picture(folder / "background.png"), np.stack([_picture(folder / p["file"]) for p in presses]), circles
 
 
-def _background() -> np.ndarray:
-    """(3, 6) place terms through the five measured colours, the curvature shared equally between the axes."""
-    centre, corners = np.array(BACKGROUND_CENTRE), np.array(BACKGROUND_CORNERS)
-    r, c = np.array([-1.0, 1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])  # u is our r, v our -c
-    linear = [(corners * weight[:, None]).mean(axis=0) for weight in (r, c, r * c)]
-    curvature = (corners.mean(axis=0) - centre) / 2
-    return np.stack([centre, linear[0], linear[1], curvature, linear[2], curvature], axis=-1)
+def _picture(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise ValueError(f"{path} is missing or no picture")
+    return picture[..., ::-1]
 
 
-def main(args: Args) -> None:
+def main(args: Table | Presses) -> None:
+    if isinstance(args, Table):
+        shader = fit_table(read_table(args.table), args.image_shape)
+    else:
+        shader = fit_presses(*read_presses(args.folder), args.ball_radius, args.pixel_size)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    fit(read_table(args.table), args.image_shape).save(args.out)
+    shader.save(args.out)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    main(tyro.cli(Table | Presses))

@@ -1,26 +1,23 @@
 """A gel-based tactile sensor (GelSight and its kin) for ManiSkill environments."""
 
+import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.sensors.base_sensor import BaseSensor
 from mani_skill.utils.structs import Articulation
 
 from .config import TactileSensorConfig
-from .contact import ContactGrid, penetration, solve_indentation, solve_shear, taxel_weights
 from .depth_camera import CameraDepth
-from .optics import Optics
 from .raycast import RaycastDepth
+from .touch_model import OUTPUTS, TouchModel
 from .visualisation import force_field_images
 from .wrench import WrenchGauge
-
-CONTACT_CELL = 3.5e-4  # m: a tenth of a millimetre of error in the contact's outline; 6,188 cells on the R1.5
-OUTPUTS = ("rgb", "force_field")
 
 
 class TactileSensor(BaseSensor):
     """One pad of a robot: wrench, shape of what presses, and from both a force field and an image.
 
-    - Wrench: the force and moment that the engine carries through the pad's fixed joint.
+    - Wrench: the force and moment that the engine carries through the pad's joint.
     - Shape: height of whatever is near the pad, by rays or by a camera in the pad.
     - Penetration: the depth and tilt at which the gel layer carries that wrench (`contact.solve_indentation`).
     - Force field: pressure of the layer, and shear by bristles with memory (`contact.solve_shear`), N per taxel.
@@ -36,7 +33,7 @@ class TactileSensor(BaseSensor):
 
     Raises:
         ValueError: a link or output that does not exist.
-        RuntimeError: backend "sapien" without a renderer.
+        RuntimeError: backend "sapien" without a renderer, or for units "tacsl"; a body with an empty mesh.
     """
 
     config: TactileSensorConfig
@@ -55,24 +52,20 @@ class TactileSensor(BaseSensor):
             )
         if unknown := set(outputs) - set(OUTPUTS):
             raise ValueError(f"outputs {sorted(unknown)} of tactile sensor {config.uid!r} are unknown; use {OUTPUTS}")
-        self.scene, self.articulation, self.outputs = scene, articulation, outputs
+        self.scene = scene
         self.pad = articulation.links_map[config.link]
-        self._gauge = WrenchGauge(articulation, self.pad)
-        self.grid = ContactGrid.covering(config.gel.size, CONTACT_CELL, scene.device)
-        self._cells = torch.stack([self.grid.x, self.grid.y], dim=-1).float()
-        self._taxel_weights = taxel_weights(self.grid, config.taxel_shape, config.taxel_pitch)
-        self._pixels = _pixel_grid(config, scene.device)
-        self._optics = Optics(config, scene.device) if "rgb" in outputs else None
+        self.model = TouchModel(config, scene.num_envs, scene.device, tuple(outputs))
+        self._gauge = WrenchGauge(articulation, self.pad, config.pad_pose)
         self._depth = self._make_depth()
-        self._bristle = torch.zeros(scene.num_envs, len(self._cells), 2, dtype=torch.float64, device=scene.device)
         self._obs: dict[str, torch.Tensor] = {}
+        self.reset(torch.arange(scene.num_envs, device=scene.device))
 
-    def _make_depth(self):
-        if self.config.backend == "sapien":
-            return CameraDepth(self.config.uid, self.scene, self.pad, self.config.gel.size, self.config.pixel_size)
-        return RaycastDepth(
-            self.scene, self.pad, self.config.gel.size, self._unfelt_links()
-        )  # "auto": the faster one on CPU and GPU
+    def _make_depth(self) -> RaycastDepth | CameraDepth:
+        config = self.config
+        if config.backend == "sapien":
+            return CameraDepth(config, self.scene, self.pad)
+        # "auto": rays are the faster ones on CPU and GPU
+        return RaycastDepth(self.scene, self.pad, config.pad_pose, config.gel.size, self._unfelt_links())
 
     def _unfelt_links(self) -> set[str]:
         """Links that the gel cannot touch: its own finger, and what carries it as far as the robot's base."""
@@ -87,58 +80,30 @@ class TactileSensor(BaseSensor):
         """Whether `scene.update_render` must precede `capture`."""
         return isinstance(self._depth, CameraDepth)
 
-    def reset(self, env_idx: torch.Tensor) -> None:
-        """Forget the shear history of these environments."""
-        self._bristle[env_idx] = 0.0
-
-    def reseed(self, seed: int) -> None:
-        """Start the image noise of an episode anew."""
-        if self._optics is not None:
-            self._optics.reseed(seed)
+    def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None) -> None:
+        """Begin an episode in these environments: no shear; noise and what is randomised as the seeds, one each, say (0)."""
+        self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
 
     def wrench(self) -> torch.Tensor:
         """Force and moment (N, 6), N and N m, of the world on the pad, about the pad frame's origin, in the pad frame."""
         return self._gauge.read()
 
     def capture(self) -> None:
-        gel = self.config.gel
-        wrench = self.wrench()
-        grids = [self._cells, self._pixels] if self._optics is not None else [self._cells]
-        heights = self._depth.heights(grids)
-        cell_height = heights[0].to(torch.float64)
-        plane = solve_indentation(cell_height, wrench, self.grid, gel.normal_stiffness)
-        self._obs = {}
-        if "force_field" in self.outputs:
-            self._obs |= self._feel(cell_height, plane, wrench)
-        if self._optics is not None:
-            depth = penetration(heights[1], plane, self._pixels[:, 0], self._pixels[:, 1], gel.max_penetration)
-            surface = self._optics.surface(depth.reshape(-1, *self.config.image_shape).float())
-            self._obs["rgb"] = self._optics.shade(surface)
-
-    def _feel(self, height: torch.Tensor, plane: torch.Tensor, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
-        gel, grid = self.config.gel, self.grid
-        depth = penetration(height, plane, grid.x, grid.y, gel.max_penetration)
-        pressure = depth * (gel.normal_stiffness * grid.area)  # (N, C), N
-        shear = solve_shear(self._bristle, pressure, wrench, grid, gel.shear_stiffness, gel.friction)
-        self._bristle = shear / (gel.shear_stiffness * grid.area)
-        values = torch.stack([pressure, shear[..., 0], shear[..., 1], depth * pressure], dim=-1)
-        taxels = (self._taxel_weights @ values).unflatten(1, self.config.taxel_shape)
-        force = taxels[..., :3]
-        mean_depth = taxels[..., 3] / taxels[..., 0].clamp(min=1e-9)  # of the pressed part of a taxel
-        return dict(force_field=force.float(), penetration=mean_depth.float())
+        """Sense what the scene is like now."""
+        self._obs = self.model.observe(self._depth, self.wrench())
 
     def get_obs(self, **kwargs) -> dict[str, torch.Tensor]:
         """What the last `capture` saw.
 
         `rgb` uint8 (N, 240, 320, 3). `force_field` float32 (N, 10, 14, 3), N per taxel, pad frame, of the object on the gel:
         normal (>= 0, into the gel), shear along increasing rows, shear along increasing columns. `penetration` float32
-        (N, 10, 14), m.
+        (N, 10, 14), m. With units "tacsl", the force field is what `taxels.tacsl_field` says.
         """
         return dict(self._obs)
 
     def get_params(self) -> dict[str, torch.Tensor]:
         """Pad pose in the world, (N, 7), m and wxyz."""
-        return dict(pose=self.pad.pose.raw_pose)
+        return dict(pose=(self.pad.pose * self.config.pad_pose).raw_pose)
 
     def get_images(self, obs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         """Pictures for people, uint8 (N, H, W, 3), of an observation."""
@@ -148,11 +113,3 @@ class TactileSensor(BaseSensor):
         if "force_field" in obs:
             images["force_field"] = force_field_images(obs["force_field"], self.config.image_shape)
         return images
-
-
-def _pixel_grid(config: TactileSensorConfig, device: torch.device) -> torch.Tensor:
-    """Pixel centres (H W, 2) of the image in the pad frame, m."""
-    rows, cols = config.image_shape
-    x = (torch.arange(rows, device=device) - (rows - 1) / 2) * config.pixel_size
-    y = (torch.arange(cols, device=device) - (cols - 1) / 2) * config.pixel_size
-    return torch.stack(torch.meshgrid(x, y, indexing="ij"), dim=-1).reshape(-1, 2).float()

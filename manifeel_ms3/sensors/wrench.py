@@ -1,21 +1,25 @@
 """The whole wrench on a link, friction included, from the force that its joint carries."""
 
+import sapien
 import torch
 from mani_skill.utils.structs import Articulation, Link
 
 
 class WrenchGauge:
-    """Measures the force and moment of the world on one link, in the link's frame about its origin.
+    """Measures the force and moment of the world on one link, in a frame fixed to it, about that frame's origin.
 
     The engine's spatial force of a joint is what the child link puts through it onto its parent, in the joint's frame. SAPIEN's
     joint frames are turned against the link's (half a turn about x for fixed joints); contact queries would leave friction out.
     The link's own weight and inertia are in it, unless its gravity is off, as on ManiSkill's robots.
+
+    Args:
+        frame: in the link's frame; default: the link's own.
     """
 
-    def __init__(self, articulation: Articulation, link: Link):
+    def __init__(self, articulation: Articulation, link: Link, frame: sapien.Pose | None = None):
         self.articulation = articulation
         self._index = int(link.index[0])
-        joint = link.joint._objs[0].pose_in_child.to_transformation_matrix()
+        joint = ((frame or sapien.Pose()).inv() * link.joint._objs[0].pose_in_child).to_transformation_matrix()
         self._rotation = torch.as_tensor(joint[:3, :3].T, dtype=torch.float64, device=articulation.device)
         self._arm = torch.as_tensor(joint[:3, 3], dtype=torch.float64, device=articulation.device)
 

@@ -1,6 +1,6 @@
 """The base of every ManiFeel task: table, robot, cameras, light, touch, and what an observation holds."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from mani_skill.utils.visualization.misc import tile_images
 
 from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.geometry import Box, Part
-from manifeel_ms3.sensors import TactileSensor, gelsight_r15
+from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
 
 from .obs_modes import split_obs_mode
 from .pictures import same_height, same_size
@@ -47,6 +47,7 @@ class VisuotactileEnv(BaseEnv):
     Args:
         cameras: those rendered, of "front", "side", "wrist"; default: the task's policy camera.
         tactile_sensors: pads observed, of "left", "right"; default: right, as in the paper.
+        tactile: fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
         lighting: "normal" or "dim" (5 %).
         occlusion: whether the task's occluder hides its interior; only tasks that have one take True.
         randomization: fields of the task's `Randomization` to override, by name.
@@ -75,6 +76,7 @@ class VisuotactileEnv(BaseEnv):
         render_backend: str = "auto",
         cameras: Iterable[str] | None = None,
         tactile_sensors: Iterable[str] = ("right",),
+        tactile: Mapping[str, Any] | None = None,
         lighting: str = "normal",
         occlusion: bool = False,
         randomization: dict[str, float] | None = None,
@@ -84,6 +86,9 @@ class VisuotactileEnv(BaseEnv):
         self._full_obs_mode = obs_mode or "state"
         self._camera_names = _known("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
         self._sides = _known("tactile_sensors", tactile_sensors, SIDES)
+        self._tactile_configs = {
+            f"tactile_{side}": with_options(gelsight_r15(f"tactile_{side}", f"gel_{side}"), tactile or {}) for side in self._sides
+        }
         (self._lighting,) = _known("lighting", [lighting], tuple(LIGHTING))
         if occlusion and not self.has_occluder:
             raise ValueError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -190,10 +195,8 @@ class VisuotactileEnv(BaseEnv):
     def _after_reconfigure(self, options: dict):
         # not in _setup_sensors, which runs only with a renderer: touch works without
         self._tactile_sensors = {
-            f"tactile_{side}": TactileSensor(
-                gelsight_r15(f"tactile_{side}", f"gel_{side}"), self.scene, self.agent.robot, self._tactile_outputs
-            )
-            for side in self._sides
+            uid: TactileSensor(config, self.scene, self.agent.robot, self._tactile_outputs)
+            for uid, config in self._tactile_configs.items()
             if self._tactile_outputs
         }
         self._touch_is_fresh = False
@@ -241,8 +244,7 @@ class VisuotactileEnv(BaseEnv):
         self._contact_force[env_idx] = 0.0
         self._touch_is_fresh, self._measured = False, None
         for sensor in self._tactile_sensors.values():
-            sensor.reset(env_idx)
-            sensor.reseed(int(self._episode_seed[0]))
+            sensor.reset(env_idx, self._episode_seed[env_idx.cpu().numpy()])
 
     def _step_action(self, action):
         action = self._checked(action)

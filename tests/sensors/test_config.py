@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from manifeel_ms3.sensors import GelConfig, OpticsConfig, gelsight_mini, gelsight_r15
-from manifeel_ms3.sensors.fit_shader import read_table
+from manifeel_ms3.sensors import GelConfig, OpticsConfig, TouchRandomization, gelsight_mini, gelsight_r15, with_options
 from manifeel_ms3.sensors.shader import Shader
+from manifeel_ms3.sensors.taxim_table import read_table
 
 
 @pytest.mark.parametrize(
@@ -19,11 +19,26 @@ from manifeel_ms3.sensors.shader import Shader
         (dict(taxel_pitch=5e-3), "taxel_shape x taxel_pitch"),
         (dict(image_shape=(480, 640)), "image_shape x pixel_size"),
         (dict(backend="magic"), "raycast"),
+        (dict(units="pound"), "tacsl"),
+        (dict(optics=OpticsConfig(shadow=1.5)), "optics.shadow"),
+        (dict(optics=OpticsConfig(noise=-1.0)), "optics.noise"),
+        (dict(optics=OpticsConfig(marker_pitch=0.0)), "optics.marker_pitch"),
+        (dict(randomization=TouchRandomization(stiffness=1.0)), "randomization.stiffness"),
     ],
 )
 def test_bad_value_is_named(overrides, field):
     with pytest.raises(ValueError, match=field):
         gelsight_r15("touch", "gel_right", **overrides)
+
+
+def test_options_by_dotted_name():
+    config = with_options(gelsight_r15("a", "b"), {"units": "tacsl", "optics.noise": 2.0})
+    assert (config.units, config.optics.noise, config.link) == ("tacsl", 2.0, "b")
+    for name in ("optics.nose", "gell", "units.metre"):
+        with pytest.raises(ValueError, match=name):
+            with_options(config, {name: 1})
+    with pytest.raises(ValueError, match="gel.thickness"):
+        with_options(config, {"gel.thickness": -1.0})
 
 
 def test_presets_are_valid():

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from manifeel_ms3.sensors.config import GelConfig
-from manifeel_ms3.sensors.contact import ContactGrid, penetration, solve_indentation, solve_shear, taxel_weights
+from manifeel_ms3.sensors.contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
+from manifeel_ms3.sensors.taxels import Taxels, tacsl_field
 
 GEL = GelConfig()
 GRID = ContactGrid.covering(GEL.size, 3.5e-4, torch.device("cpu"))
@@ -16,7 +17,7 @@ K = GEL.normal_stiffness
 def sphere(radius: float, x: float = 0.0, y: float = 0.0, gap: float = 0.0) -> torch.Tensor:
     """Height (1, C) of a ball whose lowest point is `gap` above the face at (x, y)."""
     r2 = (GRID.x - x) ** 2 + (GRID.y - y) ** 2
-    return torch.where(r2 < radius**2, (radius**2 - r2).clamp(min=0).sqrt() - radius - gap, torch.full_like(r2, -5e-3))[None]
+    return torch.where(r2 < radius**2, (radius**2 - r2).clamp(min=0).sqrt() - radius - gap, torch.full_like(r2, -5e-3))[None].float()
 
 
 def wrench(normal: float, x: float = 0.0, y: float = 0.0, fx: float = 0.0, fy: float = 0.0, mz: float = 0.0) -> torch.Tensor:
@@ -25,14 +26,22 @@ def wrench(normal: float, x: float = 0.0, y: float = 0.0, fx: float = 0.0, fy: f
 
 
 def pressure(height: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
-    plane = solve_indentation(height, load, GRID, K)
-    return penetration(height, plane, GRID.x, GRID.y, GEL.max_penetration) * K * GRID.area
+    return depth_below_face(height.double(), indent(height, load), GRID.x, GRID.y).clamp(min=0) * K * GRID.area
+
+
+def indent(height: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
+    return solve_indentation(height, load, GRID, torch.full((len(load),), K, dtype=torch.float64))
+
+
+def slide(bristle: torch.Tensor, field: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
+    ones = torch.ones(len(load), dtype=torch.float64)
+    return solve_shear(bristle, field, load, GRID, GEL.shear_stiffness * ones, GEL.friction * ones)
 
 
 @pytest.mark.parametrize("force", [1.0, 3.0, 10.0])
 def test_sphere_on_winkler_layer_sinks_as_the_closed_form(force):
     radius = 0.02
-    plane = solve_indentation(sphere(radius), wrench(force), GRID, K)
+    plane = indent(sphere(radius), wrench(force))
     depth = plane[0, 0].item()
     assert math.pi * K * depth**2 * (radius - depth / 3) == pytest.approx(force, rel=5e-3)  # K times the cap's volume
 
@@ -52,7 +61,7 @@ def test_pressure_carries_the_normal_force_where_it_acts(x, y):
 
 
 def test_moment_tilts_a_flat_object():
-    flat = torch.zeros(1, len(GRID.x), dtype=torch.float64)
+    flat = torch.zeros(1, len(GRID.x))
     field = pressure(flat, wrench(10.0, y=1e-3))
     assert (field * GRID.y).sum().item() / 10.0 == pytest.approx(1e-3, abs=1e-5)
 
@@ -65,7 +74,7 @@ def test_untouched_pad_has_no_pressure():
 def shear_of_loads(field: torch.Tensor, loads: list[torch.Tensor]) -> list[torch.Tensor]:
     bristle, out = torch.zeros(1, field.shape[1], 2, dtype=torch.float64), []
     for load in loads:
-        q = solve_shear(bristle, field, load, GRID, GEL.shear_stiffness, GEL.friction)
+        q = slide(bristle, field, load)
         bristle = q / (GEL.shear_stiffness * GRID.area)
         out.append(q)
     return out
@@ -120,7 +129,7 @@ def test_lost_contact_forgets_its_shear():
     field = pressure(sphere(0.02), wrench(8.0))
     (loaded,) = shear_of_loads(field, [wrench(8.0, fx=4.0)])
     bristle = loaded / (GEL.shear_stiffness * GRID.area)
-    released = solve_shear(bristle, torch.zeros_like(field), wrench(0.0), GRID, GEL.shear_stiffness, GEL.friction)
+    released = slide(bristle, torch.zeros_like(field), wrench(0.0))
     assert released.abs().max() == 0
 
 
@@ -128,17 +137,46 @@ def test_rows_of_a_batch_are_independent():
     heights = torch.cat([sphere(r, x) for r, x in ((0.01, 0.0), (0.02, 2e-3), (0.005, -4e-3))])
     loads = torch.cat([wrench(1.0, fx=0.3), wrench(10.0, 2e-3, fy=-2.0), wrench(0.0)])
     field = pressure(heights, loads)
-    shear = solve_shear(torch.zeros(*field.shape, 2, dtype=torch.float64), field, loads, GRID, GEL.shear_stiffness, 1.0)
+    shear = slide(torch.zeros(*field.shape, 2, dtype=torch.float64), field, loads)
     for i in range(3):
         alone = pressure(heights[i : i + 1], loads[i : i + 1])
-        assert torch.allclose(field[i], alone[0], atol=1e-9)
-        q = solve_shear(
-            torch.zeros(*alone.shape, 2, dtype=torch.float64), alone, loads[i : i + 1], GRID, GEL.shear_stiffness, 1.0
-        )
-        assert torch.allclose(shear[i], q[0], atol=1e-9)
+        assert torch.allclose(field[i], alone[0], atol=1e-12)
+        q = slide(torch.zeros(*alone.shape, 2, dtype=torch.float64), alone, loads[i : i + 1])
+        assert torch.allclose(shear[i], q[0], atol=1e-12)
+
+
+TAXELS = Taxels(GRID, (10, 14), 1.634e-3)
+MU = torch.tensor([GEL.friction], dtype=torch.float64)
 
 
 def test_taxels_own_the_whole_gel():
-    weights = taxel_weights(GRID, (10, 14), 1.634e-3)
-    assert torch.allclose(weights.sum(0), torch.ones(len(GRID.x), dtype=weights.dtype))
-    assert (weights >= 0).all()
+    ones = torch.ones(1, len(GRID.x), 1, dtype=torch.float64)
+    shares = TAXELS.add_up(ones)
+    assert shares.sum().item() == pytest.approx(len(GRID.x))
+    assert (shares > 0).all()
+    assert shares[0, 0, 0].item() > 2 * shares[0, 5, 5].item()  # a corner taxel owns the gel beyond it, too
+
+
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (9e-3, 0.0), (-9e-3, 13e-3)])
+def test_taxels_keep_the_moment_about_the_normal_even_beyond_their_centres(x, y):
+    """A flat-ended post, 6 mm wide, that twists; its outer part lies beyond the outermost taxel centres."""
+    post = torch.where(((GRID.x - x).abs() < 3e-3) & ((GRID.y - y).abs() < 3e-3), 0.0, -5e-3)[None].float()
+    load = wrench(10.0, x, y, fx=2.0, fy=-1.0, mz=(-x - 2 * y) + 4e-3)
+    field = pressure(post, load)
+    (q,) = shear_of_loads(field, [load])
+    forces = TAXELS.forces(field, q, MU)
+    at = TAXELS.centres
+    moment = (at[..., 0] * forces[0, ..., 2] - at[..., 1] * forces[0, ..., 1]).sum()
+    assert moment.item() == pytest.approx((GRID.x * q[..., 1] - GRID.y * q[..., 0]).sum().item(), rel=0.01, abs=2e-5)
+    assert forces.sum((0, 1, 2)).tolist() == pytest.approx([10.0, 2.0, -1.0], rel=0.01)
+    assert (torch.linalg.norm(forces[..., 1:], dim=-1) <= GEL.friction * forces[..., 0] + 1e-9).all()
+
+
+def test_tacsl_field_is_penetration_and_bounded_speed():
+    """f_n = d, f_t = -min(0.1 |v|, 2 d) v / |v| (Akinola et al. 2024, with the gains of the paper's public code)."""
+    depth = torch.tensor([[1e-3, 1e-4, 0.0]])
+    velocity = torch.tensor([[[0.003, -0.004], [0.03, 0.04], [1.0, 0.0]]])
+    field = tacsl_field(depth, velocity)[0]
+    assert field[0].tolist() == pytest.approx([1e-3, -3e-4, 4e-4])
+    assert field[1].tolist() == pytest.approx([1e-4, -2e-4 * 0.6, -2e-4 * 0.8])
+    assert field[2].tolist() == [0.0, 0.0, 0.0]

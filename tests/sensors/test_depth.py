@@ -36,7 +36,8 @@ def ball_env(tmp_path_factory):
 def heights(env: PadBench, backend: str) -> tuple[torch.Tensor, torch.Tensor]:
     sensor = TactileSensor(gelsight_r15("tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
     env.scene.update_render()
-    return sensor._depth.heights([sensor._pixels])[0][0], sensor._pixels
+    sensor._depth.look()
+    return sensor._depth.heights(sensor.model.pixels)[0], sensor.model.pixels
 
 
 def cap(pixels: torch.Tensor, x: float, y: float) -> torch.Tensor:
@@ -81,8 +82,9 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
     sensor = env._tactile_sensors["tactile_right"]
     env.place(env.objects[0], sapien.Pose([0, -8e-3, 2e-3 - 1e-4]))
     env.place(env.objects[1], sapien.Pose([0, 8e-3, 3e-3 - 3e-4]))
-    height = sensor._depth.heights([sensor._cells])[0][0].numpy()
-    cells = sensor._cells.numpy()
+    sensor._depth.look()
+    height = sensor._depth.heights(sensor.model.cells)[0].numpy()
+    cells = sensor.model.cells.numpy()
     for centre, half, depth in ((-8e-3, 2e-3, 1e-4), (8e-3, 3e-3, 3e-4)):
         inside = (np.abs(cells[:, 1] - centre) < half - 5e-4) & (np.abs(cells[:, 0]) < half - 5e-4)
         assert np.abs(height[inside] - depth).max() < 5e-6
