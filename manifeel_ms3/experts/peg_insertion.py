@@ -17,13 +17,17 @@ FEEL_FORCE = 2.5  # N: a wall is felt
 UPRIGHT = np.deg2rad(0.7)
 STAND_UP_TURN = 0.012  # rad a step
 STAND_UP_STEPS = 25
-STAND_UP_PUSH = np.array([0, 0, -5e-4])  # m that the command leads into the hole's corner meanwhile
+STAND_UP_PUSH = np.array([4e-4, 4e-4, -5e-4])  # m that the command leads into the hole's corner meanwhile
+ENTERED = 0.0008  # m below the rim, of the peg's end: it is in the hole
+ASTRAY = 0.004  # m from where the hole was seen: the peg slides about on top
+PATIENCE = 15  # steps without getting deeper, before starting over
 PRESS = 0.003  # m that the command leads into a contact: about 8 N
 PRESS_FORCE = 10.0  # N: enough
 GIVE = 1.5e-4  # m/N: how far the hand gives way to a sideways push
 WRIGGLE = 4e-4  # m
 DOWN = np.array([0.0, 0.0, -1.0])
 DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the peg in it: frames with their z down
+END = np.array([0.0, 0.0, -PEG_SIZE[2] / 2])  # of the peg
 CORNER = np.array(PEG_SIZE) / 2 * [1, 1, -1]  # of the peg, that goes ahead
 
 
@@ -68,11 +72,14 @@ class PegInsertionExpert:
         rim = np.array([0.0, 0.0, SOCKET_DEPTH])
         inner = np.array([*(self.hole_half - CORNER_AIM), 0.0])
         over = self.hole + rim + inner
-        yield from skills.reach(*self._tool_for(CORNER, over + [0, 0, HOVER], lean), tolerance=1e-3)
-        yield from self._touch_down(over, lean)
-        yield from self._feel_corner(lean)
-        yield from self._stand_up(lean)
-        yield from self._press()
+        while True:
+            yield from skills.reach(*self._tool_for(CORNER, over + [0, 0, HOVER], lean), tolerance=1e-3)
+            yield from self._touch_down(over, lean)
+            yield from self._feel_corner(lean)
+            yield from self._stand_up(lean)
+            yield from self._press()
+            here, facing = skills.commanded
+            yield from skills.reach(here + [0, 0, HOVER], facing, tolerance=2e-3)
 
     def _place(self, point_on_peg: np.ndarray) -> np.ndarray:
         """Where a point of the peg is, going by the hand's pose and the tactile images."""
@@ -113,24 +120,27 @@ class PegInsertionExpert:
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
 
     def _stand_up(self, lean: Rotation) -> Actions:
-        """Turn the peg upright about its leading corner, which stays lightly pushed into the hole's corner and down."""
+        """Turn the peg upright about its leading corner, which stays lightly pushed into the hole's corner and down: first until
+        the long edge lies in the hole, then all the way."""
         skills = self.skills
         place = self._place(CORNER)
-        for _ in range(STAND_UP_STEPS):
-            if self._tilt() < UPRIGHT:
-                return
-            facing = skills.towards(self._facing(Rotation.identity()), STAND_UP_TURN)
-            position, rotation = self._peg_in_tool()
-            target = place - facing.apply(position + rotation.apply(DOWNWARD.apply(CORNER)))
-            yield skills.command(target + STAND_UP_PUSH, facing)
+        for upright in (Rotation.from_euler("x", -LEAN[0]), Rotation.identity()):
+            for _ in range(STAND_UP_STEPS):
+                if self._tilt(upright) < UPRIGHT:
+                    break
+                facing = skills.towards(self._facing(upright), STAND_UP_TURN)
+                position, rotation = self._peg_in_tool()
+                target = place - facing.apply(position + rotation.apply(DOWNWARD.apply(CORNER)))
+                yield skills.command(target + STAND_UP_PUSH, facing)
 
-    def _tilt(self) -> float:
-        """Angle of the peg from upright, rad, going by the hand's pose and the tactile images."""
+    def _tilt(self, upright: Rotation = Rotation.identity()) -> float:
+        """Angle of the peg from a facing, rad, going by the hand's pose and the tactile images."""
         _, facing = self.skills.tool
-        return (self._facing(Rotation.identity()) * facing.inv()).magnitude()
+        return (self._facing(upright) * facing.inv()).magnitude()
 
     def _press(self) -> Actions:
-        """Press down, giving way to what pushes sideways and to what tilts; where it sticks, ease off and wriggle."""
+        """Press down, giving way to what pushes sideways and to what tilts; where it sticks, ease off and wriggle. Ends only
+        when the peg has not even entered."""
         skills = self.skills
         stuck, best = 0, np.inf
         for step in range(10_000):
@@ -138,6 +148,10 @@ class PegInsertionExpert:
             load = skills.load
             stuck = 0 if here[2] < best - 1e-4 else stuck + 1
             best = min(best, here[2])
+            end = self._place(END)
+            strayed = np.linalg.norm((end - self.hole)[:2]) > ASTRAY
+            if strayed or (stuck > PATIENCE and end[2] > SOCKET_DEPTH - ENTERED):
+                return
             aside = np.clip(GIVE * load * [1, 1, 0], -0.001, 0.001)
             push = PRESS if load[2] < PRESS_FORCE and self._tilt() < 3 * UPRIGHT else 0.0
             if stuck > 4:

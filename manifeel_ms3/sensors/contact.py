@@ -128,9 +128,7 @@ def _total(part: vec9d) -> vec9d:
 def _newton_step(sums: vec9d, residual: wp.vec3d) -> wp.vec3d:
     """Solve the symmetric system whose entries are sums[3..8], with a millionth of its trace on the diagonal."""
     ridge = wp.float64(1.0e-6) * (wp.float64(1.0) + sums[3] + sums[6] + sums[8])
-    hessian = wp.mat33d(
-        sums[3] + ridge, sums[4], sums[5], sums[4], sums[6] + ridge, sums[7], sums[5], sums[7], sums[8] + ridge
-    )
+    hessian = wp.mat33d(sums[3] + ridge, sums[4], sums[5], sums[4], sums[6] + ridge, sums[7], sums[5], sums[7], sums[8] + ridge)
     return wp.inverse(hessian) * residual
 
 

@@ -170,7 +170,9 @@ class Optics:
         self._wide = [[_blur_matrix(n, sigma / cell, device) for n in coarse] for sigma in WIDE_SIGMAS]
         self._narrow = [_blur_matrix(n, NARROW_SIGMA / config.pixel_size, device) for n in (rows, cols)]
         self._coat = [_blur_matrix(n, optics.smoothing, device) for n in (rows, cols)] if optics.smoothing > 0 else None
-        self._drag = [_spread(g, n, cell, config.gel.thickness * MARKER_SPREAD, device) for g, n in zip(_axes(grid), coarse, strict=True)]
+        self._drag = [
+            _spread(g, n, cell, config.gel.thickness * MARKER_SPREAD, device) for g, n in zip(_axes(grid), coarse, strict=True)
+        ]
         self._gain = torch.ones(num_pads, 3, device=device)
         self._phase = torch.tensor([[1.0, 0.0]], device=device).repeat(num_pads, 1)
         self._frame = torch.zeros(num_pads, dtype=torch.int64, device=device)

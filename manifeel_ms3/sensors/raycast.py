@@ -79,7 +79,7 @@ def _approach(
 ):
     """List the bodies whose box meets the swept box, boxed along the body's axes."""
     n = wp.tid()
-    found = int(0)
+    found = 0
     for b in range(ids.shape[1]):
         pose = wp.transform_multiply(wp.transform_inverse(body[n, b]), pad[n])
         centre = wp.transform_point(pose, middle)
@@ -129,7 +129,9 @@ def _cast_moving(
     meshes: wp.array2d(dtype=wp.int64),
     pad_in_body: wp.array2d(dtype=wp.transformf),
     near: wp.array2d(dtype=wp.int32),
-    twist: wp.array2d(dtype=wp.spatial_vectorf),  # (N, B): velocity of the pad's origin, and spin, of pad against body, pad frame
+    twist: wp.array2d(
+        dtype=wp.spatial_vectorf
+    ),  # (N, B): velocity of the pad's origin, and spin, of pad against body, pad frame
     grid: wp.array(dtype=wp.vec2f),
     start: float,
     end: float,

@@ -53,7 +53,9 @@ class TouchModel:
         self.optics = Optics(config, self.grid, num_pads, device) if "rgb" in outputs else None
         self._feels = "force_field" in outputs and config.units == "newton"
         self._bristle = torch.zeros(num_pads, len(self.cells), 2, dtype=torch.float64, device=device)
-        self._nominal = torch.tensor([gel.normal_stiffness, gel.shear_stiffness, gel.friction], dtype=torch.float64, device=device)
+        self._nominal = torch.tensor(
+            [gel.normal_stiffness, gel.shear_stiffness, gel.friction], dtype=torch.float64, device=device
+        )
         self._gel = self._nominal.repeat(num_pads, 1)
 
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:

@@ -17,7 +17,9 @@ K = GEL.normal_stiffness
 def sphere(radius: float, x: float = 0.0, y: float = 0.0, gap: float = 0.0) -> torch.Tensor:
     """Height (1, C) of a ball whose lowest point is `gap` above the face at (x, y)."""
     r2 = (GRID.x - x) ** 2 + (GRID.y - y) ** 2
-    return torch.where(r2 < radius**2, (radius**2 - r2).clamp(min=0).sqrt() - radius - gap, torch.full_like(r2, -5e-3))[None].float()
+    return torch.where(r2 < radius**2, (radius**2 - r2).clamp(min=0).sqrt() - radius - gap, torch.full_like(r2, -5e-3))[
+        None
+    ].float()
 
 
 def wrench(normal: float, x: float = 0.0, y: float = 0.0, fx: float = 0.0, fy: float = 0.0, mz: float = 0.0) -> torch.Tensor:

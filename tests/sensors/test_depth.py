@@ -3,69 +3,105 @@
 import numpy as np
 import pytest
 import sapien
-import torch
 import trimesh
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
-from manifeel_ms3.sensors.raycast import REACH
+from manifeel_ms3.sensors.surfaces import entity_mesh
 from tests.conftest import needs_renderer
+from tests.sensors import shapes
 from tests.sensors.bench import PadBench
 
-RADIUS = 0.008
 DEEP = 5e-4  # m into the gel
+BALL, ROD, WEDGE = 0.008, 0.006, 0.005  # radii, and half the side of a bar on its edge, m
+TILT = trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])
 
 
-@pytest.fixture(scope="module")
-def ball_env(tmp_path_factory):
-    path = tmp_path_factory.mktemp("mesh") / "ball.obj"
-    trimesh.creation.icosphere(subdivisions=6, radius=RADIUS).export(path)
+def bar() -> trimesh.Trimesh:
+    return trimesh.creation.box([2 * WEDGE, 0.02, 2 * WEDGE]).apply_transform(TILT)
+
+
+def rod() -> trimesh.Trimesh:
+    along = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
+    return trimesh.creation.cylinder(ROD, 0.02, sections=720).apply_transform(along)
+
+
+def ball_height(x, y):
+    return np.sqrt(np.maximum(BALL**2 - x**2 - y**2, 0)) - BALL
+
+
+def rod_height(x, y):
+    return np.where(np.abs(y) < 0.01, np.sqrt(np.maximum(ROD**2 - x**2, 0)) - ROD, -1)
+
+
+def bar_height(x, y):
+    return np.where(np.abs(y) < 0.01, -np.abs(x), -1)
+
+
+def thread_heights(x, y):
+    return np.where((np.abs(y) < 0.0099) & (np.abs(x) < 0.004), shapes.thread_height(x, y, shapes.THREAD_RADIUS), -1)
+
+
+def dimple_height(x, y):
+    return np.where((np.abs(x) < 0.0099) & (np.abs(y) < 0.0099), -shapes.dimples(x, y), -1)
+
+
+SHAPES = {  # mesh, its origin over its lowest point, height over the face when that point touches it
+    "ball": (lambda: trimesh.creation.icosphere(subdivisions=6, radius=BALL), BALL, ball_height),
+    "rod": (rod, ROD, rod_height),
+    "edge": (bar, WEDGE * np.sqrt(2), bar_height),
+    "thread": (shapes.thread_mesh, shapes.THREAD_RADIUS, thread_heights),
+    "dimples": (shapes.dimple_mesh, 0.0, dimple_height),
+}
+
+
+@pytest.fixture(scope="module", params=SHAPES)
+def shape_env(request, tmp_path_factory):
+    mesh, origin, height = SHAPES[request.param]
+    path = tmp_path_factory.mktemp("mesh") / "shape.glb"
+    mesh().export(path)
 
     def build(env):
         builder = env.scene.create_actor_builder()
-        builder.add_sphere_collision(radius=RADIUS)
+        builder.add_sphere_collision(radius=1e-3)
         builder.add_visual_from_file(str(path), material=RenderMaterial(base_color=[1, 0, 0, 1]))
         builder.initial_pose = sapien.Pose([0, 0, 2])
-        return [builder.build_kinematic("ball")]
+        return [builder.build_kinematic("shape")]
 
     env = PadBench(build, obs_mode="rgb", cameras=("wrist",))
-    yield env
+    yield env, origin, height
     env.close()
 
 
-def heights(env: PadBench, backend: str) -> tuple[torch.Tensor, torch.Tensor]:
+def heights(env: PadBench, backend: str) -> tuple[np.ndarray, np.ndarray]:
     sensor = TactileSensor(gelsight_r15("tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
     env.scene.update_render()
     sensor._depth.look()
-    return sensor._depth.heights(sensor.model.pixels)[0], sensor.model.pixels
-
-
-def cap(pixels: torch.Tensor, x: float, y: float) -> torch.Tensor:
-    """Height of the ball that sits DEEP in the gel at (x, y), as far as its flanks are shallow."""
-    r2 = (pixels[:, 0] - x) ** 2 + (pixels[:, 1] - y) ** 2
-    return (RADIUS**2 - r2).clamp(min=0).sqrt() - RADIUS + DEEP
+    return sensor._depth.heights(sensor.model.pixels)[0].numpy(), sensor.model.pixels.double().numpy()
 
 
 @needs_renderer
 @pytest.mark.parametrize("backend", ["raycast", "sapien"])
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (5e-3, -9e-3), (-6e-3, 8e-3)])
-def test_ball_is_seen_within_five_micrometres(ball_env, backend, x, y):
-    ball_env.place(ball_env.objects[0], sapien.Pose([x, y, RADIUS - DEEP]))
-    seen, pixels = heights(ball_env, backend)
-    expected = cap(pixels, x, y)
-    near = expected > -2e-3
+def test_shapes_are_seen_within_five_micrometres(shape_env, backend, x, y):
+    env, origin, height = shape_env
+    env.place(env.objects[0], sapien.Pose([x, y, origin - DEEP]))
+    seen, pixels = heights(env, backend)
+    expected = height(pixels[:, 0] - x, pixels[:, 1] - y) + DEEP
+    near = expected > -1.5e-3
     error = (seen - expected)[near]
-    assert error.square().mean().sqrt() < 5e-6
-    assert seen[expected <= -RADIUS + DEEP].max() <= -REACH + 1e-4  # and nothing is seen beside it
+    assert near.sum() > 1000
+    assert np.sqrt((error**2).mean()) < 5e-6
 
 
 @needs_renderer
-def test_backends_agree_within_five_micrometres(ball_env):
-    ball_env.place(ball_env.objects[0], sapien.Pose([1e-3, 2e-3, RADIUS - DEEP]))
-    rays, pixels = heights(ball_env, "raycast")
-    camera, _ = heights(ball_env, "sapien")
-    near = cap(pixels, 1e-3, 2e-3) > -2e-3
-    assert (rays - camera)[near].square().mean().sqrt() < 5e-6
+def test_backends_agree_within_five_micrometres(shape_env):
+    env, origin, height = shape_env
+    env.place(env.objects[0], sapien.Pose([1e-3, 2e-3, origin - DEEP]))
+    rays, pixels = heights(env, "raycast")
+    camera, _ = heights(env, "sapien")
+    near = height(pixels[:, 0] - 1e-3, pixels[:, 1] - 2e-3) + DEEP > -1.5e-3
+    assert np.sqrt(((rays - camera)[near] ** 2).mean()) < 5e-6
 
 
 def test_several_objects_and_the_table_are_felt_without_registration_or_renderer():
@@ -92,6 +128,20 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
     assert {"table", "cube", "slab", "gel_left"} <= names
     assert not names & {"gel_right", "panda_rightfinger", "panda_hand"}
     env.close()
+
+
+@needs_renderer
+def test_empty_mesh_is_named():
+    points = np.eye(3, dtype=np.float32)
+    shape = sapien.render.RenderShapeTriangleMesh(
+        points, np.zeros((0, 3), np.uint32), points, np.zeros((3, 2), np.float32), RenderMaterial()
+    )
+    entity, body = sapien.Entity(), sapien.render.RenderBodyComponent()
+    body.attach(shape)
+    entity.add_component(body)
+    entity.name = "nothing"
+    with pytest.raises(RuntimeError, match="nothing.*without triangles"):
+        entity_mesh(entity)
 
 
 def test_sapien_backend_without_renderer_says_what_to_do():
