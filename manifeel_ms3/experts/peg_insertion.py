@@ -26,6 +26,7 @@ PRESS_FORCE = 10.0  # N: enough
 GIVE = 1.5e-4  # m/N: how far the hand gives way to a sideways push
 WRIGGLE = 4e-4  # m
 DOWN = np.array([0.0, 0.0, -1.0])
+STRAIGHT = Rotation.identity()
 DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the peg in it: frames with their z down
 END = np.array([0.0, 0.0, -PEG_SIZE[2] / 2])  # of the peg
 CORNER = np.array(PEG_SIZE) / 2 * [1, 1, -1]  # of the peg, that goes ahead
@@ -120,11 +121,11 @@ class PegInsertionExpert:
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
 
     def _stand_up(self, lean: Rotation) -> Actions:
-        """Turn the peg upright about its leading corner, which stays lightly pushed into the hole's corner and down: first until
-        the long edge lies in the hole, then all the way."""
+        """Turn the peg upright about its leading corner, which stays lightly pushed into the hole's corner and down: first
+        until the long edge lies in the hole, then all the way."""
         skills = self.skills
         place = self._place(CORNER)
-        for upright in (Rotation.from_euler("x", -LEAN[0]), Rotation.identity()):
+        for upright in (Rotation.from_euler("x", -LEAN[0]), STRAIGHT):
             for _ in range(STAND_UP_STEPS):
                 if self._tilt(upright) < UPRIGHT:
                     break
@@ -133,7 +134,7 @@ class PegInsertionExpert:
                 target = place - facing.apply(position + rotation.apply(DOWNWARD.apply(CORNER)))
                 yield skills.command(target + STAND_UP_PUSH, facing)
 
-    def _tilt(self, upright: Rotation = Rotation.identity()) -> float:
+    def _tilt(self, upright: Rotation = STRAIGHT) -> float:
         """Angle of the peg from a facing, rad, going by the hand's pose and the tactile images."""
         _, facing = self.skills.tool
         return (self._facing(upright) * facing.inv()).magnitude()
@@ -156,5 +157,5 @@ class PegInsertionExpert:
             push = PRESS if load[2] < PRESS_FORCE and self._tilt() < 3 * UPRIGHT else 0.0
             if stuck > 4:
                 aside[:2] += WRIGGLE * np.array([np.cos(1.3 * step), np.sin(1.3 * step)])
-            facing = skills.towards(self._facing(Rotation.identity()), STAND_UP_TURN)
+            facing = skills.towards(self._facing(STRAIGHT), STAND_UP_TURN)
             yield skills.command(here + push * DOWN + aside, facing)

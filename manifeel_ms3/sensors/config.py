@@ -66,7 +66,7 @@ class OpticsConfig:
 
 @dataclass
 class TouchRandomization:
-    """What differs from pad to pad and episode to episode: half widths of uniform distributions around the configured values."""
+    """What differs from pad to pad and episode to episode: half widths of uniform distributions around the config's values."""
 
     gain: float = 0.0
     """Of the colours' change, relative, each channel by itself."""
@@ -105,7 +105,7 @@ class TactileSensorConfig(BaseSensorConfig):
     backend: Literal["auto", "raycast", "sapien"] = "auto"
     """Where depth comes from: rays against the meshes (no renderer needed) or a SAPIEN camera in the pad."""
     units: Literal["newton", "tacsl"] = "newton"
-    """Of the force field. "tacsl": the paper's own quantities, penetration in m and 0.1 |v_t| in m/s (`TACSL_*` in taxels.py)."""
+    """Of the force field. "tacsl": the paper's own quantities, penetration and 0.1 |v_t| (`taxels.tacsl_field`)."""
     randomization: TouchRandomization = field(default_factory=TouchRandomization)
 
     def __post_init__(self):

@@ -2,9 +2,9 @@
 # (warp reads a kernel's annotations as its own types)
 """Gel mechanics: from the shape of what presses and the measured wrench to pressure, shear and penetration of every cell.
 
-One thread block a pad: its threads share the cells and add up their parts, so that a whole Newton iteration stays on the device
-and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad frame (z out of the
-gel).
+One thread block a pad: its threads share the cells and add up their parts, so that a whole Newton iteration stays on the
+device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad frame (z out
+of the gel).
 """
 
 from dataclasses import dataclass

@@ -90,7 +90,7 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     listing = folder / "presses.csv"
     if not listing.is_file():
         raise ValueError(f"{listing} does not exist; it must say file,row,col,radius of every press")
-    with open(listing, newline="") as lines:
+    with listing.open(newline="") as lines:
         presses = list(csv.DictReader(lines))
     if not presses or set(presses[0]) < {"file", "row", "col", "radius"}:
         raise ValueError(f"{listing} must have the columns file, row, col, radius and at least one press")

@@ -250,7 +250,7 @@ class Optics:
         return light
 
     def _skin(self, coarse: torch.Tensor, bristle: torch.Tensor) -> torch.Tensor:
-        """Displacement (N, h, w, 3) of the skin, pixels, along rows and columns: dragged by shear, carried outward by pressure."""
+        """Displacement (N, h, w, 3) of the skin, pixels, along rows and columns: dragged by shear, carried out by pressure."""
         rows, cols = self._drag
         shape = (rows.shape[1], cols.shape[1])
         dragged = torch.einsum("rx,nxyk,cy->nrck", rows, bristle.unflatten(1, shape).float(), cols)

@@ -48,7 +48,7 @@ class Taxels:
 
 
 def tacsl_field(penetration: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
-    """TacSL's field (N, T, 3): penetration (N, T), m, and -min(k_t |v|, mu k_n d) v / |v| of the sliding velocity (N, T, 2), m/s."""
+    """TacSL's field (N, T, 3): k_n d and -min(k_t |v|, mu k_n d) v / |v|, penetration d (N, T), m, sliding v (N, T, 2), m/s."""
     normal = TACSL_NORMAL_GAIN * penetration
     speed = torch.linalg.norm(velocity, dim=-1)
     size = torch.minimum(TACSL_SHEAR_GAIN * speed, TACSL_FRICTION * normal)

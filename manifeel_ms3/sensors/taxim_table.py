@@ -1,7 +1,7 @@
 """Calibration tables in Taxim's format (Si & Yuan 2022, section III), `polycalib.npz`, and the compact shader that fits one.
 
-The table lies in portrait: u = column along our rows, v = row against our columns. A bin pair (slope m, direction phi) holds, per
-channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. Any number of bins.
+The table lies in portrait: u = column along our rows, v = row against our columns. A bin pair (slope m, direction phi) holds,
+per channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. Any number of bins.
 """
 
 from pathlib import Path

@@ -26,7 +26,7 @@ def warp_device(device: torch.device):
 
 @contextlib.contextmanager
 def lend_torch_threads():
-    """Give torch's CPU threads to `launch_split`: torch's own spin on for a while after an operation, and would be in its way."""
+    """Give torch's CPU threads to `launch_split`: torch's own spin on after an operation, and would be in its way."""
     global _lent_threads
     own = torch.get_num_threads()
     _lent_threads = own

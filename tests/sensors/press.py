@@ -3,7 +3,6 @@
 import numpy as np
 import sapien
 import torch
-import trimesh
 from mani_skill.utils.structs import Actor
 
 from tests.sensors.bench import PadBench
@@ -14,8 +13,8 @@ DRAG = 20.0  # N s/m; at rest it does nothing, while PhysX's own damping takes i
 TWIST_DRAG = 0.01  # N m s
 
 
-def indenter(name: str, mesh: trimesh.Trimesh | None = None, rotation: np.ndarray | None = None, **shape):
-    """A builder of one body: a `sphere`, `box` or `cylinder` collision shape by its arguments, turned into the pad frame's z."""
+def indenter(name: str, rotation: np.ndarray | None = None, **shape):
+    """A builder of one body: a sphere, box or cylinder by the arguments of its collision shape."""
 
     def build(env: PadBench) -> list[Actor]:
         builder = env.scene.create_actor_builder()

@@ -9,9 +9,12 @@ import torch
 
 from manifeel_ms3.sensors import gelsight_r15, with_options
 from manifeel_ms3.sensors.contact import ContactGrid
+from manifeel_ms3.sensors.fit_shader import Presses, main
 from manifeel_ms3.sensors.optics import Optics
 from manifeel_ms3.sensors.shader import Shader, fourier_terms, place_terms, slope_terms
 from manifeel_ms3.sensors.taxim_table import fit_table, portrait_place, read_table
+from tests.sensors.readers import photometric_stereo, ssim, table_change
+from tests.sensors.shapes import dimples
 
 TABLE = Path(__file__).parents[2].parent / "shared/data/gelsight_r15_polycalib.npz"
 CONFIG = gelsight_r15("touch", "gel_right")
@@ -147,3 +150,82 @@ def test_shipped_coefficients_reproduce_the_published_calibration():
     terms = (fourier_terms(-phi), slope_terms(np.tan(slope)), place_terms(r, c))
     ours = np.einsum("cfkq,nf,nk,nq->nc", shader.weights, *terms, optimize=True)
     assert np.sqrt(((ours - true) ** 2).mean(0)).max() < 6.0
+
+
+X, Y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * CONFIG.pixel_size for n in CONFIG.image_shape), indexing="ij")
+PRESSES = {  # m above the untouched gel's face, into it
+    "ball": np.sqrt(np.maximum(0.004**2 - X**2 - Y**2, 0)) - 0.004 + 6e-4,
+    "rod": np.where(np.abs(Y) < 0.008, np.sqrt(np.maximum(0.004**2 - X**2, 0)) - 0.004 + 5e-4, -1),
+    "tilted plate": np.where((np.abs(X) < 0.004) & (np.abs(Y) < 0.005), 4e-4 + 0.02 * X, -1),
+    "wedge": np.where(np.abs(Y) < 0.007, 5e-4 - 0.5 * np.abs(X), -1),
+    "dimples": np.where((np.abs(X) < 0.007) & (np.abs(Y) < 0.007), 4e-4 - dimples(X, Y), -1),
+}
+
+
+def pressed(optics: Optics, name: str) -> torch.Tensor:
+    return optics.surface(torch.as_tensor(PRESSES[name].clip(min=0), dtype=torch.float32)[None])
+
+
+@pytest.mark.skipif(not TABLE.is_file(), reason="the reference calibration is not at hand")
+@pytest.mark.parametrize("press", PRESSES)
+def test_change_images_are_those_of_the_published_calibration(optics, press):
+    surface = pressed(optics, press)
+    background = optics._background.numpy()
+    change = optics.shade(surface)[0].numpy() - background
+    published = table_change(read_table(TABLE), surface[0].double().numpy(), CONFIG.pixel_size)
+    published = (background + published).clip(0, 255) - background
+    assert ssim(change, published) > 0.90
+    assert np.sqrt(((change - published) ** 2).mean()) < 6.0
+
+
+@pytest.mark.skipif(not TABLE.is_file(), reason="the reference calibration is not at hand")
+def test_taxim_table_can_be_given_with_any_number_of_bins(optics, tmp_path):
+    table = read_table(TABLE)
+    surface = pressed(optics, "ball")
+    expected = optics.shade(surface).int()
+    given = make_optics(**{"optics.calibration": TABLE})
+    assert (given.shade(surface).int() - expected).abs().max() <= 1
+    # as many bins as TacSL's tables have, read between this one's
+    bins, last = 125, table.shape[1] - 1
+    at = np.linspace(0, last, bins)
+    low = np.minimum(at.astype(int), last - 1)
+    share = (at - low)[:, None]
+    rows = table[:, low] * (1 - share)[None, ..., None] + table[:, low + 1] * share[None, ..., None]
+    finer = rows[:, :, low] * (1 - share) + rows[:, :, low + 1] * share
+    np.savez(tmp_path / "polycalib.npz", **{f"grad_{c}": finer[i] for i, c in enumerate("rgb")}, bins=bins)
+    other = make_optics(**{"optics.calibration": tmp_path / "polycalib.npz"})
+    assert (other.shade(surface).int() - expected).abs().float().mean() < 1.0
+
+
+@pytest.mark.parametrize("press", ["ball", "rod", "wedge"])
+def test_height_comes_back_from_the_picture(optics, press):
+    surface = pressed(optics, press)
+    shader = Shader.load(CONFIG.optics.calibration)
+    height = photometric_stereo(optics.shade(surface)[0].numpy(), shader, CONFIG.pixel_size)
+    assert np.abs(height - surface[0, ::2, ::2].numpy()).max() < 1e-4
+    assert height.max() > 0.7 * surface.max().item()
+
+
+def test_shader_is_fitted_from_ball_presses(optics, tmp_path):
+    radius, rng, presses = 0.003, np.random.default_rng(0), []
+    shader = make_optics(**{"optics.smoothing": 0.0})
+    for k in range(60):
+        x, y = rng.uniform(-1, 1, 2) * [0.009, 0.0125]
+        depth = rng.uniform(4e-4, 1.2e-3)
+        contact = np.sqrt(radius**2 - (radius - depth) ** 2) / CONFIG.pixel_size
+        surface = ball(radius, depth, x, y)  # no skirt: only what lies within the circle counts
+        cv2.imwrite(str(tmp_path / f"{k}.png"), shader.shade(surface)[0].numpy()[..., ::-1])
+        row, col = x / CONFIG.pixel_size + 119.5, y / CONFIG.pixel_size + 159.5
+        presses.append(f"{k}.png,{row},{col},{contact - 1.5}")
+    cv2.imwrite(str(tmp_path / "background.png"), shader.background.numpy()[..., ::-1])
+    (tmp_path / "presses.csv").write_text("\n".join(["file,row,col,radius", *presses]))
+    main(Presses(tmp_path, radius, CONFIG.pixel_size, tmp_path / "out" / "shader.npz"))
+    fitted = make_optics(**{"optics.calibration": tmp_path / "out" / "shader.npz"})
+    surface = optics.surface(ball(0.005, 5e-4, 2e-3, -3e-3))
+    difference = (fitted.shade(surface).int() - optics.shade(surface).int()).abs().float()
+    assert difference.mean() < 1.0
+    assert difference.max() < 12
+    with pytest.raises(ValueError, match="larger than the ball"):
+        main(Presses(tmp_path, 5e-4, CONFIG.pixel_size, tmp_path / "x.npz"))
+    with pytest.raises(ValueError, match=r"presses\.csv"):
+        main(Presses(tmp_path / "out", radius, CONFIG.pixel_size, tmp_path / "x.npz"))
