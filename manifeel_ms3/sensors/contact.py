@@ -3,8 +3,8 @@
 """Gel mechanics: from the shape of what presses and the measured wrench to pressure, shear and penetration of every cell.
 
 One thread block a pad: its threads share the cells and add up their parts, so that a whole Newton iteration stays on the
-device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad frame (z out
-of the gel).
+device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad frame
+(z out of the gel).
 """
 
 from dataclasses import dataclass

@@ -79,7 +79,7 @@ def _approach(
 ):
     """List the bodies whose box meets the swept box, boxed along the body's axes."""
     n = wp.tid()
-    found = 0
+    found = int(0)
     for b in range(ids.shape[1]):
         pose = wp.transform_multiply(wp.transform_inverse(body[n, b]), pad[n])
         centre = wp.transform_point(pose, middle)

@@ -13,7 +13,7 @@ from .raycast import Window
 from .taxels import Taxels, tacsl_field
 from .warp_device import lend_torch_threads
 
-CONTACT_CELL = 3.5e-4  # m: a tenth of a millimetre of error in the contact's outline; 6,188 cells on the R1.5
+CONTACT_CELL = 3.5e-4  # m: a tenth of a millimetre of error in the contact's outline; 6,279 cells on the R1.5
 LOOK_MARGIN = 5.0e-4  # m: pixels are looked at where a cell, or one beside it, is nearer than this to the gel
 OUTPUTS = ("rgb", "force_field")
 

@@ -19,7 +19,7 @@ def _places(shape: tuple[int, int]) -> list[np.ndarray]:
 
 
 def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> np.ndarray:
-    """Colour change (H, W, 3) of a surface (H, W), m, by a table in Taxim's format, interpolated between the middles of its bins."""
+    """Colour change (H, W, 3) of a surface (H, W), m, by a table in Taxim's format, interpolated between its bins' middles."""
     along_rows, along_cols = gradients(surface, pixel_size)
     slope, phi = np.arctan(np.hypot(along_rows, along_cols)), np.arctan2(-along_cols, along_rows)
     last = table.shape[1] - 1
@@ -37,7 +37,7 @@ def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> n
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity of two pictures (H, W, 3), Gaussian windows of 1.5 pixels, over the range of the second (Wang 2004)."""
+    """Structural similarity (Wang 2004) of two pictures (H, W, 3), Gaussian windows of 1.5 pixels, the second's range."""
     span = b.max() - b.min()
     c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
 

@@ -1,0 +1,100 @@
+"""Many pads at once: each as if it were alone."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from manifeel_ms3.sensors import gelsight_r15, with_options
+from manifeel_ms3.sensors.raycast import MeshRays
+from manifeel_ms3.sensors.touch_model import TouchModel
+
+CPU = torch.device("cpu")
+CONFIG = gelsight_r15("touch", "gel_right")
+LOADS = torch.tensor(  # N, N m
+    [[0.5, 0.2, -5.0, 0, 0, 1e-3], [0, 0, 0, 0, 0, 0], [-1.0, 0.5, -3.0, 0.002, -0.001, 0], [0, 2.0, -8.0, 0, 0, -2e-3]],
+    dtype=torch.float64,
+)
+
+
+class Pressed:
+    """One mesh a pad, at rest on its face."""
+
+    def __init__(self, meshes: list[trimesh.Trimesh | None]):
+        self.rays = MeshRays([meshes], CONFIG.gel.size, CPU)
+        self.pads = torch.tensor([0.0, 0, 0, 0, 0, 0, 1]).repeat(len(meshes), 1)
+        self.heights = self.rays.heights
+
+    def look(self) -> None:
+        self.rays.move(self.pads[:, None].contiguous(), self.pads)
+
+
+def meshes() -> list[trimesh.Trimesh | None]:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.008)
+    shapes = [ball.copy(), ball.copy().apply_translation([3e-3, -4e-3, 0]), trimesh.creation.box([0.01, 0.012, 0.01])]
+    lifted = [shape.apply_translation([0, 0, -shape.bounds[0, 2]]) for shape in shapes]
+    return [lifted[0], lifted[1], lifted[2], None]
+
+
+def model(pads: int, **options) -> TouchModel:
+    made = TouchModel(with_options(CONFIG, options), pads, CPU)
+    made.reset(torch.arange(pads), np.arange(pads))
+    return made
+
+
+EVERYTHING = {"optics.shadow": 0.5, "optics.markers": True, "randomization.gain": 0.1, "randomization.stiffness": 0.3}
+
+
+def test_each_row_of_a_batch_is_as_if_alone():
+    together = model(4, **EVERYTHING)
+    for _ in range(2):  # with a history
+        seen = together.observe(Pressed(meshes()), LOADS)
+    for i, mesh in enumerate(meshes()):
+        alone = TouchModel(with_options(CONFIG, EVERYTHING), 1, CPU)
+        alone.reset(torch.arange(1), np.array([i]))
+        for _ in range(2):
+            one = alone.observe(Pressed([mesh]), LOADS[i : i + 1])
+        assert (one["force_field"][0] - seen["force_field"][i]).abs().max() < 1e-6
+        assert (one["penetration"][0] - seen["penetration"][i]).abs().max() < 1e-6
+        assert (one["rgb"][0].int() - seen["rgb"][i].int()).abs().max() <= 1
+
+
+def test_batch_of_64_equals_itself_bit_for_bit():
+    runs = []
+    for _ in range(2):
+        pads = model(64, **EVERYTHING, **{"optics.noise": 2.0})
+        runs.append(pads.observe(Pressed(meshes() * 16), LOADS.repeat(16, 1)))
+    for name in runs[0]:
+        assert torch.equal(runs[0][name], runs[1][name]), name
+
+
+def test_reset_clears_the_shear_of_these_pads_alone():
+    pads = model(3)
+    ball = [meshes()[0]] * 3
+    held, released = LOADS[:1].repeat(3, 1), LOADS[:1].repeat(3, 1)
+    released[:, [0, 1, 5]] = 0.0
+    pads.observe(Pressed(ball), held)
+    pads.reset(torch.tensor([1]), np.array([7]))
+    locked_in = pads.observe(Pressed(ball), released)["force_field"][..., 1:].abs().amax((1, 2, 3))
+    assert locked_in[1] < 1e-9
+    assert (locked_in[[0, 2]] > 1e-4).all()
+
+
+def test_randomised_gel_sinks_otherwise_under_the_same_force():
+    pads = model(8, **{"randomization.stiffness": 0.3, "randomization.friction": 0.2})
+    seen = pads.observe(Pressed([meshes()[0]] * 8), LOADS[:1].repeat(8, 1))
+    deepest = seen["penetration"].amax((1, 2))
+    assert deepest.unique().numel() == 8
+    assert deepest.max() / deepest.min() < np.sqrt(1.3 / 0.7) + 0.01  # a ball: depth goes with the root of the stiffness
+    assert seen["force_field"][..., 0].sum((1, 2)).tolist() == pytest.approx([5.0] * 8, rel=1e-5)
+
+
+def test_only_what_is_asked_for_is_computed():
+    depth = Pressed(meshes()[:1])
+    looked = []
+    depth.heights = lambda grid, window=None: (looked.append(len(grid)), depth.rays.heights(grid, window))[1]
+    field = TouchModel(CONFIG, 1, CPU, ("force_field",)).observe(depth, LOADS[:1])
+    assert field.keys() == {"force_field", "penetration"}
+    assert looked == [69 * 91]  # cells, no pixels
+    picture = TouchModel(CONFIG, 1, CPU, ("rgb",)).observe(depth, LOADS[:1])
+    assert picture.keys() == {"rgb"}
