@@ -7,7 +7,9 @@ import numpy as np
 
 from manifeel_ms3.tasks import VisuotactileEnv
 
-from .peg_insertion import PegInsertionExpert as PegInsertionExpert
+from .ball_sorting import BallSortingExpert as BallSortingExpert
+from .insertion import InsertionExpert as InsertionExpert
+from .object_search import ObjectSearchExpert as ObjectSearchExpert
 
 
 class Expert(Protocol):
@@ -19,7 +21,12 @@ class Expert(Protocol):
 
 
 EXPERTS: dict[str, Callable[[VisuotactileEnv, int], Expert]] = {
-    "ManiFeel-PegInsertion-v1": PegInsertionExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-PegInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-USBInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-BallSorting-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-BallSortingDim-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
 }
 
 

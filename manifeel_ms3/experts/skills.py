@@ -28,6 +28,8 @@ class Skills:
         self._scale = np.r_[np.full(3, self.arm.config.pos_upper), np.full(3, self.arm.config.rot_upper)]
         self._speed = 0.0
         self._no_load = np.zeros(3)
+        self.gripper: float | None = None
+        """What actions command the gripper to do, 1 open to -1 closed; None where the controller holds it fixed."""
 
     # ---------------------------------------------------------------- what is seen and felt
 
@@ -58,13 +60,19 @@ class Skills:
             total += pad.apply(force)
         return total  # the object passes on to the pads what the world does to it
 
+    @property
+    def squeeze(self) -> np.ndarray:
+        """Normal force (2,), N, that the left and the right pad feel."""
+        return np.array([-float(self.agent.pad_wrench(side)[0, 2]) for side in ("left", "right")])
+
     # ---------------------------------------------------------------- moving
 
     def command(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        """Action (6,) that puts the controller's target at a pose, or as near as the limits allow."""
+        """Action (6,), or (7,) with a gripper, that puts the controller's target at a pose, or as near as the limits allow."""
         here, facing = self.commanded
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
-        return np.clip(twist / self._scale, -1.0, 1.0)
+        action = np.clip(twist / self._scale, -1.0, 1.0)
+        return action if self.gripper is None else np.r_[action, self.gripper]
 
     def towards(self, rotation: Rotation, rate: float) -> Rotation:
         """Orientation of the command, turned towards another by `rate` rad at most."""
@@ -90,6 +98,12 @@ class Skills:
             if np.linalg.norm(position - here) < tolerance and (rotation * facing.inv()).magnitude() < 0.006:
                 return
             yield self.stride(position, rotation)
+
+    def set_gripper(self, opening: float, steps: int = 6) -> Actions:
+        """Stay, and move the gripper: 1 open to -1 closed."""
+        self.gripper = opening
+        for _ in range(steps):
+            yield self.command(*self.commanded)
 
     def lower_until_contact(self, rotation: Rotation, lowest: float, threshold: float = 2.0, speed: float = 0.002) -> Actions:
         """Go straight down until something pushes back, or the tool is at height `lowest`."""

@@ -1,13 +1,18 @@
 """A part: one description of a rigid body's shape that yields both what is drawn and what collides."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import sapien
+import trimesh
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
+
+from manifeel_ms3.sensors.surfaces import give_relief
+
+UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
 
 
 @dataclass(frozen=True)
@@ -17,27 +22,97 @@ class Box:
     size: tuple[float, float, float]
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
+    def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
+        pose, half_size = sapien.Pose(self.centre), np.asarray(self.size) / 2
+        builder.add_box_collision(pose, half_size, material, density)
+        if look is not None:
+            builder.add_box_visual(pose, half_size, look)
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Round pin along the part's z, m."""
+
+    radius: float
+    length: float
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
+        pose = sapien.Pose(self.centre, UPRIGHT)
+        builder.add_cylinder_collision(pose, self.radius, self.length / 2, material, density)
+        if look is not None:
+            builder.add_cylinder_visual(pose, self.radius, self.length / 2, look)
+
+
+@dataclass(frozen=True)
+class Ball:
+    radius: float
+    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
+        pose = sapien.Pose(self.centre)
+        builder.add_sphere_collision(pose, self.radius, material, density)
+        if look is not None:
+            builder.add_sphere_visual(pose, self.radius, look)
+
+
+Piece = Box | Cylinder | Ball
+
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid body made of boxes. `density` in kg/m^3, `friction` Coulomb's coefficient, `colour` RGB in [0, 1]."""
+    """A rigid body made of convex pieces. `density` in kg/m^3, `friction` Coulomb's coefficient, `colour` RGB in [0, 1].
+
+    `other_colours`: of single pieces, by their place in `pieces`.
+    """
 
     name: str
-    boxes: tuple[Box, ...]
+    pieces: tuple[Piece, ...]
     colour: tuple[float, float, float]
     density: float = 1000.0
     friction: float = 0.5
+    other_colours: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    undrawn: frozenset[int] = frozenset()
+    """Places in `pieces` of those that collide and are not seen, nor felt."""
+    relief: trimesh.Trimesh | None = None
+    """Surface to touch, where it has what is too fine for cameras and contacts."""
 
     def build(self, scene: ManiSkillScene, body_type: str, initial_pose: sapien.Pose) -> Actor:
         """Add the part to a scene as a "dynamic", "kinematic" or "static" actor."""
         builder = scene.create_actor_builder()
         material = PhysxMaterial(self.friction, self.friction, 0.0)
-        for box in self.boxes:
-            pose, half_size = sapien.Pose(box.centre), np.asarray(box.size) / 2
-            builder.add_box_collision(pose, half_size, material, self.density)
-            if scene.can_render():  # a render material cannot even be made without a renderer
-                look = RenderMaterial(base_color=[*self.colour, 1.0], roughness=0.6, specular=0.3)
-                builder.add_box_visual(pose, half_size, look)
+        for k, piece in enumerate(self.pieces):
+            look = None
+            if scene.can_render() and k not in self.undrawn:  # a render material cannot even be made without a renderer
+                colour = self.other_colours.get(k, self.colour)
+                look = RenderMaterial(base_color=[*colour, 1.0], roughness=0.6, specular=0.3)
+            piece.add_to(builder, material, self.density, look)
         builder.initial_pose = initial_pose
         builder.set_physx_body_type(body_type)
-        return builder.build(self.name)
+        actor = builder.build(self.name)
+        if self.relief is not None:
+            give_relief(actor, self.relief)
+        return actor
+
+
+def block_with_holes(
+    outer: tuple[float, float], depth: float, holes: list[tuple[tuple[float, float], tuple[float, float]]], bottom: float = 0.0
+) -> tuple[Box, ...]:
+    """Boxes of a slab `outer` (x, y) by `depth`, its underside at z = `bottom`, with rectangular through holes.
+
+    `holes`: ((size x, size y), (centre x, centre y)) each; they must not overlap along x.
+
+    Raises:
+        ValueError: holes that overlap or reach beyond the slab.
+    """
+    holes = sorted(holes, key=lambda hole: hole[1][0])
+    z, boxes, left = bottom + depth / 2, [], -outer[0] / 2
+    for (size_x, size_y), (x, y) in holes:
+        if x - size_x / 2 <= left or x + size_x / 2 >= outer[0] / 2 or abs(y) + size_y / 2 >= outer[1] / 2:
+            raise ValueError(f"hole {size_x} x {size_y} m at ({x}, {y}) overlaps another or the rim of a slab of {outer} m")
+        boxes.append(Box((x - size_x / 2 - left, outer[1], depth), ((x - size_x / 2 + left) / 2, 0.0, z)))
+        for low, high in ((-outer[1] / 2, y - size_y / 2), (y + size_y / 2, outer[1] / 2)):
+            boxes.append(Box((size_x, high - low, depth), (x, (low + high) / 2, z)))
+        left = x + size_x / 2
+    boxes.append(Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)))
+    return tuple(boxes)

@@ -49,7 +49,7 @@ class VisuotactileEnv(BaseEnv):
         tactile_sensors: pads observed, of "left", "right"; default: right, as in the paper.
         tactile: fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
         lighting: "normal" or "dim" (5 %).
-        occlusion: whether the task's occluder hides its interior; only tasks that have one take True.
+        occlusion: whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: fields of the task's `Randomization` to override, by name.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
@@ -65,6 +65,7 @@ class VisuotactileEnv(BaseEnv):
     policy_cameras: tuple[str, ...] = ("wrist",)
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
+    front_camera_at = (0.68, 0.0, 0.15)  # m
     agent: PandaGelSight
 
     def __init__(
@@ -78,7 +79,7 @@ class VisuotactileEnv(BaseEnv):
         tactile_sensors: Iterable[str] = ("right",),
         tactile: Mapping[str, Any] | None = None,
         lighting: str = "normal",
-        occlusion: bool = False,
+        occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
         **kwargs,
     ):
@@ -93,7 +94,7 @@ class VisuotactileEnv(BaseEnv):
         (self._lighting,) = _known("lighting", [lighting], tuple(LIGHTING))
         if occlusion and not self.has_occluder:
             raise ValueError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
-        self.occlusion = occlusion
+        self.occlusion = self.has_occluder if occlusion is None else occlusion
         self.randomization = self._make_randomization(randomization or {})
         backend = available_render_backend() if render_backend == "auto" else render_backend
         if backend == "none" and (wanted := self._wanted_pictures(own_mode, kwargs.get("render_mode"))):
@@ -169,7 +170,7 @@ class VisuotactileEnv(BaseEnv):
 
     @property
     def _default_sensor_configs(self):
-        views = dict(front=((0.68, 0.0, 0.15), (-1.0, 0.0)), side=((0.5, -0.17, 0.17), (0.0, 1.0)))
+        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=((0.5, -0.17, 0.17), (0.0, 1.0)))
         return [
             CameraConfig(name, looking_down(*views[name]), 256, 256, FIELD_OF_VIEW, near=0.01, far=10)
             for name in self._camera_names

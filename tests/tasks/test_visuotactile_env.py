@@ -76,7 +76,7 @@ def test_state_modes(make_env):
     state, _ = make_env(obs_mode="state", render_backend="none").reset(seed=0)
     assert isinstance(state, torch.Tensor)
     tree, _ = make_env(obs_mode="state_dict", render_backend="none").reset(seed=0)
-    assert {"peg_pose", "socket_pose", "tcp_pose"} <= set(tree["extra"])
+    assert {"plug_pose", "socket_pose", "tcp_pose"} <= set(tree["extra"])
     both, _ = make_env(obs_mode="state+tacff", render_backend="none").reset(seed=0)
     assert torch.equal(both["state"], state)
     assert both["sensor_data"]["tactile_right"]["force_field"].abs().max() > 0
@@ -223,5 +223,5 @@ def test_force_field_equals_the_wrench_and_the_weight(make_env):
             assert field.tolist() == pytest.approx([-fz, fx, fy], rel=0.01, abs=1e-3)
             rotation = torch.as_tensor(base.agent.gels[side].pose.sp.to_transformation_matrix()[:3, :3]).float()
             total += rotation @ torch.tensor([field[1], field[2], -field[0]])
-        weight = float(base.peg.mass[0]) * 9.81
+        weight = float(base.plug.mass[0]) * 9.81
         assert total.tolist() == pytest.approx([0, 0, -weight], abs=0.02 * weight)

@@ -1,0 +1,166 @@
+"""Demonstrator of the insertion tasks: approach, touch, feel for the hole with a tilted plug, align, press."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from manifeel_ms3.tasks.insertion import InsertionEnv
+
+from .skills import Actions, Skills
+
+SIGHT_ERROR = 0.0015  # m: how far off the eye places the hole, about two pixels of the wrist camera
+GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the plug's pitch in the hand
+HOVER = 0.010  # m above the socket
+LEAN = np.deg2rad([5.0, 7.0])  # of the plug while it feels for the hole, about x and y: its lowest corner is (+x, +y)
+CORNER_AIM = 0.75  # of the hole's half size, inside its (+x, +y) corner: near its middle, for what the eye may be off
+FEEL_FORCE = 2.5  # N: a wall is felt
+UPRIGHT = np.deg2rad(0.7)
+STAND_UP_TURN = 0.012  # rad a step
+STAND_UP_STEPS = 25
+STAND_UP_PUSH = np.array([4e-4, 4e-4, -5e-4])  # m that the command leads into the hole's corner meanwhile
+ENTERED = 0.0008  # m below the rim, of the plug's end: it is in the hole
+ASTRAY = 0.004  # m from where the hole was seen: the plug slides about on top
+PATIENCE = 15  # steps without getting deeper, before starting over
+PRESS_FORCE = 10.0  # N
+FEEL_PRESS = 4.5  # N, downwards, while it feels for the walls
+YIELD = 1.5e-4  # m/N a step: how the hand goes after a force that it does not want
+STEP = 0.0012  # m, at most, of a step under force
+WRIGGLE = 4e-4  # m
+STRAIGHT = Rotation.identity()
+DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the plug in it: frames with their z down
+
+
+class InsertionExpert:
+    """Knows the parts, sees roughly where the socket is, and finds the hole by touch.
+
+    It leans the plug, so that one corner goes ahead into the hole, pushes it into the hole's own corner until both walls are
+    felt, stands the plug up in it, and presses it down: what people do with a tight fit.
+    """
+
+    def __init__(self, env: InsertionEnv, seed: int):
+        self._rng = np.random.default_rng([seed, 7])
+        self.env, self.fit = env, env.fit
+        self.skills = Skills(env)
+        self._misjudged = Rotation.from_euler("y", self._rng.uniform(-1, 1) * GRASP_ERROR)
+        self._look()
+        fit = env.fit
+        # plug frame: z ahead, y turned over; the guide's corner that lies at (+x, +y) when the plug points down
+        self._corner = np.array([fit.guide_at[0] + fit.guide[0], -fit.guide_at[1] - fit.guide[1], fit.reach])
+        self._end = np.array([0.0, 0.0, fit.reach])
+        self._rim = self.socket[2] + fit.rim
+
+    def _look(self) -> None:
+        """See where the socket is, a little off."""
+        angle, radius = self._rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(self._rng.uniform())
+        socket = self.env.socket.pose.raw_pose[0, :3].cpu().numpy().astype(np.float64)
+        self.socket = socket + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+
+    # ---------------------------------------------------------------- the plug in the hand
+
+    def _plug_in_tool(self) -> tuple[np.ndarray, Rotation]:
+        """The plug as the tactile images show it, pitch a little off."""
+        pose = (self.env.agent.tcp.pose.inv() * self.env.plug.pose).raw_pose[0].cpu().numpy().astype(np.float64)
+        return pose[:3], self._misjudged * Rotation.from_quat(pose[[4, 5, 6, 3]])
+
+    def _tool_for(self, point: np.ndarray, place: np.ndarray, lean: Rotation) -> tuple[np.ndarray, Rotation]:
+        """Tool pose that puts a point of the plug (its frame) at a place, the plug leaning by `lean` from straight down."""
+        position, rotation = self._plug_in_tool()
+        facing = lean * DOWNWARD * rotation.inv()
+        return place - facing.apply(position + rotation.apply(point)), facing
+
+    def _place(self, point: np.ndarray) -> np.ndarray:
+        """Where a point of the plug is, going by the hand's pose and the tactile images."""
+        position, rotation = self._plug_in_tool()
+        tool, facing = self.skills.tool
+        return tool + facing.apply(position + rotation.apply(point))
+
+    # ---------------------------------------------------------------- the demonstration
+
+    def actions(self) -> Actions:
+        """Actions of one episode, from its start until the plug sits; endless, as it goes on holding it down."""
+        skills = self.skills
+        yield np.zeros(6)
+        skills.tare()
+        lean = Rotation.from_euler("xy", [-LEAN[0], LEAN[1]])
+        inner = (1 - CORNER_AIM) * np.array(self.fit.guide_hole) + self.fit.guide_at
+        while True:
+            over = np.array([*(self.socket[:2] + inner), self._rim])
+            yield from skills.reach(*self._tool_for(self._corner, over + [0, 0, HOVER], lean), tolerance=1e-3)
+            yield from self._touch_down(over, lean)
+            yield from self._feel_corner(lean)
+            yield from self._stand_up(lean)
+            yield from self._press()
+            here, facing = skills.commanded
+            yield from skills.reach(here + [0, 0, HOVER], facing, tolerance=2e-3)
+            self._look()
+
+    def _touch_down(self, over: np.ndarray, lean: Rotation) -> Actions:
+        """Lower the leading corner; where it lands on the rim instead of in the hole, try the next place of a spiral."""
+        skills = self.skills
+        for ring, angle in [(0.0, 0.0), *((0.0012, a) for a in np.arange(6) * np.pi / 3)]:
+            shift = ring * np.array([np.cos(angle), np.sin(angle), 0.0])
+            start, facing = self._tool_for(self._corner, over + shift + [0, 0, 0.003], lean)
+            yield from skills.reach(start, facing, tolerance=1e-3)
+            yield from skills.lower_until_contact(facing, lowest=start[2] - 0.006)
+            if self._place(self._corner)[2] < self._rim - 0.0004:
+                return
+
+    def _feel_corner(self, lean: Rotation) -> Actions:
+        """Push the leading corner towards +x and +y, lightly pressed down, until both walls push back."""
+        skills = self.skills
+        for _ in range(60):
+            here, _ = skills.commanded
+            _, facing = skills.tool
+            load = skills.load
+            if load[0] < -FEEL_FORCE and load[1] < -FEEL_FORCE:
+                return
+            step = np.array(
+                [
+                    0.0006 if load[0] > -FEEL_FORCE else 0.0,
+                    0.0006 if load[1] > -FEEL_FORCE else 0.0,
+                    np.clip(YIELD * (load[2] - FEEL_PRESS), -0.0006, 0.0006),
+                ]
+            )
+            yield skills.command(here + step, self._facing(lean))
+
+    def _facing(self, lean: Rotation) -> Rotation:
+        return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
+
+    def _stand_up(self, lean: Rotation) -> Actions:
+        """Turn the plug upright about its leading corner, which stays lightly pushed into the hole's corner and down: first
+        until the long edge lies in the hole, then all the way."""
+        skills = self.skills
+        place = self._place(self._corner)
+        for upright in (Rotation.from_euler("x", -LEAN[0]), STRAIGHT):
+            for _ in range(STAND_UP_STEPS):
+                if self._tilt(upright) < UPRIGHT:
+                    break
+                facing = skills.towards(self._facing(upright), STAND_UP_TURN)
+                position, rotation = self._plug_in_tool()
+                target = place - facing.apply(position + rotation.apply(self._corner))
+                yield skills.command(target + STAND_UP_PUSH, facing)
+
+    def _tilt(self, upright: Rotation = STRAIGHT) -> float:
+        """Angle of the plug from a facing, rad, going by the hand's pose and the tactile images."""
+        _, facing = self.skills.tool
+        return (self._facing(upright) * facing.inv()).magnitude()
+
+    def _press(self) -> Actions:
+        """Press down, giving way to what pushes sideways and to what tilts; where it sticks, ease off and wriggle. Ends only
+        when the plug has not even entered."""
+        skills = self.skills
+        stuck, best = 0, np.inf
+        for step in range(10_000):
+            here, _ = skills.tool
+            load = skills.load
+            stuck = 0 if here[2] < best - 1e-4 else stuck + 1
+            best = min(best, here[2])
+            end = self._place(self._end)
+            strayed = np.linalg.norm((end - self.socket)[:2]) > ASTRAY
+            if strayed or (stuck > PATIENCE and end[2] > self._rim - ENTERED):
+                return
+            leaning = self._tilt() > 3 * UPRIGHT
+            move = np.clip(YIELD * (load - [0, 0, FEEL_PRESS if leaning else PRESS_FORCE]), -STEP, STEP)
+            if stuck > 4:
+                move[:2] += WRIGGLE * np.array([np.cos(1.3 * step), np.sin(1.3 * step)])
+            command, _ = skills.commanded
+            yield skills.command(command + move, skills.towards(self._facing(STRAIGHT), STAND_UP_TURN))

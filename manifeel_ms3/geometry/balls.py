@@ -1,0 +1,53 @@
+"""Two balls that look alike and feel different, and the stand they sit on."""
+
+import numpy as np
+import trimesh
+
+from .part import Ball, Box, Part, block_with_holes
+
+BALL_RADIUS = 0.02075  # m, of both: between a table-tennis ball's 20.0 and a golf ball's 21.35
+GOLF_MASS, TENNIS_MASS = 0.0459, 0.0027  # kg
+DIMPLES, DIMPLE_DEPTH, DIMPLE_RADIUS = 336, 2.5e-4, 1.75e-3  # m
+SEAT_SPACING, SEAT_HOLE, STAND_HEIGHT = 0.130, 0.020, 0.015  # m; so far apart that open fingers go between
+SEAT_SIZE = (0.05, 0.05)
+SEAT_HEIGHT = STAND_HEIGHT + float(np.sqrt(BALL_RADIUS**2 - (SEAT_HOLE / 2) ** 2))
+"""Of a seated ball's centre: it rests on the four edges of a square hole."""
+WHITE = (0.93, 0.93, 0.90)
+
+
+def golf_ball() -> Part:
+    return _ball("golf_ball", GOLF_MASS, golf_ball_mesh())
+
+
+def tennis_ball() -> Part:
+    return _ball("tennis_ball", TENNIS_MASS, None)
+
+
+def _ball(name: str, mass: float, relief: trimesh.Trimesh | None) -> Part:
+    volume = 4 / 3 * np.pi * BALL_RADIUS**3
+    return Part(name, (Ball(BALL_RADIUS),), WHITE, density=mass / volume, relief=relief)
+
+
+def golf_ball_mesh() -> trimesh.Trimesh:
+    """Sphere with 336 spherical dimples, evenly spread (Fibonacci lattice), 82,000 triangles."""
+    mesh = trimesh.creation.icosphere(subdivisions=6, radius=1.0)
+    k = np.arange(DIMPLES) + 0.5
+    polar, turn = np.arccos(1 - 2 * k / DIMPLES), np.pi * (1 + np.sqrt(5)) * k
+    centres = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    # the direction's angle from the nearest dimple's middle, as a length on the ball
+    distance = BALL_RADIUS * np.arccos((mesh.vertices @ centres.T).max(axis=1).clip(-1, 1))
+    cup = (DIMPLE_RADIUS**2 + DIMPLE_DEPTH**2) / (2 * DIMPLE_DEPTH)
+    depth = np.sqrt(np.maximum(cup**2 - distance**2, 0)) - (cup - DIMPLE_DEPTH)
+    return trimesh.Trimesh(mesh.vertices * (BALL_RADIUS - depth.clip(min=0))[:, None], mesh.faces, process=False)
+
+
+def ball_stand() -> Part:
+    """Two seats with a square hole each, along y, and a bar between; its frame in the middle of its underside."""
+    seat = block_with_holes(SEAT_SIZE, STAND_HEIGHT, [((SEAT_HOLE, SEAT_HOLE), (0.0, 0.0))])
+    seats = [
+        Box(box.size, (box.centre[0], box.centre[1] + side * SEAT_SPACING / 2, box.centre[2]))
+        for side in (-1, 1)
+        for box in seat
+    ]
+    bar = Box((SEAT_SIZE[0], SEAT_SPACING - SEAT_SIZE[1], STAND_HEIGHT / 3), (0.0, 0.0, STAND_HEIGHT / 6))
+    return Part("stand", (*seats, bar), (0.30, 0.32, 0.36))

@@ -1,0 +1,28 @@
+"""Things to look for, and what they are hidden in."""
+
+from .part import Box, Part
+
+CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004  # m
+CONTAINER_FLOOR = 0.004
+BATTERY_SIZE = 0.025
+
+
+def container(front_drawn: bool) -> Part:
+    """Opaque box, open above; its frame in the middle of its underside. Its front, at +x, may be left undrawn."""
+    (x, y), wall, height = CONTAINER_OUTER, CONTAINER_WALL, CONTAINER_HEIGHT
+    pieces = (
+        Box((wall, y, height), ((x - wall) / 2, 0.0, height / 2)),
+        Box((wall, y, height), (-(x - wall) / 2, 0.0, height / 2)),
+        *(Box((x - 2 * wall, wall, height), (0.0, side * (y - wall) / 2, height / 2)) for side in (-1, 1)),
+        Box((x - 2 * wall, y - 2 * wall, CONTAINER_FLOOR), (0.0, 0.0, CONTAINER_FLOOR / 2)),
+    )
+    return Part("container", pieces, colour=(0.36, 0.30, 0.26), undrawn=frozenset() if front_drawn else frozenset({0}))
+
+
+def battery() -> Part:
+    """Cube-shaped battery block with its contact in the middle of one face."""
+    size = BATTERY_SIZE
+    terminal = Box((size / 3, size / 3, 0.001), (0.0, 0.0, size / 2 + 0.0005))
+    return Part(
+        "battery", (Box((size, size, size)), terminal), (0.12, 0.35, 0.20), density=2000.0, other_colours={1: (0.8, 0.7, 0.3)}
+    )

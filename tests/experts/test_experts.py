@@ -1,0 +1,101 @@
+"""Demonstrators win by the policy's own means, and go by what they feel."""
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.experts import EXPERTS, make_expert
+from manifeel_ms3.experts.ball_sorting import ROUGH
+from manifeel_ms3.sensors.surfaces import RELIEF
+from tests.conftest import PEG
+
+
+@pytest.mark.parametrize("fit", ["tight", "loose"])
+def test_expert_succeeds_gently_within_the_action_limits(make_env, fit):
+    env = make_env(obs_mode="none", render_backend="none", fit=fit)
+    for seed in range(6):
+        env.reset(seed=seed)
+        actions, peak = [], 0.0
+        for action in make_expert(PEG, env.unwrapped, seed).actions():
+            *_, terminated, truncated, info = env.step(action)
+            actions.append(action)
+            peak = max(peak, float(info["contact_force"]))
+            if terminated or truncated:
+                break
+        assert info["success"].all(), f"seed {seed}"
+        assert np.abs(actions).max() <= 1.0
+        assert peak < 60.0
+        assert len(actions) < 150
+
+
+def test_expert_feels_the_rim(make_env):
+    """It goes on only after touch: with the socket taken away, it finds nothing to stand the peg up in."""
+    env = make_env(obs_mode="none", render_backend="none", fit="loose")
+    env.reset(seed=0)
+    expert = make_expert(PEG, env.unwrapped, 0)
+    from mani_skill.utils.structs import Pose
+
+    away = env.unwrapped.socket.pose.raw_pose.clone()
+    away[:, 0] += 0.2
+    env.unwrapped.socket.set_pose(Pose.create(away))
+    for _, action in zip(range(120), expert.actions(), strict=False):
+        *_, info = env.step(action)
+    assert not info["success"].any()
+
+
+@pytest.mark.parametrize("task", sorted(set(EXPERTS) - {PEG}))
+def test_every_expert_succeeds_gently(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none")
+    for seed in range(3):
+        env.reset(seed=seed)
+        actions, peak = [], 0.0
+        for action in make_expert(task, env.unwrapped, seed).actions():
+            *_, terminated, truncated, info = env.step(action)
+            actions.append(action)
+            peak = max(peak, float(info["contact_force"]))
+            if terminated or truncated:
+                break
+        assert info["success"].all(), f"seed {seed}"
+        assert np.abs(actions).max() <= 1.0
+        assert peak < 60.0
+
+
+def test_search_goes_to_the_other_place_when_it_feels_nothing(make_env):
+    env = make_env("ManiFeel-ObjectSearch-v1", obs_mode="none", render_backend="none")
+    visited = []
+    for seed in range(6):
+        env.reset(seed=seed)
+        base, places = env.unwrapped, []
+        expert = make_expert("ManiFeel-ObjectSearch-v1", base, seed)
+        for action in expert.actions():
+            *_, terminated, truncated, _ = env.step(action)
+            x, z = float(base.agent.tcp.pose.p[0, 0]) - 0.5, float(base.agent.tcp.pose.p[0, 2])
+            if z < 0.05 and (not places or places[-1] != int(x > 0)):
+                places.append(int(x > 0))
+            if terminated or truncated:
+                break
+        assert places[0] == expert.guess
+        assert places[-1] == int(base.place)
+        assert len(places) == 1 + (expert.guess != int(base.place))
+        visited.append(len(places))
+    assert set(visited) == {1, 2}
+
+
+def test_sorting_decides_by_the_dimples_it_feels(make_env):
+    """With the dimples taken off the golf ball, the expert finds no ball to keep."""
+    env = make_env("ManiFeel-BallSorting-v1", obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    delattr(env.unwrapped.golf, RELIEF)
+    expert = make_expert("ManiFeel-BallSorting-v1", env.unwrapped, 0)
+    felt = []
+    roughness = expert.roughness
+    expert.roughness = lambda: felt.append(roughness()) or felt[-1]
+    for _, action in zip(range(250), expert.actions(), strict=False):
+        env.step(action)
+    assert len(felt) == 3
+    assert max(felt) < ROUGH
+
+
+def test_unknown_task_names_those_that_have_an_expert(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    with pytest.raises(ValueError, match=PEG):
+        make_expert("ManiFeel-Juggling-v1", env.unwrapped, 0)

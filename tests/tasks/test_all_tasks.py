@@ -1,0 +1,62 @@
+"""What holds for every task."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from manifeel_ms3.experts import EXPERTS
+from manifeel_ms3.paths import data_dir
+
+TASKS = sorted(name for name in gym.registry if name.startswith("ManiFeel-"))
+
+
+def test_every_task_has_a_demonstrator_and_evaluation_seeds():
+    assert set(EXPERTS) == set(TASKS)
+    seeds = json.loads((data_dir() / "eval_seeds.json").read_text())
+    assert set(seeds) == set(TASKS)
+    assert all(len(set(s)) == 50 and min(s) >= 100_000 for s in seeds.values())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_no_success_at_reset_or_by_chance(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none")
+    rng = np.random.default_rng(0)
+    for seed in range(20):
+        _, info = env.reset(seed=seed)
+        assert not info["success"].any()
+        assert not info["fail"].any()
+        assert info["contact_force"].isfinite().all()
+    for _ in range(60):
+        *_, info = env.step(rng.uniform(-1, 1, env.action_space.shape))
+        assert not info["success"].any()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_observations_keep_the_contract_and_hold_nothing_privileged(make_env, task):
+    env = make_env(task, obs_mode="tacrgb+tacff", render_backend="none", tactile_sensors=("left", "right"))
+    obs, _ = env.reset(seed=0)
+    assert set(obs["extra"]) == {"tcp_pose"}
+    assert set(obs["sensor_data"]) == {"tactile_left", "tactile_right"}
+    for pad in obs["sensor_data"].values():
+        assert pad["rgb"].shape == (1, 240, 320, 3)
+        assert pad["rgb"].dtype == torch.uint8
+        assert pad["force_field"].shape == (1, 10, 14, 3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_rewards_are_normalised(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none", reward_mode="normalized_dense")
+    env.reset(seed=0)
+    _, reward, *_ = env.step(np.zeros(env.action_space.shape))
+    assert 0.0 <= float(reward) <= 1.0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_task_says_what_it_is(task):
+    text = gym.spec(task).entry_point
+    cls = text if isinstance(text, type) else None
+    doc = (cls or gym.make(task, obs_mode="none", render_backend="none").unwrapped.__class__).__doc__
+    assert "at 5 % of the light" in doc or all(h in doc for h in ("Task Description", "Randomizations", "Success Conditions"))

@@ -1,0 +1,84 @@
+"""ObjectSearch and BallSorting: near misses, and that only touch can tell."""
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
+from tests.conftest import needs_renderer
+
+SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
+
+
+def lift(actor, height: float) -> None:
+    pose = actor.pose.raw_pose.clone()
+    pose[:, 2] += height
+    actor.set_pose(Pose.create(pose))
+
+
+@pytest.mark.parametrize(
+    ("golf", "tennis", "goal"), [(0.11, 0.0, True), (0.09, 0.0, False), (0.0, 0.11, False), (0.11, 0.011, False)]
+)
+def test_only_the_golf_ball_lifted_alone_counts(make_env, golf, tennis, goal):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    lift(base.golf, golf)
+    lift(base.tennis, tennis)
+    assert bool(base.goal_reached(base.measure())) is goal
+
+
+def test_balls_swap_and_rest_in_their_seats(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    sides = []
+    for seed in range(20):
+        env.reset(seed=seed)
+        base = env.unwrapped
+        sides.append(bool(base.swapped))
+        assert abs(float(base.golf.pose.p[0, 2]) - SEAT_HEIGHT) < 2e-4
+        assert float(base.measure()["tennis_away"]) < 2e-4
+    assert 5 <= sum(sides) <= 15
+
+
+def test_golf_ball_has_its_dimples():
+    radius = np.linalg.norm(golf_ball_mesh().vertices, axis=1)
+    assert radius.max() == pytest.approx(BALL_RADIUS, abs=1e-6)
+    assert radius.min() == pytest.approx(BALL_RADIUS - DIMPLE_DEPTH, abs=5e-6)
+    assert 0.5 < (radius < BALL_RADIUS - 1e-5).mean() < 0.7  # share of the surface
+
+
+@needs_renderer
+def test_cameras_cannot_tell_the_balls_apart(make_env):
+    env = make_env(SORTING, obs_mode="rgb", cameras=("front", "wrist"))
+    env.reset(seed=3)
+    base = env.unwrapped
+    before = {name: data["rgb"].clone() for name, data in base.get_obs()["sensor_data"].items()}
+    golf, tennis = base.golf.pose.raw_pose.clone(), base.tennis.pose.raw_pose.clone()
+    base.golf.set_pose(Pose.create(tennis))
+    base.tennis.set_pose(Pose.create(golf))
+    for name, data in base.get_obs()["sensor_data"].items():
+        difference = (data["rgb"].int() - before[name].int()).abs()
+        assert difference.max() <= 2, name  # a sphere's facets turn with it
+
+
+@pytest.mark.parametrize(("height", "goal"), [(0.11, True), (0.09, False)])
+def test_battery_must_be_lifted(make_env, height, goal):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    lift(base.battery, height)
+    assert bool(base.goal_reached(base.measure())) is goal
+
+
+@needs_renderer
+def test_front_camera_cannot_see_into_the_container_unless_its_front_is_left_out(make_env):
+    for occlusion in (True, False):
+        env = make_env(SEARCH, obs_mode="rgb", occlusion=occlusion)
+        pictures = []
+        for x in (0.425, 0.575):
+            env.reset(seed=0)
+            base = env.unwrapped
+            base.battery.set_pose(Pose.create_from_pq(torch.tensor([[x, 0.0, 0.0165]])))
+            pictures.append(base.get_obs()["sensor_data"]["front"]["rgb"].int())
+        assert bool((pictures[0] != pictures[1]).any()) is not occlusion
