@@ -9,6 +9,13 @@ TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
 WITHOUT_PICTURES="only what needs no picture works: obs_mode='state' or 'tacff' with render_backend='none'."
 
+LAVAPIPE=/usr/local/lib/mesa-lavapipe
+LAVAPIPE_SHA256=3899f1800424c60a05df5d6913076a526ca8fdbabec43672cd397563d1ca3263
+LAVAPIPE_URLS=(
+  "http://deb.debian.org/debian/pool/main/m/mesa/mesa-vulkan-drivers_25.0.7-2~bpo12+1_amd64.deb"
+  "https://snapshot.debian.org/file/690815f474701be97646657f06069dcd3d56f644"
+)
+
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
 has_library() { ldconfig -p | grep -q "$1"; } # packages have other names from release to release
@@ -19,6 +26,7 @@ as_root() {
 
 new_enough_mesa() {
   local version
+  [ ! -f "$LAVAPIPE/libvulkan_lvp.so" ] || return 0
   version=$(dpkg-query -W -f='${Version}' mesa-vulkan-drivers 2>/dev/null) || return 1
   dpkg --compare-versions "$version" ge "$MIN_MESA"
 }
@@ -36,11 +44,23 @@ add_mesa_source() { # a release of Mesa that is new enough, where the system's o
     as_root apt-get update -q
     MESA_RELEASE=(-t bookworm-backports)
     ;;
-  ubuntu-22.04)
-    as_root apt-get install -y -q software-properties-common
-    as_root add-apt-repository -y ppa:kisak/kisak-mesa && as_root apt-get update -q
-    ;;
   esac
+}
+
+install_debians_lavapipe() { # Ubuntu 22.04 has no Mesa that is new enough; Debian's is built for its LLVM 15 and glibc
+  . /etc/os-release
+  [ "$ID-$VERSION_ID" = ubuntu-22.04 ] && [ "$(dpkg --print-architecture)" = amd64 ] || return 1
+  local unpacked url
+  unpacked=$(mktemp -d)
+  for url in "${LAVAPIPE_URLS[@]}"; do
+    /usr/lib/apt/apt-helper download-file "$url" "$unpacked/mesa.deb" "SHA256:$LAVAPIPE_SHA256" && break
+  done
+  dpkg-deb -x "$unpacked/mesa.deb" "$unpacked" &&
+    sed "s#\"libvulkan_lvp.so\"#\"$LAVAPIPE/libvulkan_lvp.so\"#" "$unpacked/usr/share/vulkan/icd.d/lvp_icd.json" >"$unpacked/lvp_icd.json" &&
+    as_root install -D -m 644 "$unpacked/lvp_icd.json" /usr/local/share/vulkan/icd.d/lvp_icd.json &&
+    as_root install -D -m 644 "$unpacked/usr/lib/x86_64-linux-gnu/libvulkan_lvp.so" "$LAVAPIPE/libvulkan_lvp.so"
+  rm -r "$unpacked"
+  new_enough_mesa
 }
 
 install_system_packages() {
@@ -62,7 +82,7 @@ install_system_packages() {
   [ ${#missing[@]} = 0 ] || as_root apt-get install -y -q --no-install-recommends "${missing[@]}"
   if ! $mesa; then
     as_root apt-get install -y -q --no-install-recommends mesa-vulkan-drivers || true
-    if ! new_enough_mesa; then
+    if ! new_enough_mesa && ! install_debians_lavapipe; then
       { add_mesa_source && as_root apt-get install -y -q --no-install-recommends "${MESA_RELEASE[@]}" mesa-vulkan-drivers; } || true
     fi
     new_enough_mesa || say "No mesa-vulkan-drivers >= $MIN_MESA could be installed: $WITHOUT_PICTURES"

@@ -130,6 +130,7 @@ def _height(surface: wp.array3d(dtype=wp.float32), n: int, y: float, x: float) -
 
 @wp.kernel
 def _cast_shadows(
+    first: int,
     surface: wp.array3d(dtype=wp.float32),  # (N, h, w), m into the gel
     to_light: wp.array(dtype=wp.vec2f),  # (3,), direction of each channel's light along the skin
     phase: wp.array(dtype=wp.vec2f),
@@ -138,6 +139,7 @@ def _cast_shadows(
     light: wp.array3d(dtype=wp.vec3f),
 ):
     n, i, j = wp.tid()
+    i += first
     here = surface[n, i, j]
     arrives = wp.vec3f(1.0)
     for channel in range(3):
@@ -240,13 +242,8 @@ class Optics:
         light = torch.empty(*coarse.shape, 3, device=self.device)
         phase = wp.from_torch(self._phase, dtype=wp.vec2f)
         cell = COARSE * self.config.pixel_size
-        wp.launch(
-            _cast_shadows,
-            dim=coarse.shape,
-            inputs=[wp.from_torch(coarse), self._to_light, phase, cell, self.config.optics.shadow],
-            outputs=[wp.from_torch(light, dtype=wp.vec3f)],
-            device=warp_device(self.device),
-        )
+        inputs = [wp.from_torch(coarse), self._to_light, phase, cell, self.config.optics.shadow]
+        launch_split(_cast_shadows, tuple(coarse.shape), inputs, [wp.from_torch(light, dtype=wp.vec3f)], self.device)
         return light
 
     def _skin(self, coarse: torch.Tensor, bristle: torch.Tensor) -> torch.Tensor:

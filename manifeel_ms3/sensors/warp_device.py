@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import torch
 import warp as wp
 
-WORTH_SPLITTING = 20_000  # threads of a launch
+WORTH_SPLITTING = 4_000  # threads of a launch
 
 wp.config.quiet = True
 if hasattr(wp, "LOG_WARNING"):  # newer releases
