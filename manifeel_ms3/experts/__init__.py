@@ -8,6 +8,7 @@ import numpy as np
 from manifeel_ms3.tasks import VisuotactileEnv
 
 from .ball_sorting import BallSortingExpert as BallSortingExpert
+from .insertion import GearExpert as GearExpert
 from .insertion import InsertionExpert as InsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
 
@@ -22,9 +23,11 @@ class Expert(Protocol):
 
 EXPERTS: dict[str, Callable[[VisuotactileEnv, int], Expert]] = {
     "ManiFeel-PegInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-PegReorientation-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
     "ManiFeel-USBInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
     "ManiFeel-BallSorting-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
     "ManiFeel-BallSortingDim-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
+    "ManiFeel-GearAssembly-v1": GearExpert,  # pyright: ignore[reportAssignmentType]
     "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,  # pyright: ignore[reportAssignmentType]
     "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
 }

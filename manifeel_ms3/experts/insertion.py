@@ -11,7 +11,6 @@ SIGHT_ERROR = 0.0015  # m: how far off the eye places the hole, about two pixels
 GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the plug's pitch in the hand
 HOVER = 0.010  # m above the socket
 LEAN = np.deg2rad([5.0, 7.0])  # of the plug while it feels for the hole, about x and y: its lowest corner is (+x, +y)
-CORNER_AIM = 0.75  # of the hole's half size, inside its (+x, +y) corner: near its middle, for what the eye may be off
 FEEL_FORCE = 2.5  # N: a wall is felt
 UPRIGHT = np.deg2rad(0.7)
 STAND_UP_TURN = 0.012  # rad a step
@@ -25,6 +24,7 @@ FEEL_PRESS = 4.5  # N, downwards, while it feels for the walls
 YIELD = 1.5e-4  # m/N a step: how the hand goes after a force that it does not want
 STEP = 0.0012  # m, at most, of a step under force
 WRIGGLE = 4e-4  # m
+TWIST_RATE = 0.15  # rad a step, of a sine
 STRAIGHT = Rotation.identity()
 DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the plug in it: frames with their z down
 
@@ -36,6 +36,9 @@ class InsertionExpert:
     felt, stands the plug up in it, and presses it down: what people do with a tight fit.
     """
 
+    twist = 0.0
+    """rad that it turns the plug to and fro by where it sticks, until its teeth fall into gaps"""
+
     def __init__(self, env: InsertionEnv, seed: int):
         self._rng = np.random.default_rng([seed, 7])
         self.env, self.fit = env, env.fit
@@ -43,10 +46,12 @@ class InsertionExpert:
         self._misjudged = Rotation.from_euler("y", self._rng.uniform(-1, 1) * GRASP_ERROR)
         self._look()
         fit = env.fit
-        # plug frame: z ahead, y turned over; the guide's corner that lies at (+x, +y) when the plug points down
-        self._corner = np.array([fit.guide_at[0] + fit.guide[0], -fit.guide_at[1] - fit.guide[1], fit.reach])
+        self._corner = np.array([fit.corner[0], -fit.corner[1], fit.reach])  # plug frame: z ahead, y turned over
         self._end = np.array([0.0, 0.0, fit.reach])
         self._rim = self.socket[2] + fit.rim
+        down_x, down_y = np.sign(fit.corner) * LEAN[::-1]
+        self._lean = Rotation.from_euler("xy", [-down_y, down_x])
+        self._lean_on_edge = Rotation.from_euler("x", -down_y)
 
     def _look(self) -> None:
         """See where the socket is, a little off."""
@@ -80,14 +85,13 @@ class InsertionExpert:
         skills = self.skills
         yield np.zeros(6)
         skills.tare()
-        lean = Rotation.from_euler("xy", [-LEAN[0], LEAN[1]])
-        inner = (1 - CORNER_AIM) * np.array(self.fit.guide_hole) + self.fit.guide_at
+        lean = self._lean
         while True:
-            over = np.array([*(self.socket[:2] + inner), self._rim])
+            over = np.array([*(self.socket[:2] + self.fit.aim), self._rim])
             yield from skills.reach(*self._tool_for(self._corner, over + [0, 0, HOVER], lean), tolerance=1e-3)
             yield from self._touch_down(over, lean)
             yield from self._feel_corner(lean)
-            yield from self._stand_up(lean)
+            yield from self._stand_up()
             yield from self._press()
             here, facing = skills.commanded
             yield from skills.reach(here + [0, 0, HOVER], facing, tolerance=2e-3)
@@ -125,12 +129,12 @@ class InsertionExpert:
     def _facing(self, lean: Rotation) -> Rotation:
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
 
-    def _stand_up(self, lean: Rotation) -> Actions:
+    def _stand_up(self) -> Actions:
         """Turn the plug upright about its leading corner, which stays lightly pushed into the hole's corner and down: first
         until the long edge lies in the hole, then all the way."""
         skills = self.skills
         place = self._place(self._corner)
-        for upright in (Rotation.from_euler("x", -LEAN[0]), STRAIGHT):
+        for upright in (self._lean_on_edge, STRAIGHT):
             for _ in range(STAND_UP_STEPS):
                 if self._tilt(upright) < UPRIGHT:
                     break
@@ -162,5 +166,12 @@ class InsertionExpert:
             move = np.clip(YIELD * (load - [0, 0, FEEL_PRESS if leaning else PRESS_FORCE]), -STEP, STEP)
             if stuck > 4:
                 move[:2] += WRIGGLE * np.array([np.cos(1.3 * step), np.sin(1.3 * step)])
+            twist = Rotation.from_euler("z", self.twist * np.sin(TWIST_RATE * stuck))
             command, _ = skills.commanded
-            yield skills.command(command + move, skills.towards(self._facing(STRAIGHT), STAND_UP_TURN))
+            yield skills.command(command + move, skills.towards(twist * self._facing(STRAIGHT), STAND_UP_TURN))
+
+
+class GearExpert(InsertionExpert):
+    """Puts the bore over the shaft like a plug into a socket, its rim hooked on the shaft's side."""
+
+    twist = 0.10

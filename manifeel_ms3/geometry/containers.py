@@ -8,8 +8,13 @@ BATTERY_SIZE = 0.025
 
 
 def container(front_drawn: bool) -> Part:
+    """Where the battery lies."""
+    return open_box(CONTAINER_OUTER, CONTAINER_HEIGHT, front_drawn)
+
+
+def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Part:
     """Opaque box, open above; its frame in the middle of its underside. Its front, at +x, may be left undrawn."""
-    (x, y), wall, height = CONTAINER_OUTER, CONTAINER_WALL, CONTAINER_HEIGHT
+    (x, y), wall = outer, CONTAINER_WALL
     pieces = (
         Box((wall, y, height), ((x - wall) / 2, 0.0, height / 2)),
         Box((wall, y, height), (-(x - wall) / 2, 0.0, height / 2)),

@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 from .part import Part
 
+CORNER_AIM = 0.75  # of a hole's half size, inside its (+x, +y) corner: near its middle, for what the eye may be off
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -25,14 +27,21 @@ class Fit:
     """Height of the socket's rim over its underside."""
     floor: float
     """Height of the plug's foremost face over the socket's underside when it is all the way in."""
-    guide: tuple[float, float]
-    """Half sizes (x, y) of the prong that finds its hole first."""
-    guide_hole: tuple[float, float]
-    """Half sizes (x, y) of that hole."""
-    guide_at: tuple[float, float] = (0.0, 0.0)
-    """Centre (x, y) of that hole in the socket's frame."""
+    corner: tuple[float, float]
+    """Where the first of the foremost face finds its way in when the plug leans towards it: (x, y) from the socket's axis when
+    the plug is in."""
+    aim: tuple[float, float]
+    """Where to set that point down, (x, y) from the socket's axis: well within what takes it."""
     clearance: float = 1e-3
     """How far off its axis a plug that is in can be."""
+
+    @staticmethod
+    def into_hole(
+        prong: tuple[float, float], hole: tuple[float, float], at: tuple[float, float] = (0.0, 0.0)
+    ) -> dict[str, tuple[float, float]]:
+        """`corner` and `aim` of a prong of half sizes `prong`, for a hole of half sizes `hole` at `at`: its (+x, +y) corner."""
+        corner = (at[0] + prong[0], at[1] + prong[1])
+        return dict(corner=corner, aim=(at[0] + (1 - CORNER_AIM) * hole[0], at[1] + (1 - CORNER_AIM) * hole[1]))
 
     @property
     def depth(self) -> float:

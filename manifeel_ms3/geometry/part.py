@@ -1,6 +1,9 @@
 """A part: one description of a rigid body's shape that yields both what is drawn and what collides."""
 
+import hashlib
+import os
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import sapien
@@ -10,6 +13,7 @@ from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
+from manifeel_ms3.paths import cache_dir
 from manifeel_ms3.sensors.surfaces import give_relief
 
 UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
@@ -56,7 +60,38 @@ class Ball:
             builder.add_sphere_visual(pose, self.radius, look)
 
 
-Piece = Box | Cylinder | Ball
+@dataclass(frozen=True, eq=False)
+class Hulls:
+    """Convex hulls of several sets of points (n, 3), m."""
+
+    points: tuple[np.ndarray, ...]
+
+    def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
+        path = str(self._file())
+        builder.add_multiple_convex_collisions_from_file(path, material=material, density=density)
+        if look is not None:
+            builder.add_visual_from_file(path, material=look)
+
+    def _file(self) -> Path:
+        """The hulls as meshes of one file, which is how the engine takes them; made once."""
+        content = hashlib.sha256(b"".join(np.ascontiguousarray(p, np.float64).tobytes() for p in self.points)).hexdigest()
+        path = cache_dir() / "parts" / f"{content[:16]}.obj"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            lines, first = [], 1
+            for k, points in enumerate(self.points):
+                hull = trimesh.convex.convex_hull(points)
+                lines.append(f"o piece{k}")
+                lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in hull.vertices]
+                lines += [f"f {a} {b} {c}" for a, b, c in hull.faces + first]
+                first += len(hull.vertices)
+            draft = path.with_suffix(f".{os.getpid()}.obj")
+            draft.write_text("\n".join(lines))
+            draft.replace(path)
+        return path
+
+
+Piece = Box | Cylinder | Ball | Hulls
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,29 @@ def peg_fit(fit: str) -> Fit:
         grip_width=PEG_SIZE[1],
         rim=0.009,
         floor=0.0,
-        guide=(PEG_SIZE[0] / 2, PEG_SIZE[1] / 2),
-        guide_hole=(hole[0] / 2, hole[1] / 2),
+        **Fit.into_hole((PEG_SIZE[0] / 2, PEG_SIZE[1] / 2), (hole[0] / 2, hole[1] / 2)),
+    )
+
+
+REORIENTATION_PEG = (0.016, 0.010, 0.050)  # m
+REORIENTATION_GAP, RIM_DEPTH, RIM_BOTTOM = 2e-4, 0.015, 0.005  # m
+
+
+def reorientation_fit() -> Fit:
+    """Peg 16 x 10 x 50 mm and a rim 15 mm deep around its place, 0.2 mm wider on each side."""
+    x, y, z = REORIENTATION_PEG
+    hole = (x + 2 * REORIENTATION_GAP, y + 2 * REORIENTATION_GAP)
+    base = Box((0.03, 0.03, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
+    rim = block_with_holes((0.03, 0.03), RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
+    return Fit(
+        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=2700.0),
+        socket=Part("rim", (base, *rim), colour=PLASTIC),
+        reach=z / 2,
+        grip=-0.018,  # the fingers stay clear of the rim at 30 degrees
+        grip_width=y,
+        rim=RIM_BOTTOM + RIM_DEPTH,
+        floor=RIM_BOTTOM,
+        **Fit.into_hole((x / 2, y / 2), (hole[0] / 2, hole[1] / 2)),
     )
 
 
@@ -64,8 +85,7 @@ def usb_fit() -> Fit:
         grip_width=0.012,
         rim=rim,
         floor=floor,
-        guide=(x / 2, y / 2),
-        guide_hole=(hole[0] / 2, hole[1] / 2),
+        **Fit.into_hole((x / 2, y / 2), (hole[0] / 2, hole[1] / 2)),
     )
 
 
@@ -96,9 +116,7 @@ def power_fit() -> Fit:
         grip_width=0.022,
         rim=rim,
         floor=floor,
-        guide=(GROUND_RADIUS, GROUND_RADIUS),
-        guide_hole=(ground_hole / 2, ground_hole / 2),
-        guide_at=(GROUND_OFFSET / 2, 0.0),
+        **Fit.into_hole((GROUND_RADIUS, GROUND_RADIUS), (ground_hole / 2, ground_hole / 2), (GROUND_OFFSET / 2, 0.0)),
     )
 
 

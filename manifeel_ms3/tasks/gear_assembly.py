@@ -1,0 +1,68 @@
+"""ManiFeel-GearAssembly-v1"""
+
+import sapien
+import torch
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.geometry import gear_fit
+from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
+
+from .insertion import InsertionEnv
+
+NEIGHBOURS = ("small", "large")
+ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
+
+
+@register_env("ManiFeel-GearAssembly-v1", max_episode_steps=300)
+class GearAssemblyEnv(InsertionEnv):
+    """
+    **Task Description:**
+    The gripper holds the medium one of three gears (19 teeth, 42 mm across) by a handle and puts it on the middle shaft of a
+    base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.
+
+    **Randomizations:** (half ranges; the argument `randomization` overrides them)
+    - base: xy +-50 mm around (0.5, 0) m; the neighbours are turned at random
+    - gripper start: 200 mm above the table, xy +-100 mm, z +-50 mm, +-0.1 rad about each axis
+    - gear in hand: pitch about the closing axis +-10 degrees
+
+    **Success Conditions:** held for 0.5 s
+    - the gear is on its shaft, within 1 mm of the base, tilted by less than 3 degrees
+    - both neighbours are on theirs: there, its teeth are in their gaps
+
+    **Fail Conditions:** the gear has left the grip (30 mm).
+    """
+
+    fit = gear_fit()
+    max_gap = 1.0e-3
+    lift = 0.05
+
+    def _load_task(self):
+        super()._load_task()
+        self.neighbours = {
+            name: neighbour_gear(name).build(self.scene, "dynamic", sapien.Pose([0.5 + SHAFT_X[name], 0, BASE_SIZE[2]]))
+            for name in NEIGHBOURS
+        }
+
+    def _initialize_task(self, env_idx: torch.Tensor):
+        super()._initialize_task(env_idx)
+        n = len(env_idx)
+        for name, actor in self.neighbours.items():
+            turn = torch.zeros(n, 3)
+            turn[:, 2] = (2 * torch.rand(n) - 1) * torch.pi
+            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], axis_angle_to_quaternion(turn)))
+
+    def _place_of(self, neighbour: str) -> torch.Tensor:
+        """Where a neighbour belongs, (N, 3), m."""
+        return self.socket.pose.p + torch.tensor([SHAFT_X[neighbour], 0.0, BASE_SIZE[2]], device=self.device)
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        off = [torch.linalg.norm(actor.pose.p - self._place_of(name), dim=1) for name, actor in self.neighbours.items()]
+        return super().measure() | dict(neighbours_off=torch.stack(off).amax(0))  # m, the worse of both
+
+    def goal_reached(self, measures):
+        return super().goal_reached(measures) & (measures["neighbours_off"] < ON_SHAFT)
+
+    def _privileged_state(self):
+        return super()._privileged_state() | {f"{name}_gear_pose": a.pose.raw_pose for name, a in self.neighbours.items()}
