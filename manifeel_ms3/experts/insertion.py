@@ -10,11 +10,11 @@ from .skills import Actions, Skills
 SIGHT_ERROR = 0.0015  # m: how far off the eye places the hole, about two pixels of the wrist camera
 GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the plug's pitch in the hand
 HOVER = 0.010  # m above the socket
-LEAN = np.deg2rad([5.0, 7.0])  # of the plug while it feels for the hole, about x and y: its lowest corner is (+x, +y)
-FEEL_FORCE = 2.5  # N: a wall is felt
+FEEL_FORCE, WALL_FORCE = 2.5, 7.0  # N: a wall is felt if it goes no further; a wall is felt
+FEEL_STEP, STALL = 6e-4, 2e-4  # m a step; less than this is no further
 UPRIGHT = np.deg2rad(0.7)
 STAND_UP_TURN = 0.012  # rad a step
-STAND_UP_STEPS = 25
+STAND_UP_STEPS = 30
 STAND_UP_PUSH = np.array([4e-4, 4e-4, -5e-4])  # m that the command leads into the hole's corner meanwhile
 ENTERED = 0.0008  # m below the rim, of the plug's end: it is in the hole
 ASTRAY = 0.004  # m from where the hole was seen: the plug slides about on top
@@ -49,7 +49,7 @@ class InsertionExpert:
         self._corner = np.array([fit.corner[0], -fit.corner[1], fit.reach])  # plug frame: z ahead, y turned over
         self._end = np.array([0.0, 0.0, fit.reach])
         self._rim = self.socket[2] + fit.rim
-        down_x, down_y = np.sign(fit.corner) * LEAN[::-1]
+        down_x, down_y = np.sign(fit.corner) * fit.lean
         self._lean = Rotation.from_euler("xy", [-down_y, down_x])
         self._lean_on_edge = Rotation.from_euler("x", -down_y)
 
@@ -111,20 +111,17 @@ class InsertionExpert:
     def _feel_corner(self, lean: Rotation) -> Actions:
         """Push the leading corner towards +x and +y, lightly pressed down, until both walls push back."""
         skills = self.skills
+        last = self._place(self._corner)
         for _ in range(60):
-            here, _ = skills.commanded
-            _, facing = skills.tool
-            load = skills.load
-            if load[0] < -FEEL_FORCE and load[1] < -FEEL_FORCE:
+            command, _ = skills.commanded
+            load, place = skills.load, self._place(self._corner)
+            # friction pushes back, too: a wall is where it goes no further
+            felt = (load[:2] < -WALL_FORCE) | ((load[:2] < -FEEL_FORCE) & (place - last < STALL)[:2])
+            if felt.all():
                 return
-            step = np.array(
-                [
-                    0.0006 if load[0] > -FEEL_FORCE else 0.0,
-                    0.0006 if load[1] > -FEEL_FORCE else 0.0,
-                    np.clip(YIELD * (load[2] - FEEL_PRESS), -0.0006, 0.0006),
-                ]
-            )
-            yield skills.command(here + step, self._facing(lean))
+            last = place
+            down = np.clip(YIELD * (load[2] - FEEL_PRESS), -FEEL_STEP, FEEL_STEP)
+            yield skills.command(command + [*np.where(felt, 0.0, FEEL_STEP), down], self._facing(lean))
 
     def _facing(self, lean: Rotation) -> Rotation:
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]

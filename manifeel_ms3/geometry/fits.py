@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from .part import Part
 
 CORNER_AIM = 0.75  # of a hole's half size, inside its (+x, +y) corner: near its middle, for what the eye may be off
+LEAD = 0.0007  # m that a leaning plug's corner can go down before its other side meets the hole's
+LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,8 @@ class Fit:
     the plug is in."""
     aim: tuple[float, float]
     """Where to set that point down, (x, y) from the socket's axis: well within what takes it."""
+    lean: tuple[float, float]
+    """How far the plug leans so that this point goes ahead: rad, along x and along y."""
     clearance: float = 1e-3
     """How far off its axis a plug that is in can be."""
 
@@ -39,9 +45,12 @@ class Fit:
     def into_hole(
         prong: tuple[float, float], hole: tuple[float, float], at: tuple[float, float] = (0.0, 0.0)
     ) -> dict[str, tuple[float, float]]:
-        """`corner` and `aim` of a prong of half sizes `prong`, for a hole of half sizes `hole` at `at`: its (+x, +y) corner."""
+        """`corner`, `aim` and `lean` of a prong of half sizes `prong`, for a hole of half sizes `hole` at `at`: it finds the hole's
+        (+x, +y) corner."""
         corner = (at[0] + prong[0], at[1] + prong[1])
-        return dict(corner=corner, aim=(at[0] + (1 - CORNER_AIM) * hole[0], at[1] + (1 - CORNER_AIM) * hole[1]))
+        aim = (at[0] + (1 - CORNER_AIM) * hole[0], at[1] + (1 - CORNER_AIM) * hole[1])
+        lean = tuple(float(np.clip(np.arctan(LEAD / ((2 - CORNER_AIM) * half)), *LEANS)) for half in hole)
+        return dict(corner=corner, aim=aim, lean=lean)
 
     @property
     def depth(self) -> float:

@@ -13,7 +13,7 @@ THICKNESS = {"small": 0.014, "medium": 0.020, "large": 0.014}  # m
 SHAFT_RADIUS, SHAFT_HEIGHT, BORE_GAP = 0.005, 0.018, 1.5e-4  # m; the gap is the bore's, on each side
 RING_HEIGHT = 0.005  # m, between the medium gear and its handle
 BASE_SIZE = (0.15, 0.075, 0.025)  # m
-HANDLE_SIZE = (0.030, 0.012, 0.040)  # m
+HANDLE_SIZE = (0.020, 0.030, 0.040)  # m; narrower than a pad, so that touch sees its edges
 WEDGES = 16
 GEAR_FRICTION = 0.15  # greased
 ALUMINIUM = 2700.0  # kg/m^3
@@ -98,6 +98,7 @@ def gear_fit() -> Fit:
         floor=BASE_SIZE[2],
         corner=(-diagonal * (SHAFT_RADIUS + BORE_GAP),) * 2,
         aim=(-diagonal * (SHAFT_RADIUS + BESIDE),) * 2,
+        lean=(np.deg2rad(7.0), np.deg2rad(5.0)),
         clearance=5e-4,
     )
 

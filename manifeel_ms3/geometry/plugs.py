@@ -57,7 +57,10 @@ USB_GAP = 1e-4  # m, on each side
 
 
 def usb_fit() -> Fit:
-    """USB-A plug on a handle 30 x 12 x 70 mm, and a port in a block 66 x 66 x 37 mm. It goes in one way round alone."""
+    """USB-A plug on a handle 12 x 30 x 70 mm, and a port in a block 66 x 66 x 37 mm. It goes in one way round alone.
+
+    The handle is narrower than a pad, so that touch sees its edges.
+    """
     x, y, z = USB_SHELL
     handle = 0.070
     middle = handle / 2 + z / 2
@@ -78,11 +81,11 @@ def usb_fit() -> Fit:
     # the tongue stands mirrored in y: a plug that points down has its y turned over
     tongue = Box(tongue.size, (0.0, -tongue.centre[1], tongue.centre[2]))
     return Fit(
-        plug=Part("usb_plug", (Box((0.030, 0.012, handle)), *shell), DARK, other_colours=dict.fromkeys(range(1, 5), METAL)),
+        plug=Part("usb_plug", (Box((0.012, 0.030, handle)), *shell), DARK, other_colours=dict.fromkeys(range(1, 5), METAL)),
         socket=Part("usb_port", (base, *walls, tongue), PLASTIC, other_colours={5: (0.9, 0.9, 0.9)}),
         reach=handle / 2 + z,
         grip=-0.012,
-        grip_width=0.012,
+        grip_width=0.030,
         rim=rim,
         floor=floor,
         **Fit.into_hole((x / 2, y / 2), (hole[0] / 2, hole[1] / 2)),
@@ -104,7 +107,7 @@ def power_fit() -> Fit:
     blade_hole, ground_hole = (BLADE[0] + 2 * NEMA_GAP, BLADE[1] + 2 * NEMA_GAP), 2 * (GROUND_RADIUS + NEMA_GAP)
     return Fit(
         plug=Part(
-            "power_plug", (Box((0.032, 0.022, handle)), *blades, ground), DARK, other_colours={1: METAL, 2: METAL, 3: BRASS}
+            "power_plug", (Box((0.019, 0.032, handle)), *blades, ground), DARK, other_colours={1: METAL, 2: METAL, 3: BRASS}
         ),
         socket=Part(
             "power_socket",
@@ -113,7 +116,7 @@ def power_fit() -> Fit:
         ),
         reach=handle / 2 + GROUND_LENGTH,
         grip=-0.006,
-        grip_width=0.022,
+        grip_width=0.032,
         rim=rim,
         floor=floor,
         **Fit.into_hole((GROUND_RADIUS, GROUND_RADIUS), (ground_hole / 2, ground_hole / 2), (GROUND_OFFSET / 2, 0.0)),

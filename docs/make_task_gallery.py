@@ -1,0 +1,59 @@
+"""The pictures of docs/tasks.md, made anew: `python -m docs.make_task_gallery` in the repository's root.
+
+Every task once, in the middle of its demonstration: front, side and wrist camera, left and right pad.
+"""
+
+from pathlib import Path
+
+import cv2
+import gymnasium as gym
+import numpy as np
+from rich.progress import track
+
+from manifeel_ms3.experts import EXPERTS, make_expert
+
+IMAGES = Path(__file__).parent / "images"
+VIEWS = ("front", "side", "wrist", "tactile_left", "tactile_right")
+MOMENT = 0.8  # of the demonstration
+HEIGHT = 192  # pixels
+SEED = 1
+
+
+def steps_of(task: str) -> int:
+    """Length of the demonstration."""
+    env = gym.make(task, obs_mode="none", render_backend="none")
+    env.reset(seed=SEED)
+    count = 0
+    for action in make_expert(task, env.unwrapped, SEED).actions():
+        *_, terminated, truncated, _ = env.step(action)
+        count += 1
+        if terminated or truncated:
+            break
+    env.close()
+    return count
+
+
+def moment(task: str) -> np.ndarray:
+    """All views side by side."""
+    steps = round(MOMENT * steps_of(task))
+    env = gym.make(task, obs_mode="rgb+tacrgb", cameras=VIEWS[:3], tactile_sensors=("left", "right"))
+    obs, _ = env.reset(seed=SEED)
+    for _, action in zip(range(steps), make_expert(task, env.unwrapped, SEED).actions(), strict=False):
+        obs, *_ = env.step(action)
+    pictures = [obs["sensor_data"][view]["rgb"][0].cpu().numpy() for view in VIEWS]
+    env.close()
+    return np.hstack(
+        [cv2.resize(p, (round(HEIGHT * p.shape[1] / p.shape[0]), HEIGHT), interpolation=cv2.INTER_AREA) for p in pictures]
+    )
+
+
+if __name__ == "__main__":
+    IMAGES.mkdir(exist_ok=True)
+    rows = []
+    for name in track(EXPERTS, "tasks"):
+        row = moment(name)
+        label = name.removeprefix("ManiFeel-").removesuffix("-v1")
+        cv2.rectangle(row, (0, 0), (180, 24), (20, 20, 20), cv2.FILLED)
+        cv2.putText(row, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
+        rows.append(row)
+    cv2.imwrite(str(IMAGES / "tasks.jpg"), np.vstack(rows)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
