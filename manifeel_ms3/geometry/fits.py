@@ -45,8 +45,7 @@ class Fit:
     def into_hole(
         prong: tuple[float, float], hole: tuple[float, float], at: tuple[float, float] = (0.0, 0.0)
     ) -> dict[str, tuple[float, float]]:
-        """`corner`, `aim` and `lean` of a prong of half sizes `prong`, for a hole of half sizes `hole` at `at`: it finds the hole's
-        (+x, +y) corner."""
+        """`corner`, `aim` and `lean` of a prong of half sizes `prong` that finds the (+x, +y) corner of a hole at `at`."""
         corner = (at[0] + prong[0], at[1] + prong[1])
         aim = (at[0] + (1 - CORNER_AIM) * hole[0], at[1] + (1 - CORNER_AIM) * hole[1])
         lean = tuple(float(np.clip(np.arctan(LEAD / ((2 - CORNER_AIM) * half)), *LEANS)) for half in hole)
