@@ -8,3 +8,5 @@ from .plugs import peg_fit as peg_fit
 from .plugs import power_fit as power_fit
 from .plugs import reorientation_fit as reorientation_fit
 from .plugs import usb_fit as usb_fit
+from .threads import m16_bolt as m16_bolt
+from .threads import m16_nut as m16_nut

@@ -73,25 +73,42 @@ class Hulls:
             builder.add_visual_from_file(path, material=look)
 
     def _file(self) -> Path:
-        """The hulls as meshes of one file, which is how the engine takes them; made once."""
-        content = hashlib.sha256(b"".join(np.ascontiguousarray(p, np.float64).tobytes() for p in self.points)).hexdigest()
-        path = cache_dir() / "parts" / f"{content[:16]}.obj"
-        if not path.is_file():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            lines, first = [], 1
-            for k, points in enumerate(self.points):
-                hull = trimesh.convex.convex_hull(points)
-                lines.append(f"o piece{k}")
-                lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in hull.vertices]
-                lines += [f"f {a} {b} {c}" for a, b, c in hull.faces + first]
-                first += len(hull.vertices)
-            draft = path.with_suffix(f".{os.getpid()}.obj")
-            draft.write_text("\n".join(lines))
-            draft.replace(path)
-        return path
+        """The hulls as meshes of one file, which is how the engine takes them."""
+        return _cached_obj([trimesh.convex.convex_hull(points) for points in self.points])
 
 
-Piece = Box | Cylinder | Ball | Hulls
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A triangle mesh, m, as it is: for parts that are fixed, and touch convex ones."""
+
+    mesh: trimesh.Trimesh
+
+    def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
+        path = str(_cached_obj([self.mesh]))
+        builder.add_nonconvex_collision_from_file(path, material=material)
+        if look is not None:
+            builder.add_visual_from_file(path, material=look)
+
+
+Piece = Box | Cylinder | Ball | Hulls | Solid
+
+
+def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
+    """A file with these meshes as its objects, made once; to nanometres."""
+    lines, first = [], 1
+    for k, mesh in enumerate(meshes):
+        lines.append(f"o piece{k}")
+        lines += [f"v {x:.9f} {y:.9f} {z:.9f}" for x, y, z in mesh.vertices]
+        lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + first]
+        first += len(mesh.vertices)
+    text = "\n".join(lines)
+    path = cache_dir() / "parts" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.obj"
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        draft = path.with_suffix(f".{os.getpid()}.obj")
+        draft.write_text(text)
+        draft.replace(path)
+    return path
 
 
 @dataclass(frozen=True)

@@ -98,6 +98,8 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(cameras=("top",)), "wrist"),
         (dict(tactile_sensors=("middle",)), "left"),
         (dict(lighting="disco"), "dim"),
+        (dict(tactile={"optics.nose": 1.0}), "optics.nose"),
+        (dict(tactile={"gel.thickness": 0.0}), "gel.thickness"),
         (dict(occlusion=True), "nothing that could occlude"),
         (dict(fit="snug"), "tight"),
         (dict(randomization=dict(colour=1.0)), "socket_xy"),
