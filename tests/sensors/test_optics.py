@@ -114,27 +114,30 @@ def test_shadow_darkens_behind_the_bump_and_nowhere_else(optics):
         assert (away * torch.as_tensor(optics._to_light.numpy()[channel])).sum() < -1
 
 
-def dot_centres(image: torch.Tensor) -> np.ndarray:
-    count, _, _, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))
-    return centres[1:]
+def dots(image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (n, 2) as column and row, and areas (n,), pixels, of what is dark."""
+    _, _, stats, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))
+    return centres[1:], stats[1:, cv2.CC_STAT_AREA]
 
 
-def test_markers_move_with_the_shear_and_spread_where_pressed():
+def test_markers_move_with_the_shear_spread_and_swell_where_pressed():
     optics = make_optics(**{"optics.markers": True})
     flat, still = torch.zeros(1, 240, 320), torch.zeros(1, len(GRID.x), 2, dtype=torch.float64)
-    rest = dot_centres(optics.shade(flat, still)[0])
+    rest, size = dots(optics.shade(flat, still)[0])
     moved = still.clone()
     moved[..., 1] = 3e-4
-    sheared = dot_centres(optics.shade(flat, moved)[0])
+    sheared, _ = dots(optics.shade(flat, moved)[0])
     inner = rest[(np.abs(rest - [159.5, 119.5]) < [120, 90]).all(1)]
     near = sheared[np.argmin(np.linalg.norm(sheared[None] - inner[:, None] - [3e-4 / CONFIG.pixel_size, 0], axis=-1), axis=1)]
     assert (near - inner).mean(0) == pytest.approx([3e-4 / CONFIG.pixel_size, 0.0], abs=0.3)
-    pressed = dot_centres(optics.shade(optics.surface(ball(0.004, 8e-4)), still)[0])
+    pressed, swollen = dots(optics.shade(optics.surface(ball(0.004, 8e-4)), still)[0])
     ring = rest[np.abs(np.linalg.norm(rest - [159.5, 119.5], axis=1) - 23.5) < 3]  # the dots around the middle one
     after = pressed[np.argmin(np.linalg.norm(pressed[None] - ring[:, None], axis=-1), axis=1)]
     out = np.linalg.norm(after - [159.5, 119.5], axis=1) - np.linalg.norm(ring - [159.5, 119.5], axis=1)
     assert len(ring) == 4
     assert (out > 0.5).all()
+    middle = [np.argmin(np.linalg.norm(c - [159.5, 119.5], axis=1)) for c in (rest, pressed)]
+    assert swollen[middle[1]] > 1.2 * size[middle[0]]
 
 
 @pytest.mark.skipif(not TABLE.is_file(), reason="the reference calibration is not at hand")
