@@ -24,7 +24,7 @@ def test_expert_succeeds_gently_within_the_action_limits(make_env, fit):
         assert info["success"].all(), f"seed {seed}"
         assert np.abs(actions).max() <= 1.0
         assert peak < 60.0
-        assert len(actions) < 150
+        assert len(actions) < 250  # one start over, at most
 
 
 def test_expert_feels_the_rim(make_env):
