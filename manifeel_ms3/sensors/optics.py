@@ -20,6 +20,7 @@ from .warp_device import launch_split, warp_device
 COARSE = 4  # coarse cells are 4 x 4 pixels
 WIDE_SIGMAS = (0.9e-3, 0.46e-3)  # m; these three are the larger kernels of Taxim's pyramid at its 0.0295 mm per pixel
 NARROW_SIGMA = 0.24e-3  # m
+BAND = 80  # samples of a blur that are computed as one matrix product
 SEGMENTS = len(KNOTS) - 1
 SHADOW_STEPS = 12  # coarse cells that a shadow is long at most
 LOW_LIGHT, HIGH_LIGHT = 0.2, 0.5  # gradients of the rays from a bar's lowest and highest light: 3 to 6 mm high, 12 to 15 mm off
@@ -169,9 +170,9 @@ class Optics:
         self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
         coarse = (rows // COARSE, cols // COARSE)
         cell = COARSE * config.pixel_size
-        self._wide = [[_blur_matrix(n, sigma / cell, device) for n in coarse] for sigma in WIDE_SIGMAS]
-        self._narrow = [_blur_matrix(n, NARROW_SIGMA / config.pixel_size, device) for n in (rows, cols)]
-        self._coat = [_blur_matrix(n, optics.smoothing, device) for n in (rows, cols)] if optics.smoothing > 0 else None
+        self._wide = [[_blur_bands(n, sigma / cell, device) for n in coarse] for sigma in WIDE_SIGMAS]
+        self._narrow = [_blur_bands(n, NARROW_SIGMA / config.pixel_size, device) for n in (rows, cols)]
+        self._coat = [_blur_bands(n, optics.smoothing, device) for n in (rows, cols)] if optics.smoothing > 0 else None
         self._drag = [
             _spread(g, n, cell, config.gel.thickness * MARKER_SPREAD, device) for g, n in zip(_axes(grid), coarse, strict=True)
         ]
@@ -200,8 +201,8 @@ class Optics:
         """
         coarse = F.avg_pool2d(penetration[:, None], COARSE)[:, 0]
         skirt = coarse
-        for matrices in self._wide:
-            skirt = torch.maximum(coarse, _blur(skirt, matrices))
+        for bands in self._wide:
+            skirt = torch.maximum(coarse, _blur(skirt, bands))
         surface = F.interpolate(skirt[:, None], size=penetration.shape[1:], mode="bilinear", align_corners=False)[:, 0]
         surface = torch.maximum(penetration, surface)
         surface = torch.maximum(penetration, _blur(surface, self._narrow))
@@ -288,17 +289,26 @@ def _shading_maps(path: Path, image_shape: tuple[int, int], device: torch.device
     return *maps, to_light.astype(np.float32)
 
 
-def _blur_matrix(count: int, sigma: float, device: torch.device) -> torch.Tensor:
-    """(count, count) that blurs a row of samples with a Gaussian of sigma samples, the ends' values repeated."""
+def _blur_bands(count: int, sigma: float, device: torch.device) -> list[tuple[int, int, torch.Tensor]]:
+    """Gaussian blur of a row of `count` samples, sigma in samples, the ends' values repeated: stretches of the result as a
+    matrix times the samples from a first to a last."""
     reach = max(1, round(2.5 * sigma))
     matrix = np.zeros((count, count))
     for offset in range(-reach, reach + 1):
         matrix[np.arange(count), np.clip(np.arange(count) + offset, 0, count - 1)] += math.exp(-0.5 * (offset / sigma) ** 2)
-    return torch.as_tensor(matrix / matrix.sum(1, keepdims=True), dtype=torch.float32, device=device)
+    matrix = torch.as_tensor(matrix / matrix.sum(1, keepdims=True), dtype=torch.float32, device=device)
+    bands = []
+    for start in range(0, count, BAND):
+        low, high = max(0, start - reach), min(count, start + BAND + reach)
+        bands.append((low, high, matrix[start : start + BAND, low:high].contiguous()))
+    return bands
 
 
-def _blur(image: torch.Tensor, matrices: list[torch.Tensor]) -> torch.Tensor:
-    return matrices[0] @ image @ matrices[1].T
+def _blur(image: torch.Tensor, bands: list[list[tuple[int, int, torch.Tensor]]]) -> torch.Tensor:
+    """Blur of (N, H, W) along rows and columns."""
+    rows, cols = bands
+    image = torch.cat([matrix @ image[:, low:high] for low, high, matrix in rows], dim=1)
+    return torch.cat([image[:, :, low:high] @ matrix.T for low, high, matrix in cols], dim=2)
 
 
 def _axes(grid: ContactGrid) -> tuple[np.ndarray, np.ndarray]:
