@@ -69,7 +69,7 @@ def test_a_thread_carries_the_load_on_its_crests(tmp_path):
 
     press = Press(build, render_backend="cpu")
     press.touching = 0.008
-    for force in (1.0, 10.0):
+    for force in (1.0, 3.0, 10.0, 30.0):
         press.place(0.0082)
         press.push(force, 0.2 * force, 0.1 * force, 2e-4 * force)
         assert_carries(press, force, 0.2 * force, 0.1 * force, 2e-4 * force)
