@@ -44,17 +44,12 @@ class Args:
     """per measurement"""
 
 
-class Press:
-    """N pads, each with a shape half a millimetre in."""
-
-    def __init__(self, shape: trimesh.Trimesh, pads: int, device: torch.device):
-        self.rays = MeshRays([[shape] * pads], gelsight_r15("touch", "gel_right").gel.size, device)
-        self.bodies = torch.tensor([0.0, 0, -5e-4, 0, 0, 0, 1], device=device).repeat(pads, 1, 1)
-        self.pads = torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device).repeat(pads, 1)
-        self.heights, self.sliding = self.rays.heights, None
-
-    def look(self) -> None:
-        self.rays.move(self.bodies, self.pads)
+def press(shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
+    """Pads, each with the shape half a millimetre in."""
+    rays = MeshRays([[shape] * pads], gelsight_r15("touch", "gel_right").gel.size, device)
+    deep = torch.tensor([0.0, 0, -5e-4, 0, 0, 0, 1], device=device)
+    rays.move(deep.expand(pads, 1, 7), torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device).expand(pads, 7))
+    return rays
 
 
 def shapes() -> dict[str, trimesh.Trimesh]:
@@ -113,8 +108,8 @@ def main(args: Args) -> None:
             times = []
             for n in args.batches:
                 model = TouchModel(with_options(config, options), n, device, outputs)
-                press, wrench = Press(shape, n, device), torch.tensor(PUSH, dtype=torch.float64, device=device).repeat(n, 1)
-                times.append(milliseconds(lambda m=model, p=press, w=wrench: m.observe(p, w), args.seconds) / n)
+                rays, wrench = press(shape, n, device), torch.tensor(PUSH, dtype=torch.float64, device=device).repeat(n, 1)
+                times.append(milliseconds(lambda m=model, p=rays, w=wrench: m.observe(p, w), args.seconds) / n)
             table.add_row(shape_name, label, *(f"{t:.2f}" for t in times))
     env = gym.make("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none").unwrapped
     env.reset(seed=0)
@@ -124,11 +119,11 @@ def main(args: Args) -> None:
     console.print(table)
 
     model = TouchModel(config, 1, torch.device("cpu"))
-    press, wrench = Press(shapes()["ball, 20,480 triangles"], 1, torch.device("cpu")), torch.tensor([PUSH], dtype=torch.float64)
-    model.observe(press, wrench)
+    rays, wrench = press(shapes()["ball, 20,480 triangles"], 1, torch.device("cpu")), torch.tensor([PUSH], dtype=torch.float64)
+    model.observe(rays, wrench)
     optics, lookup = model.optics, any_table()
     assert optics is not None
-    depth = press.heights(model.pixels).clamp(min=0).unflatten(1, config.image_shape)
+    depth = rays.heights(model.pixels).clamp(min=0).unflatten(1, config.image_shape)
     surface = optics.surface(depth)
     background, plain = optics.background.numpy(), surface[0].double().numpy()
     with lend_torch_threads():  # as the sensor runs it

@@ -40,32 +40,23 @@ def _lifted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
 
 
-class Pressed:
+def pressed(mesh: trimesh.Trimesh) -> MeshRays:
     """One pad under one mesh."""
-
-    def __init__(self, mesh: trimesh.Trimesh):
-        self.rays = MeshRays([[mesh]], CONFIG.gel.size, CPU)
-        self.heights = self.rays.heights
-
-    def look(self) -> None:
-        still = torch.tensor([[0.0, 0, 0, 0, 0, 0, 1]])
-        self.rays.move(still[None], still)
+    return MeshRays([[mesh]], CONFIG.gel.size, CPU)
 
 
 def touch(mesh: trimesh.Trimesh, load: float, shear: tuple[float, float] = (0.0, 0.0), twist: float = 0.0, **options):
     model = TouchModel(with_options(CONFIG, options), 1, CPU)
     wrench = torch.tensor([[*shear, -load, 0.0, 0.0, twist]], dtype=torch.float64)
-    return {name: value[0] for name, value in model.observe(Pressed(mesh), wrench).items()}
+    return {name: value[0] for name, value in model.observe(pressed(mesh), wrench).items()}
 
 
 def gallery() -> None:
     """Every indenter: how high it stands, TacRGB, force field under shear; then the options of the optics."""
     rows = []
     for name, (mesh, load) in indenters().items():
-        pressed = Pressed(mesh)
         model = TouchModel(CONFIG, 1, CPU)
-        pressed.look()
-        height = pressed.heights(model.pixels).unflatten(1, CONFIG.image_shape)[0].numpy()
+        height = pressed(mesh).heights(model.pixels).unflatten(1, CONFIG.image_shape)[0].numpy()
         relief = (255 * np.clip(1 + height / 1.5e-3, 0, 1)).astype(np.uint8)
         plain = touch(mesh, load)
         sheared = touch(mesh, load, shear=(0.0, 0.3 * load), twist=1e-3)

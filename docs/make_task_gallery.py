@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from rich.progress import track
 
+from manifeel_ms3.demonstrations.record import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
 
 IMAGES = Path(__file__).parent / "images"
@@ -22,15 +23,9 @@ SEED = 1
 def steps_of(task: str) -> int:
     """Length of the demonstration."""
     env = gym.make(task, obs_mode="none", render_backend="none")
-    env.reset(seed=SEED)
-    count = 0
-    for action in make_expert(task, env.unwrapped, SEED).actions():
-        *_, terminated, truncated, _ = env.step(action)
-        count += 1
-        if terminated or truncated:
-            break
+    steps = demonstrate(env, task, SEED).info["elapsed_steps"]
     env.close()
-    return count
+    return steps
 
 
 def moment(task: str) -> np.ndarray:

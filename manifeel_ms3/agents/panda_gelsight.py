@@ -144,6 +144,13 @@ class PandaGelSight(BaseAgent):
             targets[:, 7:] -= grip_force / self.controller.controllers["gripper"].config.stiffness
             self.robot.set_joint_drive_targets(targets, self.robot.active_joints, torch.arange(9, device=self.device))
 
+    def reset_tool(self, pose: Pose, opening: float = 0.04, grip_force: float = 0.0):
+        """`reset` with the tool at poses (n,), base frame, and each finger `opening`, m, from the middle."""
+        qpos = torch.tensor(self.keyframes["tool_down"].qpos, dtype=torch.float32, device=self.device).repeat(len(pose), 1)
+        qpos[:, :7] = self.solve_ik(pose, qpos)
+        qpos[:, 7:] = opening
+        self.reset(qpos, grip_force)
+
     def get_proprioception(self):
         return dict(qpos=self.robot.get_qpos(), qvel=self.robot.get_qvel())  # no controller internals
 

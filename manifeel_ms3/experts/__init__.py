@@ -1,7 +1,7 @@
 """Scripted demonstrators, one a task."""
 
 from collections.abc import Callable, Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -21,15 +21,15 @@ class Expert(Protocol):
         ...
 
 
-EXPERTS: dict[str, Callable[[VisuotactileEnv, int], Expert]] = {
-    "ManiFeel-PegInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-PegReorientation-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-USBInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-BallSorting-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-BallSortingDim-v1": BallSortingExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-GearAssembly-v1": GearExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,  # pyright: ignore[reportAssignmentType]
-    "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,  # pyright: ignore[reportAssignmentType]
+EXPERTS: dict[str, Callable[[Any, int], Expert]] = {
+    "ManiFeel-PegInsertion-v1": InsertionExpert,
+    "ManiFeel-PegReorientation-v1": InsertionExpert,
+    "ManiFeel-USBInsertion-v1": InsertionExpert,
+    "ManiFeel-BallSorting-v1": BallSortingExpert,
+    "ManiFeel-BallSortingDim-v1": BallSortingExpert,
+    "ManiFeel-GearAssembly-v1": GearExpert,
+    "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,
+    "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,
 }
 
 

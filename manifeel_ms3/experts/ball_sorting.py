@@ -2,16 +2,13 @@
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry.balls import SEAT_HEIGHT, SEAT_SPACING
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
 from manifeel_ms3.tasks.ball_sorting import BallSortingEnv
 
-from .skills import Actions, Skills
+from .skills import DOWNWARD, SIGHT_ERROR, Actions, Skills
 
-DOWNWARD = Rotation.from_euler("x", np.pi)
-SIGHT_ERROR = 0.0015  # m: how far off the eye places the stand
 GRASP_ABOVE = 0.004  # m over the ball's middle, clear of the stand
 OVER = 0.075  # m over the ball's middle
 ROUGH = 2.0  # grey levels that TacRGB varies within a millimetre, where something touches
@@ -43,10 +40,7 @@ class BallSortingExpert:
                 break
             yield from skills.set_gripper(1.0, steps=5)
             yield from skills.reach(ball + [0, 0, OVER], DOWNWARD, tolerance=5e-3)
-        here, _ = skills.tool
-        yield from skills.reach(here + [0.0, 0.0, LIFT_BY], DOWNWARD, tolerance=2e-3)
-        while True:
-            yield skills.command(*skills.commanded)
+        yield from skills.lift_and_hold(LIFT_BY, DOWNWARD)
 
     def _look(self) -> np.ndarray:
         self._pad.capture()

@@ -5,9 +5,8 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.insertion import InsertionEnv
 
-from .skills import Actions, Skills
+from .skills import DOWNWARD, SIGHT_ERROR, Actions, Skills
 
-SIGHT_ERROR = 0.0015  # m: how far off the eye places the hole, about two pixels of the wrist camera
 GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the plug's pitch in the hand
 HOVER = 0.010  # m above the socket
 FEEL_FORCE, WALL_FORCE = 2.5, 7.0  # N: a wall is felt if it goes no further; a wall is felt
@@ -26,7 +25,6 @@ STEP = 0.0012  # m, at most, of a step under force
 WRIGGLE = 4e-4  # m
 TWIST_RATE = 0.15  # rad a step, of a sine
 STRAIGHT = Rotation.identity()
-DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of the plug in it: frames with their z down
 
 
 class InsertionExpert:

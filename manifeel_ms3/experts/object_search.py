@@ -1,14 +1,12 @@
 """Demonstrator of ObjectSearch: grasp in one place, feel whether something is between the fingers, else try the other."""
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR
 from manifeel_ms3.tasks.object_search import CONTAINER_XY, PLACES_X, ObjectSearchEnv
 
-from .skills import Actions, Skills
+from .skills import DOWNWARD, Actions, Skills
 
-DOWNWARD = Rotation.from_euler("x", np.pi)
 OVER = 0.21  # m: tool height over the container, the fingertips clear of the battery
 GRASP = CONTAINER_FLOOR + BATTERY_SIZE / 2 + 0.010  # m: the pads' lower half closes on the cube
 FELT = 3.0  # N on each pad: something is between the fingers
@@ -35,7 +33,4 @@ class ObjectSearchExpert:
                 break
             yield from skills.set_gripper(1.0, steps=4)
             yield from skills.reach(above, DOWNWARD, tolerance=5e-3)
-        here, _ = skills.tool
-        yield from skills.reach(here + [0.0, 0.0, LIFT_BY], DOWNWARD, tolerance=2e-3)
-        while True:
-            yield skills.command(*skills.commanded)
+        yield from skills.lift_and_hold(LIFT_BY, DOWNWARD)

@@ -16,6 +16,8 @@ MOVE_GAIN = 0.4  # share of the remaining way that a step covers: a reach that s
 TOP_SPEED = 0.008  # m a step; actions reach 0.01
 TOP_TURN = 0.04  # rad a step; actions reach 0.05
 SPEED_UP = 0.002  # m a step more than the step before, at most
+SIGHT_ERROR = 0.0015  # m: how far off the eye places a thing, about two pixels of the wrist camera
+DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of a plug in it: frames with their z down
 
 
 class Skills:
@@ -103,6 +105,13 @@ class Skills:
         """Stay, and move the gripper: 1 open to -1 closed."""
         self.gripper = opening
         for _ in range(steps):
+            yield self.command(*self.commanded)
+
+    def lift_and_hold(self, height: float, rotation: Rotation) -> Actions:
+        """Raise what is held by `height`, m; then stay, without end."""
+        here, _ = self.tool
+        yield from self.reach(here + [0.0, 0.0, height], rotation, tolerance=2e-3)
+        while True:
             yield self.command(*self.commanded)
 
     def lower_until_contact(self, rotation: Rotation, lowest: float, threshold: float = 2.0, speed: float = 0.002) -> Actions:

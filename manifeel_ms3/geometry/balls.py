@@ -1,5 +1,7 @@
 """Two balls that look alike and feel different, and the stand they sit on."""
 
+import functools
+
 import numpy as np
 import trimesh
 
@@ -15,6 +17,7 @@ SEAT_HEIGHT = STAND_HEIGHT + float(np.sqrt(BALL_RADIUS**2 - (SEAT_HOLE / 2) ** 2
 WHITE = (0.93, 0.93, 0.90)
 
 
+@functools.cache
 def golf_ball() -> Part:
     return _ball("golf_ball", GOLF_MASS, golf_ball_mesh())
 

@@ -1,9 +1,11 @@
 """Spur gears that mesh: involute teeth on a ring of wedges around the bore, and the base whose shafts they turn on."""
 
+import functools
+
 import numpy as np
 
 from .fits import Fit
-from .part import Box, Cylinder, Hulls, Part
+from .part import Box, Cylinder, Hulls, Part, extruded, ring_of_wedges
 
 MODULE = 0.002  # m: pitch diameter per tooth
 PRESSURE_ANGLE = np.deg2rad(20.0)
@@ -33,7 +35,7 @@ def tooth_polygon(teeth: int) -> np.ndarray:
     """Outline (n, 2), m, of the tooth about the x axis, from root to tip: involutes of the base circle (ISO 53 proportions)."""
     pitch = MODULE * teeth / 2
     base, tip, root = pitch * np.cos(PRESSURE_ANGLE), pitch + MODULE, pitch - 1.25 * MODULE
-    radius = np.linspace(max(root, 0.0), tip, FLANK_POINTS + 1)
+    radius = np.linspace(root, tip, FLANK_POINTS + 1)
 
     def involute(r: np.ndarray) -> np.ndarray:
         angle = np.arccos(np.clip(base / np.maximum(r, base), -1, 1))
@@ -51,19 +53,12 @@ def gear_hulls(teeth: int, bottom: float, top: float) -> Hulls:
     for k in range(teeth):
         turn = 2 * np.pi * k / teeth
         rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        pieces.append(_extruded(tooth_polygon(teeth) @ rotation.T, bottom, top))
-    for k in range(WEDGES):
-        angles = 2 * np.pi * (k + np.array([0.0, 1.0])) / WEDGES
-        inner = bore / np.cos(np.pi / WEDGES)  # the flats touch the bore's circle
-        outline = [[r * np.cos(a), r * np.sin(a)] for r in (inner, root + 2e-4) for a in angles]
-        pieces.append(_extruded(np.array(outline), bottom, top))
+        pieces.append(extruded(tooth_polygon(teeth) @ rotation.T, bottom, top))
+    pieces += ring_of_wedges(WEDGES, bore, lambda angles: np.full_like(angles, root + 2e-4), bottom, top)
     return Hulls(tuple(pieces))
 
 
-def _extruded(outline: np.ndarray, bottom: float, top: float) -> np.ndarray:
-    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (bottom, top)])
-
-
+@functools.cache
 def neighbour_gear(name: str) -> Part:
     """The "small" or the "large" gear, to turn on its shaft. Its frame on the axis, in the underside."""
     return Part(

@@ -2,7 +2,9 @@
 
 import hashlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +52,8 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Ball:
+    """Sphere in the part's frame, m."""
+
     radius: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -67,12 +71,13 @@ class Hulls:
     points: tuple[np.ndarray, ...]
 
     def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
-        path = str(self._file())
+        path = str(self.file)
         builder.add_multiple_convex_collisions_from_file(path, material=material, density=density)
         if look is not None:
             builder.add_visual_from_file(path, material=look)
 
-    def _file(self) -> Path:
+    @cached_property
+    def file(self) -> Path:
         """The hulls as meshes of one file, which is how the engine takes them."""
         return _cached_obj([trimesh.convex.convex_hull(points) for points in self.points])
 
@@ -84,10 +89,15 @@ class Solid:
     mesh: trimesh.Trimesh
 
     def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
-        path = str(_cached_obj([self.mesh]))
+        path = str(self.file)
         builder.add_nonconvex_collision_from_file(path, material=material)
         if look is not None:
             builder.add_visual_from_file(path, material=look)
+
+    @cached_property
+    def file(self) -> Path:
+        """The mesh as a file, which is how the engine takes it."""
+        return _cached_obj([self.mesh])
 
 
 Piece = Box | Cylinder | Ball | Hulls | Solid
@@ -113,7 +123,7 @@ def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid body made of convex pieces. `density` in kg/m^3, `friction` Coulomb's coefficient, `colour` RGB in [0, 1].
+    """A rigid body made of pieces. `density` in kg/m^3, `friction` Coulomb's coefficient, `colour` RGB in [0, 1].
 
     `other_colours`: of single pieces, by their place in `pieces`.
     """
@@ -145,6 +155,24 @@ class Part:
         if self.relief is not None:
             give_relief(actor, self.relief)
         return actor
+
+
+def extruded(outline: np.ndarray, bottom: float, top: float) -> np.ndarray:
+    """Points (2 n, 3) of an outline (n, 2) at two heights."""
+    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (bottom, top)])
+
+
+def ring_of_wedges(
+    count: int, bore: float, rim: Callable[[np.ndarray], np.ndarray], bottom: float, top: float
+) -> list[np.ndarray]:
+    """Points (8, 3) of each convex wedge of a ring about z, whose flats touch the bore's circle; `rim`: radius at an angle."""
+    wedges = []
+    for k in range(count):
+        angles = 2 * np.pi * (k + np.array([0.0, 1.0])) / count
+        radii = (np.full(2, bore / np.cos(np.pi / count)), rim(angles))
+        outline = [[r * np.cos(a), r * np.sin(a)] for at in radii for r, a in zip(at, angles, strict=True)]
+        wedges.append(extruded(np.array(outline), bottom, top))
+    return wedges
 
 
 def block_with_holes(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from .part import Hulls, Part, Solid
+from .part import Hulls, Part, Solid, ring_of_wedges
 
 FLANK = np.tan(np.deg2rad(30.0))
 
@@ -106,12 +106,10 @@ def m16_bolt() -> Part:
 
 def m16_nut() -> Part:
     """Hexagon nut, 24 mm across flats, two turns of ridge in its lower half; its frame on the axis, in the underside."""
-    wedges = []
-    for k in range(12):
-        angles = 2 * np.pi * (k + np.array([0.0, 1.0])) / 12
-        rim = NUT_ACROSS_FLATS / 2 / np.cos((angles + np.pi / 6) % (np.pi / 3) - np.pi / 6)
-        wall = NUT_WALL / np.cos(np.pi / 12)
-        outline = [[r * np.cos(a), r * np.sin(a)] for a, far in zip(angles, rim, strict=True) for r in (wall, far)]
-        wedges.append(np.concatenate([np.c_[outline, np.full(4, z)] for z in (0.0, NUT_HEIGHT)]))
+
+    def hexagon(angles: np.ndarray) -> np.ndarray:
+        return NUT_ACROSS_FLATS / 2 / np.cos((angles + np.pi / 6) % (np.pi / 3) - np.pi / 6)
+
+    wedges = ring_of_wedges(12, NUT_WALL, hexagon, 0.0, NUT_HEIGHT)
     ridge = [piece + [0, 0, 0.0015] for piece in internal_ridge(M16, NUT_TURNS, NUT_GAP, NUT_WALL, NUT_CREST_GAP)]
     return Part("nut", (Hulls((*wedges, *ridge)),), GREY, density=STEEL, friction=GREASED)

@@ -73,6 +73,3 @@ class CameraDepth:
         where = torch.stack([-column, row], dim=-1)[None, None]  # (right, down) in [-1, 1]
         where = where.expand(len(self._height), -1, -1, -1)
         return F.grid_sample(self._height, where, padding_mode="border", align_corners=False)[:, 0, 0]
-
-    def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        raise NotImplementedError("a picture holds no velocities; the constructor refuses units='tacsl'")

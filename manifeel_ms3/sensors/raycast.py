@@ -12,7 +12,6 @@ import warp as wp
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
 from mani_skill.utils.structs import Actor, Link
-from mani_skill.utils.structs.pose import Pose
 
 from .surfaces import scene_surfaces
 from .warp_device import launch_split, warp_device
@@ -155,7 +154,8 @@ class MeshRays:
     """Rays from N pads to B meshes each.
 
     Args:
-        meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are kept once.
+        meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are kept once. Bodies and pads lie
+            at the origin until `move`.
         size: of the pads' face, m.
     """
 
@@ -176,6 +176,9 @@ class MeshRays:
         self._near_ids = torch.zeros(shape, dtype=torch.int64, device=device)
         self._near_poses = torch.zeros(*shape, 7, device=device)
         self._everywhere = torch.zeros(0, 0, 0, dtype=torch.bool, device=device)
+
+        at_origin = torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device)
+        self.move(at_origin.expand(*shape, 7), at_origin.expand(shape[0], 7))
 
     def _upload(self, mesh: trimesh.Trimesh) -> wp.Mesh:
         key = mesh.vertices.tobytes() + mesh.faces.tobytes()
@@ -242,7 +245,7 @@ class RaycastDepth:
 
     def __init__(self, scene: ManiSkillScene, pad: Link, pad_pose: sapien.Pose, size: tuple[float, float], excluded: set[str]):
         self.pad, self.device = pad, scene.device
-        self._pad_pose = torch.tensor([*pad_pose.p, *pad_pose.q], device=scene.device)
+        self._pad_pose = pad_pose
         self.surfaces = scene_surfaces(scene, excluded)
         self._rays = MeshRays([_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces], size, scene.device)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
@@ -257,7 +260,7 @@ class RaycastDepth:
     def look(self) -> None:
         """Take the poses of now."""
         self._take_poses(self._moving)
-        self._pad_world = _compose(self.pad.pose.raw_pose, self._pad_pose)
+        self._pad_world = (self.pad.pose * self._pad_pose).raw_pose
         self._rays.move(_xyzw(self._world), _xyzw(self._pad_world))
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
@@ -297,11 +300,6 @@ def _motion(body: Actor | Link, at: torch.Tensor) -> tuple[torch.Tensor, torch.T
     centre = torch.tensor(body._bodies[0].cmass_local_pose.p, device=at.device)  # the engine's velocity is the mass centre's
     centre = pose[:, :3] + (quaternion_to_matrix(pose[:, 3:]) @ centre)
     return body.linear_velocity + torch.linalg.cross(spin, at - centre), spin
-
-
-def _compose(pose: torch.Tensor, local: torch.Tensor) -> torch.Tensor:
-    """Poses (N, 7) times one local pose (7,): m and wxyz."""
-    return (Pose.create(pose) * Pose.create(local[None].expand_as(pose))).raw_pose
 
 
 def _xyzw(pose: torch.Tensor) -> torch.Tensor:

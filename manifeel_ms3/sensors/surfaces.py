@@ -4,6 +4,7 @@ A body is taken as it is drawn; where nothing is drawn (`render_backend="none"`)
 scene holds is found here. A body whose surface is finer than what is drawn, such as a golf ball's, can be given a relief.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +85,11 @@ def _colliding(shape) -> trimesh.Trimesh:
     return _primitive(shape)
 
 
+@functools.cache
+def _unit_sphere() -> trimesh.Trimesh:
+    return trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS)
+
+
 def _primitive(shape) -> trimesh.Trimesh:
     """Box, sphere, capsule, cylinder and plane, drawn or colliding: their names differ in the prefix alone."""
     kind = type(shape).__name__.removeprefix("RenderShape").removeprefix("PhysxCollisionShape")
@@ -91,7 +97,7 @@ def _primitive(shape) -> trimesh.Trimesh:
     if kind == "Box":
         return trimesh.creation.box(extents=2 * np.asarray(shape.half_size))
     if kind == "Sphere":
-        return trimesh.creation.icosphere(subdivisions=SPHERE_SUBDIVISIONS, radius=shape.radius)
+        return _unit_sphere().copy().apply_scale(shape.radius)
     if kind == "Capsule":
         capsule = trimesh.creation.capsule(height=2 * shape.half_length, radius=shape.radius, count=[128, 128])
         return capsule.apply_transform(x_from_z)

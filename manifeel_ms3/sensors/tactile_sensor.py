@@ -90,6 +90,7 @@ class TactileSensor(BaseSensor):
 
     def capture(self) -> None:
         """Sense what the scene is like now."""
+        self._depth.look()
         self._obs = self.model.observe(self._depth, self.wrench())
 
     def get_obs(self, **kwargs) -> dict[str, torch.Tensor]:

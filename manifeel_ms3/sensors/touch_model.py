@@ -19,18 +19,18 @@ OUTPUTS = ("rgb", "force_field")
 
 
 class Depth(Protocol):
-    """Height of what is near N pads."""
-
-    def look(self) -> None:
-        """Take the poses of now."""
-        ...
+    """Height of what is near N pads, where they are now."""
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
         """Height (N, C), m, above (+: into) the face at points (C, 2); free to say "nothing" where the window is not open."""
         ...
 
+
+class MovingDepth(Depth, Protocol):
+    """What units="tacsl" needs besides."""
+
     def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Heights, and velocity (N, C, 2), m/s, of the pad along what it faces; only for units="tacsl"."""
+        """Heights, and velocity (N, C, 2), m/s, of the pad along what it faces."""
         ...
 
 
@@ -78,7 +78,6 @@ class TouchModel:
             return self._observe(depth, wrench)
 
     def _observe(self, depth: Depth, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
-        depth.look()
         stiffness = self._gel[:, 0].contiguous()
         height = depth.heights(self.cells)
         plane = solve_indentation(height, wrench, self.grid, stiffness)
@@ -110,7 +109,7 @@ class TouchModel:
         sums = self.taxels.add_up(torch.stack([below * pressure, pressure], dim=-1))
         return (sums[..., 0] / sums[..., 1].clamp(min=1e-9)).float()
 
-    def _feel_as_tacsl(self, depth: Depth, plane: torch.Tensor) -> dict[str, torch.Tensor]:
+    def _feel_as_tacsl(self, depth: MovingDepth, plane: torch.Tensor) -> dict[str, torch.Tensor]:
         centres = self.taxels.centres.flatten(0, 1).float()
         height, velocity = depth.sliding(centres)
         below = depth_below_face(height, plane, centres[:, 0], centres[:, 1]).clamp(0.0, self.config.gel.max_penetration)

@@ -72,9 +72,7 @@ class BallSortingEnv(VisuotactileEnv):
         self.golf.set_pose(Pose.create_from_pq(seat + side, random_quaternions(n, device=self.device)))
         self.tennis.set_pose(Pose.create_from_pq(seat - side))
         start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
-        qpos = torch.tensor(self.agent.keyframes["tool_down"].qpos, dtype=torch.float32).repeat(n, 1)
-        qpos[:, :7] = self.agent.solve_ik(start, qpos)
-        self.agent.reset(qpos)
+        self.agent.reset_tool(start)
 
     def _seats(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Where the golf ball's and the other's centres belong, (N, 3), m."""

@@ -9,7 +9,7 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.geometry import gear_fit
 from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
 
-from .insertion import InsertionEnv
+from .insertion import SOCKET_XY, InsertionEnv
 
 NEIGHBOURS = ("small", "large")
 ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
@@ -41,7 +41,9 @@ class GearAssemblyEnv(InsertionEnv):
     def _load_task(self):
         super()._load_task()
         self.neighbours = {
-            name: neighbour_gear(name).build(self.scene, "dynamic", sapien.Pose([0.5 + SHAFT_X[name], 0, BASE_SIZE[2]]))
+            name: neighbour_gear(name).build(
+                self.scene, "dynamic", sapien.Pose([SOCKET_XY[0] + SHAFT_X[name], SOCKET_XY[1], BASE_SIZE[2]])
+            )
             for name in NEIGHBOURS
         }
 

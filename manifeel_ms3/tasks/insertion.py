@@ -62,10 +62,7 @@ class InsertionEnv(VisuotactileEnv):
 
         position = (*START_XYZ[:2], START_XYZ[2] + self.lift)
         start = start_pose(n, position, (ranges.start_xy, ranges.start_xy, ranges.start_z), ranges.start_rotation)
-        qpos = torch.tensor(self.agent.keyframes["tool_down"].qpos, dtype=torch.float32).repeat(n, 1)
-        qpos[:, :7] = self.agent.solve_ik(start, qpos)
-        qpos[:, 7:] = self.fit.grip_width / 2 - GRIP_INDENTATION
-        self.agent.reset(qpos, GRIP_FORCE)
+        self.agent.reset_tool(start, self.fit.grip_width / 2 - GRIP_INDENTATION, GRIP_FORCE)
 
         pitch = torch.zeros(n, 3)
         pitch[:, 1] = (2 * torch.rand(n) - 1) * ranges.in_hand_pitch

@@ -69,9 +69,7 @@ class ObjectSearchEnv(VisuotactileEnv):
         position[:, 2] = CONTAINER_FLOOR + BATTERY_SIZE / 2
         self.battery.set_pose(Pose.create_from_pq(position))
         start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
-        qpos = torch.tensor(self.agent.keyframes["tool_down"].qpos, dtype=torch.float32).repeat(n, 1)
-        qpos[:, :7] = self.agent.solve_ik(start, qpos)
-        self.agent.reset(qpos)
+        self.agent.reset_tool(start)
 
     def measure(self) -> dict[str, torch.Tensor]:
         position = self.battery.pose.p

@@ -3,27 +3,27 @@
 import numpy as np
 import pytest
 
+from manifeel_ms3.demonstrations.record import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
 from manifeel_ms3.experts.ball_sorting import ROUGH
 from manifeel_ms3.sensors.surfaces import RELIEF
 from tests.conftest import PEG
 
 
+def gentle_success(env, task: str, seed: int) -> np.ndarray:
+    """Actions of a demonstration that succeeds within the limits of actions and force."""
+    episode = demonstrate(env, task, seed)
+    assert episode.info["success"], f"seed {seed}"
+    assert np.abs(episode.arrays["actions"]).max() <= 1.0
+    assert episode.info["peak_contact_force"] < 60.0
+    return episode.arrays["actions"]
+
+
 @pytest.mark.parametrize("fit", ["tight", "loose"])
 def test_expert_succeeds_gently_within_the_action_limits(make_env, fit):
     env = make_env(obs_mode="none", render_backend="none", fit=fit)
     for seed in range(6):
-        env.reset(seed=seed)
-        actions, peak = [], 0.0
-        for action in make_expert(PEG, env.unwrapped, seed).actions():
-            *_, terminated, truncated, info = env.step(action)
-            actions.append(action)
-            peak = max(peak, float(info["contact_force"]))
-            if terminated or truncated:
-                break
-        assert info["success"].all(), f"seed {seed}"
-        assert np.abs(actions).max() <= 1.0
-        assert peak < 60.0
+        actions = gentle_success(env, PEG, seed)
         assert len(actions) < 250  # one start over, at most
 
 
@@ -46,17 +46,7 @@ def test_expert_feels_the_rim(make_env):
 def test_every_expert_succeeds_gently(make_env, task):
     env = make_env(task, obs_mode="none", render_backend="none")
     for seed in range(3):
-        env.reset(seed=seed)
-        actions, peak = [], 0.0
-        for action in make_expert(task, env.unwrapped, seed).actions():
-            *_, terminated, truncated, info = env.step(action)
-            actions.append(action)
-            peak = max(peak, float(info["contact_force"]))
-            if terminated or truncated:
-                break
-        assert info["success"].all(), f"seed {seed}"
-        assert np.abs(actions).max() <= 1.0
-        assert peak < 60.0
+        gentle_success(env, task, seed)
 
 
 def test_search_goes_to_the_other_place_when_it_feels_nothing(make_env):

@@ -72,7 +72,7 @@ def test_teeth_are_as_thick_as_they_should_be(teeth):
 def test_what_is_drawn_is_what_collides(make_env):
     """Every collision piece of a gear lies on the drawn mesh: vertices within 1 micrometre."""
     part = neighbour_gear("small")
-    drawn = trimesh.load(part.pieces[0]._file(), force="mesh")
+    drawn = trimesh.load(part.pieces[0].file, force="mesh")
 
     def build(env):
         return [part.build(env.scene, "dynamic", sapien.Pose([0.5, 0, 0.5]))]

@@ -17,16 +17,9 @@ LOADS = torch.tensor(  # N, N m
 )
 
 
-class Pressed:
+def pressed(meshes: list[trimesh.Trimesh | None]) -> MeshRays:
     """One mesh a pad, at rest on its face."""
-
-    def __init__(self, meshes: list[trimesh.Trimesh | None]):
-        self.rays = MeshRays([meshes], CONFIG.gel.size, CPU)
-        self.pads = torch.tensor([0.0, 0, 0, 0, 0, 0, 1]).repeat(len(meshes), 1)
-        self.heights = self.rays.heights
-
-    def look(self) -> None:
-        self.rays.move(self.pads[:, None].contiguous(), self.pads)
+    return MeshRays([meshes], CONFIG.gel.size, CPU)
 
 
 def meshes() -> list[trimesh.Trimesh | None]:
@@ -48,12 +41,12 @@ EVERYTHING = {"optics.shadow": 0.5, "optics.markers": True, "randomization.gain"
 def test_each_row_of_a_batch_is_as_if_alone():
     together = model(4, **EVERYTHING)
     for _ in range(2):  # with a history
-        seen = together.observe(Pressed(meshes()), LOADS)
+        seen = together.observe(pressed(meshes()), LOADS)
     for i, mesh in enumerate(meshes()):
         alone = TouchModel(with_options(CONFIG, EVERYTHING), 1, CPU)
         alone.reset(torch.arange(1), np.array([i]))
         for _ in range(2):
-            one = alone.observe(Pressed([mesh]), LOADS[i : i + 1])
+            one = alone.observe(pressed([mesh]), LOADS[i : i + 1])
         assert (one["force_field"][0] - seen["force_field"][i]).abs().max() < 1e-6
         assert (one["penetration"][0] - seen["penetration"][i]).abs().max() < 1e-6
         assert (one["rgb"][0].int() - seen["rgb"][i].int()).abs().max() <= 1
@@ -63,7 +56,7 @@ def test_batch_of_64_equals_itself_bit_for_bit():
     runs = []
     for _ in range(2):
         pads = model(64, **EVERYTHING, **{"optics.noise": 2.0})
-        runs.append(pads.observe(Pressed(meshes() * 16), LOADS.repeat(16, 1)))
+        runs.append(pads.observe(pressed(meshes() * 16), LOADS.repeat(16, 1)))
     for name in runs[0]:
         assert torch.equal(runs[0][name], runs[1][name]), name
 
@@ -73,16 +66,16 @@ def test_reset_clears_the_shear_of_these_pads_alone():
     ball = [meshes()[0]] * 3
     held, released = LOADS[:1].repeat(3, 1), LOADS[:1].repeat(3, 1)
     released[:, [0, 1, 5]] = 0.0
-    pads.observe(Pressed(ball), held)
+    pads.observe(pressed(ball), held)
     pads.reset(torch.tensor([1]), np.array([7]))
-    locked_in = pads.observe(Pressed(ball), released)["force_field"][..., 1:].abs().amax((1, 2, 3))
+    locked_in = pads.observe(pressed(ball), released)["force_field"][..., 1:].abs().amax((1, 2, 3))
     assert locked_in[1] < 1e-9
     assert (locked_in[[0, 2]] > 1e-4).all()
 
 
 def test_randomised_gel_sinks_otherwise_under_the_same_force():
     pads = model(8, **{"randomization.stiffness": 0.3, "randomization.friction": 0.2})
-    seen = pads.observe(Pressed([meshes()[0]] * 8), LOADS[:1].repeat(8, 1))
+    seen = pads.observe(pressed([meshes()[0]] * 8), LOADS[:1].repeat(8, 1))
     deepest = seen["penetration"].amax((1, 2))
     assert deepest.unique().numel() == 8
     assert deepest.max() / deepest.min() < np.sqrt(1.3 / 0.7) + 0.01  # a ball: depth goes with the root of the stiffness
@@ -90,9 +83,9 @@ def test_randomised_gel_sinks_otherwise_under_the_same_force():
 
 
 def test_only_what_is_asked_for_is_computed():
-    depth = Pressed(meshes()[:1])
-    looked = []
-    depth.heights = lambda grid, window=None: (looked.append(len(grid)), depth.rays.heights(grid, window))[1]
+    depth = pressed(meshes()[:1])
+    looked, heights = [], depth.heights
+    depth.heights = lambda grid, window=None: (looked.append(len(grid)), heights(grid, window))[1]
     field = TouchModel(CONFIG, 1, CPU, ("force_field",)).observe(depth, LOADS[:1])
     assert field.keys() == {"force_field", "penetration"}
     assert looked == [69 * 91]  # cells, no pixels
