@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from rich.progress import track
 
-from manifeel_ms3.demonstrations.record import demonstrate
+from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
 
 IMAGES = Path(__file__).parent / "images"

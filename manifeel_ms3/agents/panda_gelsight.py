@@ -11,6 +11,7 @@ from mani_skill.agents.controllers import (
 )
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.sensors.wrench import WrenchGauge
@@ -144,9 +145,13 @@ class PandaGelSight(BaseAgent):
             targets[:, 7:] -= grip_force / self.controller.controllers["gripper"].config.stiffness
             self.robot.set_joint_drive_targets(targets, self.robot.active_joints, torch.arange(9, device=self.device))
 
-    def reset_tool(self, pose: Pose, opening: float = 0.04, grip_force: float = 0.0):
-        """`reset` with the tool at poses (n,), base frame, and each finger `opening`, m, from the middle."""
+    def reset_tool(self, pose: Pose, opening: float = 0.04, grip_force: float = 0.0, wrist_turn: float = 0.0):
+        """`reset` with the tool at poses (n,), base frame, and each finger `opening`, m, from the middle.
+
+        `wrist_turn`, rad: about which angle the last joint is to be turned, of those that differ by a whole turn.
+        """
         qpos = torch.tensor(self.keyframes["tool_down"].qpos, dtype=torch.float32, device=self.device).repeat(len(pose), 1)
+        qpos[:, 6] += wrist_turn
         qpos[:, :7] = self.solve_ik(pose, qpos)
         qpos[:, 7:] = opening
         self.reset(qpos, grip_force)
@@ -179,3 +184,13 @@ class PandaGelSight(BaseAgent):
         `pad_joint_forces` (..., 2, 6) was collected from the property of that name.
         """
         return torch.linalg.norm(torch.einsum("...kj,kij->...i", pad_joint_forces[..., :3], self._joint_to_hand), dim=-1)
+
+    def torque_on_held(self, point: torch.Tensor) -> torch.Tensor:
+        """Torque (N,), N m, of both pads on what they hold, about the vertical through `point` (N, 3), counter-clockwise seen
+        from above."""
+        total = torch.zeros(len(point), device=point.device)
+        for side, gel in self.gels.items():
+            wrench = self.pad_wrench(side).to(point.dtype)
+            force, moment = quaternion_apply(gel.pose.q, wrench[:, :3]), quaternion_apply(gel.pose.q, wrench[:, 3:])
+            total -= (moment + torch.linalg.cross(gel.pose.p - point, force))[:, 2]
+        return total

@@ -6,6 +6,7 @@ killed goes on where it stopped when the same command is given again.
 
 import json
 import logging
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -14,18 +15,16 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import gymnasium as gym
-import numpy as np
 import torch
 import tyro
-from mani_skill.utils import common
 
-from manifeel_ms3.experts import EXPERTS, make_expert
-from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.experts import EXPERTS
+from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
+from .episode import demonstrate
 from .trajectory_file import (
     DemonstrationError,
-    Episode,
     consolidate,
     episode_folder,
     finished_episodes,
@@ -62,30 +61,27 @@ class Args:
     """give up when this many times `num` seeds have been tried"""
 
 
-def main(args: Args) -> Path:
-    """Record, and return the file's path."""
+def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
+    """Record, and return the file's path. `on_episode` is called after each episode, instead of a progress bar."""
     if args.env_id not in EXPERTS:
         raise ValueError(f"{args.env_id!r} has no demonstrator; there are ones for {sorted(EXPERTS)}")
     path = args.out or Path("data/demos") / args.env_id / "trajectory.h5"
     env_kwargs = _env_kwargs(args)
-    header = _header(args.env_id, env_kwargs)
-    infos, failed = _already_there(path, header)
+    header = make_header(args.env_id, env_kwargs)
+    infos, failed = already_there(path, header)
     if len(infos) >= args.num:
         log.info("%s already holds %d episodes", path, len(infos))
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    context = get_context("spawn")  # a forked renderer does not work
     with (
-        progress_bar() as bar,
-        ProcessPoolExecutor(args.workers, context, _start_worker, (args.env_id, env_kwargs, path)) as pool,
+        episode_counter(f"recording {args.env_id}", args.num, len(infos), on_episode) as count,
+        worker_pool(args.workers, args.env_id, env_kwargs, path) as pool,
     ):
-        task = bar.add_task(f"recording {args.env_id}", total=args.num, completed=len(infos))
         for seed, info in _episodes(pool, args, infos, failed):
             if info is None:
                 failed.add(seed)
             else:
                 infos[seed] = info
-                bar.advance(task)
+                count()
             write_index(path, header | dict(failed_seeds=sorted(failed)), dict(sorted(infos.items())))
     consolidate(path)
     return path
@@ -119,7 +115,8 @@ def _env_kwargs(args: Args) -> dict[str, Any]:
     return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | extra
 
 
-def _header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The json of a trajectory file, but for its episodes."""
     packages = {name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")}
     limit = gym.spec(env_id).max_episode_steps
     return dict(
@@ -136,7 +133,7 @@ def _without_renderer(env_kwargs: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in env_kwargs.items() if name != "render_backend"}
 
 
-def _already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
+def already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
     """Episodes and failed seeds that an earlier run has left."""
     if not path.is_file() and not episode_folder(path).is_dir():
         return {}, set()
@@ -156,67 +153,31 @@ def _already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict],
 
 # -------------------------------------------------------------------- in the workers
 
-_worker: dict[str, Any] = {}
+worker: dict[str, Any] = {}
+"""In a worker process: its `env`, and the `env_id` and `path` that it was started for."""
+
+
+def worker_pool(workers: int, env_id: str, env_kwargs: dict[str, Any], path: Path) -> ProcessPoolExecutor:
+    """Processes with one environment each, for episodes that are written beside `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    context = get_context("spawn")  # a forked renderer does not work
+    return ProcessPoolExecutor(workers, context, _start_worker, (env_id, env_kwargs, path))
 
 
 def _start_worker(env_id: str, env_kwargs: dict[str, Any], path: Path) -> None:
     torch.set_num_threads(1)  # processes share the cores
     import manifeel_ms3  # noqa: F401
 
-    _worker.update(env_id=env_id, path=path, env=gym.make(env_id, **env_kwargs))
+    worker.update(env_id=env_id, path=path, env=gym.make(env_id, **env_kwargs))
 
 
 def _record_seed(seed: int) -> dict[str, Any] | None:
     """Record one episode; write it if it succeeded, and return its info, else None."""
-    episode = demonstrate(_worker["env"], _worker["env_id"], seed)
+    episode = demonstrate(worker["env"], worker["env_id"], seed)
     if not episode.info["success"]:
         return None
-    write_episode(_worker["path"], episode)
+    write_episode(worker["path"], episode)
     return episode.info | dict(episode_seed=seed)
-
-
-def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
-    """Run the demonstrator through one episode."""
-    base = env.unwrapped
-    obs, _ = env.reset(seed=seed)
-    observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
-    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[])
-    peak = 0.0
-    for action in make_expert(env_id, base, seed).actions():
-        action = action.astype(np.float32)
-        obs, _, terminated, truncated, info = env.step(action)
-        observations.append(common.to_numpy(obs))
-        states.append(common.to_numpy(base.get_state_dict()))
-        flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
-        for name, value in (dict(actions=action) | {k: bool(v) for k, v in flags.items()}).items():
-            steps[name].append(value)
-        peak = max(peak, float(info["contact_force"]))
-        if terminated or truncated:
-            break
-    arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}
-    if observations[0]:
-        arrays["obs"] = _stack(observations)
-    arrays["env_states"] = _stack(states)
-    info = dict(
-        reset_kwargs=dict(seed=seed, options={}),
-        control_mode=base.control_mode,
-        elapsed_steps=len(steps["actions"]),
-        success=steps["success"][-1],
-        fail=steps["fail"][-1],
-        peak_contact_force=round(peak, 3),
-    )
-    return Episode(seed, arrays, info)
-
-
-def _stack(trees: list[dict]) -> dict[str, Any]:
-    """A list over time of trees with arrays (1, ...) as one tree with arrays (T, ...)."""
-    first = trees[0]
-    return {
-        key: _stack([tree[key] for tree in trees])
-        if isinstance(first[key], dict)
-        else np.concatenate([tree[key] for tree in trees])
-        for key in first
-    }
 
 
 if __name__ == "__main__":

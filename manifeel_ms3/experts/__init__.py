@@ -11,6 +11,7 @@ from .ball_sorting import BallSortingExpert as BallSortingExpert
 from .insertion import GearExpert as GearExpert
 from .insertion import InsertionExpert as InsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
+from .screwing import ScrewingExpert as ScrewingExpert
 
 
 class Expert(Protocol):
@@ -28,6 +29,8 @@ EXPERTS: dict[str, Callable[[Any, int], Expert]] = {
     "ManiFeel-BallSorting-v1": BallSortingExpert,
     "ManiFeel-BallSortingDim-v1": BallSortingExpert,
     "ManiFeel-GearAssembly-v1": GearExpert,
+    "ManiFeel-BulbInstallation-v1": ScrewingExpert,
+    "ManiFeel-NutBoltAssembly-v1": ScrewingExpert,
     "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,
     "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,
 }

@@ -107,6 +107,21 @@ class Skills:
         for _ in range(steps):
             yield self.command(*self.commanded)
 
+    def move_fingers(self, opening: float, steps: int) -> Actions:
+        """Stay, and move the gripper at a steady pace; then give it two steps to come to rest."""
+        start = self.gripper
+        for step in range(steps + 2):
+            yield from self.set_gripper(start + (opening - start) * min((step + 1) / steps, 1.0), steps=1)
+
+    def finger_action(self, position: float) -> float:
+        """What commands each finger to a place, m from the middle."""
+        limits = self.agent.controller.controllers["gripper"].config
+        return float(np.clip((position - limits.lower) / (limits.upper - limits.lower) * 2 - 1, -1, 1))
+
+    def grip_action(self, width: float, force: float) -> float:
+        """What presses each finger with a force, N, on something this wide, m."""
+        return self.finger_action(width / 2 - force / self.agent.controller.controllers["gripper"].config.stiffness)
+
     def lift_and_hold(self, height: float, rotation: Rotation) -> Actions:
         """Raise what is held by `height`, m; then stay, without end."""
         here, _ = self.tool

@@ -8,5 +8,6 @@ from .plugs import peg_fit as peg_fit
 from .plugs import power_fit as power_fit
 from .plugs import reorientation_fit as reorientation_fit
 from .plugs import usb_fit as usb_fit
-from .threads import m16_bolt as m16_bolt
-from .threads import m16_nut as m16_nut
+from .screws import Screw as Screw
+from .screws import bulb_and_holder as bulb_and_holder
+from .screws import nut_and_bolt as nut_and_bolt

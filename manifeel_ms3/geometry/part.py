@@ -136,18 +136,21 @@ class Part:
     other_colours: dict[int, tuple[float, float, float]] = field(default_factory=dict)
     undrawn: frozenset[int] = frozenset()
     """Places in `pieces` of those that collide and are not seen, nor felt."""
+    springs: dict[int, float] = field(default_factory=dict)
+    """Places in `pieces` of those that give way, and how stiff they are: N/m at each contact point."""
     relief: trimesh.Trimesh | None = None
     """Surface to touch, where it has what is too fine for cameras and contacts."""
 
     def build(self, scene: ManiSkillScene, body_type: str, initial_pose: sapien.Pose) -> Actor:
         """Add the part to a scene as a "dynamic", "kinematic" or "static" actor."""
         builder = scene.create_actor_builder()
-        material = PhysxMaterial(self.friction, self.friction, 0.0)
         for k, piece in enumerate(self.pieces):
             look = None
             if scene.can_render() and k not in self.undrawn:  # a render material cannot even be made without a renderer
                 colour = self.other_colours.get(k, self.colour)
                 look = RenderMaterial(base_color=[*colour, 1.0], roughness=0.6, specular=0.3)
+            # the engine takes negative restitution as a spring, and averages it with the other body's
+            material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
             piece.add_to(builder, material, self.density, look)
         builder.initial_pose = initial_pose
         builder.set_physx_body_type(body_type)

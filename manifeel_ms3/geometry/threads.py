@@ -1,7 +1,6 @@
-"""Threads that really turn: an external thread as one triangle mesh, an internal one as a row of convex ridge pieces.
+"""Threads that really turn. Of a mating pair the fixed side is one triangle mesh, the held one a row of convex ridge pieces.
 
-Triangle meshes collide with convex shapes alone, so that of every mating pair one side is made of pieces. Profile: 60 degrees,
-crest flat of an eighth and root flat of a quarter of the pitch (ISO 68-1). Right-handed.
+Triangle meshes collide with convex shapes alone, and only fixed bodies can have them. All threads are right-handed.
 """
 
 from dataclasses import dataclass
@@ -9,107 +8,117 @@ from dataclasses import dataclass
 import numpy as np
 import trimesh
 
-from .part import Hulls, Part, Solid, ring_of_wedges
-
 FLANK = np.tan(np.deg2rad(30.0))
 
 
 @dataclass(frozen=True)
 class Thread:
-    """External thread about z, from z = 0 to `length`, chamfered at the top. Lengths in m."""
+    """Outer surface of a thread about z: its radius along one pitch, periodic, turned into a helix. Lengths in m."""
 
-    major_radius: float
     pitch: float
-    length: float
+    profile: tuple[tuple[float, float], ...]
+    """(height, radius) along one pitch, the crest's middle at height 0; straight lines between."""
 
     @property
-    def depth(self) -> float:
-        """From crest to root: what is left of half the pitch after half of both flats, along the flank."""
-        return (0.5 - 1 / 16 - 1 / 8) * self.pitch / FLANK
+    def major_radius(self) -> float:
+        return max(radius for _, radius in self.profile)
 
     @property
     def minor_radius(self) -> float:
-        return self.major_radius - self.depth
+        return min(radius for _, radius in self.profile)
 
-    def groove_half_width(self, radius: float) -> float:
-        """Of the groove at a radius, along z."""
-        return self.pitch / 8 + (radius - self.minor_radius) * FLANK
+    def wider(self, gap: float) -> "Thread":
+        """The thread with its surface `gap` further out: the bore that this one runs in."""
+        return Thread(self.pitch, tuple((height, radius + gap) for height, radius in self.profile))
 
 
-def external_mesh(thread: Thread, per_turn: int = 32) -> trimesh.Trimesh:
-    """Closed surface of an external thread, its crest at z = 0 at angle 0."""
-    p, low, high = thread.pitch, thread.minor_radius, thread.major_radius
-    # along one pitch: crest from -1/16 to 1/16, flank to 6/16, root to 10/16, flank to 15/16
-    places = np.array([-1 / 16, 1 / 16, 6 / 16, 10 / 16]) * p
-    radii = np.array([high, high, low, low])
-    turns = int(np.ceil(thread.length / p)) + 3
-    u = np.concatenate([(n - 2) * p + places for n in range(turns)])
-    r = np.tile(radii, turns)
-    angle = 2 * np.pi * np.arange(per_turn) / per_turn
-    z = np.clip(u[None] + p * angle[:, None] / (2 * np.pi), 0.0, thread.length)
-    chamfer = low - 2e-4 + (thread.length - z)  # 45 degrees
-    radius = np.minimum(np.broadcast_to(r, z.shape), np.maximum(chamfer, low - 2e-4))
-    rim = np.stack([radius * np.cos(angle)[:, None], radius * np.sin(angle)[:, None], z], axis=-1)  # (per_turn, J, 3)
-    count = len(u)
-    vertices = [*rim.reshape(-1, 3), [0, 0, 0], [0, 0, thread.length]]
-    bottom, top = len(vertices) - 2, len(vertices) - 1
+def iso_metric(major_radius: float, pitch: float) -> Thread:
+    """ISO 68-1: 60 degrees, crest flat of an eighth of the pitch, root flat of a quarter."""
+    minor = major_radius - (0.5 - 1 / 16 - 1 / 8) * pitch / FLANK
+    places = np.array([-1 / 16, 1 / 16, 6 / 16, 10 / 16]) * pitch
+    return Thread(pitch, tuple(zip(places, (major_radius, major_radius, minor, minor), strict=True)))
+
+
+def edison(major_radius: float, pitch: float, arc: float, points: int = 4) -> Thread:
+    """Edison screw (IEC 60061-1): crest and root are arcs of one radius, tangent to each other."""
+    drop = 2 * arc - np.sqrt(4 * arc**2 - pitch**2 / 4)  # from crest to root
+    height = np.linspace(-pitch / 4, pitch / 4, points + 1)
+    sag = arc - np.sqrt(arc**2 - height**2)
+    crest = zip(height, major_radius - sag, strict=True)
+    root = zip(height + pitch / 2, major_radius - drop + sag, strict=True)
+    return Thread(pitch, (*crest, *list(root)[1:-1]))
+
+
+def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: int = 32) -> trimesh.Trimesh:
+    """Closed surface of an external thread from z = 0 to `length`, its crest at z = 0 at angle 0.
+
+    Its top is chamfered by 45 degrees, down to `tip_radius`.
+    """
+    rim = _helix(thread, length, per_turn)
+    chamfer = tip_radius + length - rim[..., 1]
+    rim[..., 0] = np.minimum(rim[..., 0], np.maximum(chamfer, tip_radius))
+    vertices, faces = _skin(rim, len(thread.profile))
+    count = rim.shape[1]
+    bottom, top = len(vertices), len(vertices) + 1
+    for k in range(per_turn):
+        ahead = (k + 1) % per_turn * count
+        faces += [[k * count, bottom, ahead], [(k + 1) * count - 1, ahead + count - 1, top]]
+    return _clean(np.r_[vertices, [[0, 0, 0], [0, 0, length]]], faces)
+
+
+def internal_mesh(thread: Thread, length: float, per_turn: int = 48) -> trimesh.Trimesh:
+    """Surface of a bore with this thread from z = 0 to `length`, seen from its axis; open at its ends and behind.
+
+    Its mouth, at the top, is chamfered by 45 degrees, out to the thread's major radius.
+    """
+    rim = _helix(thread, length, per_turn)
+    rim[..., 0] = np.maximum(rim[..., 0], thread.major_radius - (length - rim[..., 1]))
+    vertices, faces = _skin(rim, len(thread.profile))
+    return _clean(vertices, np.fliplr(faces))
+
+
+def _helix(thread: Thread, length: float, per_turn: int) -> np.ndarray:
+    """(radius, height) of the surface's columns, (per_turn, n, 2); what lies beyond the ends is cut off there."""
+    heights, radii = np.array(thread.profile).T
+    turns = np.arange(-2, int(np.ceil(length / thread.pitch)) + 1)
+    u = (turns[:, None] * thread.pitch + heights).ravel()
+    z = np.clip(u + thread.pitch * np.arange(per_turn)[:, None] / per_turn, 0.0, length)
+    return np.stack([np.broadcast_to(np.tile(radii, len(turns)), z.shape), z], axis=-1)
+
+
+def _skin(rim: np.ndarray, per_pitch: int) -> tuple[np.ndarray, list[list[int]]]:
+    """Vertices and faces between columns; once round, a column meets the one a pitch further up."""
+    per_turn, count, _ = rim.shape
+    angle = 2 * np.pi * np.arange(per_turn)[:, None] / per_turn
+    vertices = np.stack([rim[..., 0] * np.cos(angle), rim[..., 0] * np.sin(angle), rim[..., 1]], axis=-1).reshape(-1, 3)
     faces = []
     for k in range(per_turn):
-        ahead, shift = ((k + 1) * count, 0) if k + 1 < per_turn else (0, len(places))  # a turn on, one pitch up
+        ahead, shift = ((k + 1) * count, 0) if k + 1 < per_turn else (0, per_pitch)
         for j in range(count - 1 - shift):
             a, b, c, d = k * count + j, ahead + j + shift, ahead + j + shift + 1, k * count + j + 1
             faces += [[a, b, c], [a, c, d]]
-        faces.append([k * count, bottom, ahead + shift])
-        faces.append([k * count + count - 1 - shift, ahead + count - 1, top])
-    mesh = trimesh.Trimesh(np.array(vertices), faces, process=False)
+    return vertices, faces
+
+
+def _clean(vertices: np.ndarray, faces) -> trimesh.Trimesh:
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
     mesh.merge_vertices(digits_vertex=9)
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
     return mesh
 
 
-def internal_ridge(
-    thread: Thread, turns: float, gap: float, wall_radius: float, crest_gap: float, per_turn: int = 24
-) -> list[np.ndarray]:
-    """Ridge of a nut for `thread`, (8, 3) corners of every piece: from z = 0, `gap` m thinner on each flank.
+def ridge(section: np.ndarray, pitch: float, turns: float, per_turn: int, lead_in: float = 0.0) -> list[np.ndarray]:
+    """Convex pieces (2 m, 3) of a ridge that winds up from z = 0; `section` (m, 2): its corners, (radius, height).
 
-    Args:
-        wall_radius: where the ridge is rooted.
-        crest_gap: m between its crest and the thread's root.
+    `lead_in`: turns over which it rises from its foot, the smallest radius.
     """
-    inner = thread.minor_radius + crest_gap
-    halves = {r: max(thread.groove_half_width(r) - gap, 1e-5) for r in (inner, wall_radius)}
-    # the groove's middle lies half a pitch above the crest
-    pieces = []
-    for k in range(round(turns * per_turn)):
-        corners = []
-        for step in (k, k + 1):
-            angle = 2 * np.pi * step / per_turn
-            middle = thread.pitch * step / per_turn + thread.pitch / 2
-            for r, half in halves.items():
-                stretch = 1.0 if r == inner else 1 / np.cos(np.pi / per_turn)
-                corners += [[r * stretch * np.cos(angle), r * stretch * np.sin(angle), middle + s * half] for s in (-1, 1)]
-        pieces.append(np.array(corners))
-    return pieces
+    foot = section[:, 0].min()
 
+    def at(step: int) -> np.ndarray:
+        angle, (radius, height) = 2 * np.pi * step / per_turn, section.T
+        radius = foot + (radius - foot) * (min(step / (lead_in * per_turn), 1.0) if lead_in else 1.0)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), height + pitch * step / per_turn], axis=1)
 
-M16 = Thread(major_radius=0.008, pitch=0.002, length=0.024)
-NUT_ACROSS_FLATS, NUT_HEIGHT, NUT_WALL = 0.024, 0.013, 0.0083  # m; the wall is the ridge's root
-NUT_GAP, NUT_CREST_GAP, NUT_TURNS = 1e-4, 2e-4, 2.0
-STEEL, GREASED, GREY = 7800.0, 0.15, (0.70, 0.72, 0.75)
-
-
-def m16_bolt() -> Part:
-    """Thread of an M16 bolt, 24 mm, standing up; its frame in the middle of its foot."""
-    return Part("bolt", (Solid(external_mesh(M16)),), GREY, density=STEEL, friction=GREASED)
-
-
-def m16_nut() -> Part:
-    """Hexagon nut, 24 mm across flats, two turns of ridge in its lower half; its frame on the axis, in the underside."""
-
-    def hexagon(angles: np.ndarray) -> np.ndarray:
-        return NUT_ACROSS_FLATS / 2 / np.cos((angles + np.pi / 6) % (np.pi / 3) - np.pi / 6)
-
-    wedges = ring_of_wedges(12, NUT_WALL, hexagon, 0.0, NUT_HEIGHT)
-    ridge = [piece + [0, 0, 0.0015] for piece in internal_ridge(M16, NUT_TURNS, NUT_GAP, NUT_WALL, NUT_CREST_GAP)]
-    return Part("nut", (Hulls((*wedges, *ridge)),), GREY, density=STEEL, friction=GREASED)
+    first = 1 if lead_in else 0  # the very beginning has no height
+    return [np.concatenate([at(k), at(k + 1)]) for k in range(first, round(turns * per_turn))]

@@ -1,6 +1,8 @@
 from .ball_sorting import BallSortingDimEnv as BallSortingDimEnv
 from .ball_sorting import BallSortingEnv as BallSortingEnv
+from .bulb_installation import BulbInstallationEnv as BulbInstallationEnv
 from .gear_assembly import GearAssemblyEnv as GearAssemblyEnv
+from .nut_bolt_assembly import NutBoltAssemblyEnv as NutBoltAssemblyEnv
 from .object_search import ObjectSearchEnv as ObjectSearchEnv
 from .peg_insertion import PegInsertionEnv as PegInsertionEnv
 from .peg_reorientation import PegReorientationEnv as PegReorientationEnv

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manifeel_ms3.demonstrations.record import demonstrate
+from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
 from manifeel_ms3.experts.ball_sorting import ROUGH
 from manifeel_ms3.sensors.surfaces import RELIEF

@@ -1,0 +1,157 @@
+"""Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --workers 2`.
+
+For each task two files: `states.h5`, states and actions alone, and `trajectory.h5`, the same episodes with observations; beside
+them all a `manifest.json` with hashes, versions, seeds and outcomes, which `validate` checks. A run that was killed goes on
+where it stopped when the same command is given again.
+"""
+
+import hashlib
+import json
+import logging
+import shutil
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
+
+from . import materialize, record
+from .trajectory_file import finished_episodes, read_header, write_json
+
+log = logging.getLogger(__name__)
+PAPER_COUNTS = {
+    "ManiFeel-PegInsertion-v1": 50,
+    "ManiFeel-USBInsertion-v1": 50,
+    "ManiFeel-PowerPlugInsertion-v1": 50,
+    "ManiFeel-GearAssembly-v1": 100,
+    "ManiFeel-NutBoltAssembly-v1": 30,
+    "ManiFeel-BulbInstallation-v1": 20,
+    "ManiFeel-PegReorientation-v1": 50,
+    "ManiFeel-ObjectSearch-v1": 50,
+    "ManiFeel-BallSorting-v1": 80,
+    "ManiFeel-BallSortingDim-v1": 80,
+}
+BYTES_A_DEMO = 12e6  # observed with everything, at most about
+
+
+@dataclass
+class Args:
+    out: Path = Path("data/demos")
+    """folder to write"""
+    tasks: tuple[str, ...] = tuple(PAPER_COUNTS)
+    """tasks to record"""
+    num: int | None = None
+    """episodes a task; default: the paper's counts"""
+    workers: int = 1
+    """processes"""
+    obs_mode: str = "rgb+tacrgb+tacff"
+    """what to observe; "none" for states and actions alone"""
+    cameras: tuple[str, ...] = CAMERAS
+    """cameras to observe"""
+    tactile_sensors: tuple[str, ...] = SIDES
+    """pads to observe"""
+    picture_size: int | None = None
+    """pixels, of the cameras' sides; default: the tasks' 256"""
+
+
+def main(args: Args) -> Path:
+    """Record, and return the manifest's path.
+
+    Raises:
+        ValueError: a task that is not known.
+        OSError: the disk has no room for it.
+    """
+    counts = {task: args.num or PAPER_COUNTS.get(task, 0) for task in args.tasks}
+    if unknown := set(args.tasks) - set(PAPER_COUNTS):
+        raise ValueError(f"tasks {sorted(unknown)} are unknown; choose from {list(PAPER_COUNTS)}")
+    observed = args.obs_mode != "none"
+    args.out.mkdir(parents=True, exist_ok=True)
+    _check_room(args, sum(counts.values()) if observed else 0)
+    files = {task: (args.out / task / "states.h5", args.out / task / "trajectory.h5") for task in counts}
+    with progress_bar() as bar:
+        total = sum(counts.values()) * (2 if observed else 1)
+        done = sum(_there(path) for paths in files.values() for path in paths[: 1 + observed])
+        whole = bar.add_task("all tasks", total=total, completed=min(done, total))
+
+        def count() -> None:
+            bar.advance(whole)
+
+        for task, (states, trajectory) in files.items():
+            bar.update(whole, description=f"recording {task}")
+            bare = dict(obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs='{"render_backend": "none"}')
+            record.main(record.Args(task, counts[task], args.workers, out=states, **bare), count)
+            if observed:
+                bar.update(whole, description=f"observing {task}")
+                pictures = (args.obs_mode, args.cameras, args.tactile_sensors, args.picture_size)
+                materialize.main(materialize.Args(states, trajectory, *pictures, workers=args.workers), count)
+            write_manifest(args.out)
+    return args.out / "manifest.json"
+
+
+def _there(path: Path) -> int:
+    """Episodes that an earlier run has left."""
+    return len(read_header(path)["episodes"]) if path.is_file() else len(finished_episodes(path))
+
+
+def _check_room(args: Args, episodes: int) -> None:
+    free = shutil.disk_usage(args.out).free
+    pixels = ((args.picture_size or 256) / 256) ** 2
+    if (needed := episodes * BYTES_A_DEMO * max(pixels, 0.2)) > free:
+        raise OSError(
+            f"{args.out} has {free / 1e9:.1f} GB free, {episodes} episodes take up to {needed / 1e9:.1f}; give another --out, "
+            "fewer --tasks or cameras, or --obs-mode none (what is there already is kept)"
+        )
+
+
+def write_manifest(folder: Path) -> None:
+    """Write `manifest.json` for the trajectory files under a folder."""
+    files = {path.relative_to(folder).as_posix(): describe(path) for path in sorted(folder.glob("*/*.h5"))}
+    write_json(folder / "manifest.json", dict(schema="manifeel-demonstrations-1", version=version("manifeel-ms3"), files=files))
+
+
+def describe(path: Path) -> dict[str, Any]:
+    """What a manifest says of a trajectory file."""
+    header = read_header(path)
+    episodes = header["episodes"]
+    return dict(
+        env_id=header["env_info"]["env_id"].rpartition(":")[2],
+        env_kwargs=header["env_info"]["env_kwargs"],
+        versions=header["versions"],
+        sha256=_sha256(path),
+        json_sha256=_sha256(path.with_suffix(".json")),
+        bytes=path.stat().st_size,
+        seeds=[episode["episode_seed"] for episode in episodes],
+        failed_seeds=header.get("failed_seeds", []),
+        success=sum(bool(episode["success"]) for episode in episodes),
+        mean_steps=round(sum(episode["elapsed_steps"] for episode in episodes) / max(len(episodes), 1), 1),
+        peak_contact_force=max((episode["peak_contact_force"] for episode in episodes), default=0.0),
+    )
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """A folder's manifest.
+
+    Raises:
+        FileNotFoundError: there is none.
+    """
+    path = Path(folder) / "manifest.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
+    return json.loads(path.read_text())
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.WARNING, format="%(message)s")
+    main(tyro.cli(Args))

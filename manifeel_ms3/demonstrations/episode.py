@@ -1,0 +1,61 @@
+"""Run one episode and keep everything of it."""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from mani_skill.utils import common
+
+from manifeel_ms3.experts import make_expert
+
+from .trajectory_file import Episode
+
+
+def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
+    """Run the demonstrator through one episode."""
+    return run_episode(env, seed, lambda: make_expert(env_id, env.unwrapped, seed).actions())
+
+
+def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarray]]) -> Episode:
+    """Reset with a seed, take the actions (asked for after the reset), and keep observations, states and outcome."""
+    base = env.unwrapped
+    obs, _ = env.reset(seed=seed)
+    observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
+    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[])
+    peak = 0.0
+    for action in actions():
+        action = action.astype(np.float32)
+        obs, _, terminated, truncated, info = env.step(action)
+        observations.append(common.to_numpy(obs))
+        states.append(common.to_numpy(base.get_state_dict()))
+        flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
+        for name, value in (dict(actions=action) | {k: bool(v) for k, v in flags.items()}).items():
+            steps[name].append(value)
+        peak = max(peak, float(info["contact_force"]))
+        if terminated or truncated:
+            break
+    arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}
+    if observations[0]:
+        arrays["obs"] = _stack(observations)
+    arrays["env_states"] = _stack(states)
+    info = dict(
+        reset_kwargs=dict(seed=seed, options={}),
+        control_mode=base.control_mode,
+        elapsed_steps=len(steps["actions"]),
+        success=steps["success"][-1],
+        fail=steps["fail"][-1],
+        peak_contact_force=round(peak, 3),
+    )
+    return Episode(seed, arrays, info)
+
+
+def _stack(trees: list[dict]) -> dict[str, Any]:
+    """A list over time of trees with arrays (1, ...) as one tree with arrays (T, ...)."""
+    first = trees[0]
+    return {
+        key: _stack([tree[key] for tree in trees])
+        if isinstance(first[key], dict)
+        else np.concatenate([tree[key] for tree in trees])
+        for key in first
+    }

@@ -1,0 +1,93 @@
+"""Check a set of demonstrations: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`."""
+
+import json
+import logging
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import tyro
+
+from manifeel_ms3.paths import data_dir
+from manifeel_ms3.progress import progress_bar
+
+from .dataset import describe, read_manifest
+from .replay import replay
+from .trajectory_file import DemonstrationError, open_trajectories, read_header
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Args:
+    folder: tyro.conf.Positional[Path]
+    """with a manifest.json"""
+    replay: int = 0
+    """episodes of each file to play again from their actions"""
+
+
+def validate(folder: Path, num_replays: int = 0) -> list[str]:
+    """What is wrong with a set, a line each; nothing, if it is sound."""
+    problems = []
+    files = read_manifest(folder)["files"]
+    with progress_bar() as bar:
+        for name, entry in bar.track(files.items(), description="checking"):
+            problems += [f"{name}: {problem}" for problem in _problems(Path(folder) / name, entry, num_replays)]
+    return problems
+
+
+def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
+    try:
+        found = describe(path)
+        problems = [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in entry if found[key] != entry[key]]
+        with open_trajectories(path) as file:
+            for episode in read_header(path)["episodes"]:
+                problems += [f"seed {episode['episode_seed']}: {what}" for what in _episode_problems(file, episode)]
+    except (DemonstrationError, KeyError, OSError) as error:
+        return [str(error)]
+    held_out = json.loads((data_dir() / "eval_seeds.json").read_text())[entry["env_id"]]
+    if shared := set(found["seeds"]) & set(held_out):
+        problems.append(f"seeds {sorted(shared)} are evaluation seeds")
+    if len(set(found["seeds"])) < len(found["seeds"]):
+        problems.append("a seed occurs twice")
+    if num_replays:
+        again = replay(path, num_replays)
+        problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in again if r.deviation > 0]
+    return problems
+
+
+def _episode_problems(file: h5py.File, episode: dict[str, Any]) -> list[str]:
+    group, steps = file[f"traj_{episode['episode_id']}"], episode["elapsed_steps"]
+    problems = []
+    if not group["success"][-1]:
+        problems.append("it does not end in success")
+    if np.abs(group["actions"][()]).max() > 1:
+        problems.append("an action is beyond its limits")
+
+    def check(name: str, item: h5py.HLObject) -> None:
+        if not isinstance(item, h5py.Dataset):
+            return
+        expected = steps + 1 if name.startswith(("obs", "env_states")) else steps
+        if len(item) != expected:
+            problems.append(f"{name} has {len(item)} entries instead of {expected}")
+        elif item.dtype.kind == "f" and not np.isfinite(item[()]).all():
+            problems.append(f"{name} holds what is not a number")
+
+    group.visititems(check)
+    return problems
+
+
+def main(args: Args) -> int:
+    problems = validate(args.folder, args.replay)
+    for problem in problems:
+        log.error(problem)
+    log.info("%d problems", len(problems))
+    return int(bool(problems))
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    sys.exit(main(tyro.cli(Args)))

@@ -1,0 +1,170 @@
+"""Parts that are screwed together: an M16 nut and bolt, an E27 bulb and its holder."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from .part import Ball, Box, Cylinder, Hulls, Part, Solid, ring_of_wedges
+from .threads import FLANK, edison, external_mesh, internal_mesh, iso_metric, ridge
+
+
+@dataclass(frozen=True)
+class Screw:
+    """A held part with a thread, and the fixed one that it is screwed onto or into.
+
+    Frames: the held part's on its axis, in the middle of what is held, z up when it is in place; the fixed part's in the middle
+    of its underside, z up. Lengths in m.
+    """
+
+    held: Part
+    fixed: Part
+    grip_width: float
+    """Of what the pads close on."""
+    engaged: float
+    """Height of the held part's origin over the underside of the fixed one where the threads first meet."""
+    pitch: float
+    seated: float
+    """The same height where it is far enough in."""
+    tightening: float
+    """rad to turn it further there."""
+    symmetry: float
+    """rad between grips that are alike."""
+    grip_force: float
+    """N, of each pad."""
+
+
+STEEL, GREASED, GREY = 7800.0, 0.15, (0.70, 0.72, 0.75)
+M16 = iso_metric(0.008, 0.002)
+M16_POINT = 0.006  # m: radius of the flat point (ISO 4753)
+BOLT_FOOT, BOLT_LENGTH = 0.030, 0.024  # m: plate and head; thread
+NUT_ACROSS_FLATS, NUT_HEIGHT, NUT_WALL = 0.024, 0.013, 0.0083  # m; the wall is the ridge's root
+BOLT_TURN = np.deg2rad(-15)  # so that the threads meet soon after the hand begins to turn
+NUT_GAP, NUT_CREST_GAP, NUT_TURNS, NUT_MOUTH = 1e-4, 2e-4, 2.0, 0.0015  # m; the mouth is below the ridge
+NUT_ENGAGED = 0.0018  # m: its middle over the bolt's end, where the ridge's lower end just passes under the end of the crest
+
+
+def hexagon(across_flats: float) -> Callable[[np.ndarray], np.ndarray]:
+    """Radius (n,) of a hexagon, one flat facing y, at angles (n,)."""
+    return lambda angles: across_flats / 2 / np.cos(angles % (np.pi / 3) - np.pi / 6)
+
+
+def m16_bolt() -> Part:
+    """M16 bolt, standing on its head in a plate."""
+    head = ring_of_wedges(12, 0.001, hexagon(NUT_ACROSS_FLATS), 0.020, BOLT_FOOT)
+    shank = external_mesh(M16, BOLT_LENGTH, M16_POINT)
+    shank.apply_transform(trimesh.transformations.rotation_matrix(BOLT_TURN, [0, 0, 1]))
+    shank.apply_translation([0, 0, BOLT_FOOT])
+    plate = Box((0.06, 0.06, 0.02), (0.0, 0.0, 0.01))
+    return Part(
+        "bolt", (plate, Hulls(tuple(head)), Solid(shank)), GREY, friction=GREASED, other_colours={0: (0.25, 0.35, 0.55)}
+    )
+
+
+def m16_nut() -> Part:
+    """Hexagon nut, 24 mm across flats, two turns of ridge in its lower half."""
+    inner, root = M16.minor_radius + NUT_CREST_GAP, NUT_WALL / np.cos(np.pi / 24)
+
+    def half_width(radius: float) -> float:
+        return M16.pitch / 8 + (radius - M16.minor_radius) * FLANK - NUT_GAP
+
+    section = np.array([[r, side * half_width(r)] for r in (inner, root) for side in (-1, 1)])
+    section[:, 1] += NUT_MOUTH + M16.pitch / 2 - NUT_HEIGHT / 2
+    wedges = ring_of_wedges(12, NUT_WALL, hexagon(NUT_ACROSS_FLATS), -NUT_HEIGHT / 2, NUT_HEIGHT / 2)
+    pieces = (*wedges, *ridge(section, M16.pitch, NUT_TURNS, per_turn=24))
+    return Part("nut", (Hulls(pieces),), GREY, density=STEEL, friction=GREASED)
+
+
+def nut_and_bolt() -> Screw:
+    return Screw(
+        held=m16_nut(),
+        fixed=m16_bolt(),
+        grip_width=NUT_ACROSS_FLATS,
+        engaged=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED,
+        pitch=M16.pitch,
+        seated=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED - 1.5 * M16.pitch,
+        tightening=np.deg2rad(40),
+        symmetry=np.deg2rad(60),
+        grip_force=20.0,
+    )
+
+
+# IEC 60061-1: cap 7004-21, holder 7005-20, both in the middle of their tolerances
+E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025)
+E27_GAP = 2.0e-4  # m, radial
+GLASS_RADIUS = 0.030
+CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
+CAP_RIDGE, CAP_TURNS = -0.056, 2.0
+HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
+CONTACT_HEIGHT = 0.012  # m, over the underside
+BORE = (0.018, 0.0285)  # m: the thread's ends
+BORE_TURN = np.deg2rad(-10)  # so that the threads meet soon after the hand begins to turn
+CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.1 N m of the thread
+BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)
+BULB_SEATED = CONTACT_HEIGHT - CAP_TIP
+BULB_TRAVEL = 0.0042  # m down from where the ridge's lower end just passes under the bore's crest
+
+
+def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int = 24) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(corners) / corners
+    return np.concatenate(
+        [np.c_[r * np.cos(angle), r * np.sin(angle), np.full(corners, z)] for r, z in zip(radii, heights, strict=True)]
+    )
+
+
+def e27_bulb() -> Part:
+    """Light bulb: glass, neck, and a cap with two turns of thread, an insulator and a contact at its foot."""
+    core = E27.minor_radius
+    crest = np.array([(radius, height) for height, radius in E27.profile if abs(height) < E27.pitch / 3])
+    section = np.r_[crest, [[core - 5e-4, side * E27.pitch / 4] for side in (-1, 1)]]
+    section[:, 1] += CAP_RIDGE
+    neck = _cone((0.018, core), (-0.024, CAP_TOP))
+    cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, per_turn=36, lead_in=0.25))
+    foot = _cone((core, 0.005), (CAP_FOOT, CAP_TIP + 0.001))
+    tip = Cylinder(0.004, 0.003, (0.0, 0.0, CAP_TIP + 0.0015))
+    return Part(
+        "bulb",
+        (Ball(GLASS_RADIUS), Hulls((neck,)), Hulls(cap), Hulls((foot,)), tip),
+        GLASS,
+        density=400.0,
+        friction=0.2,
+        other_colours={2: GREY, 3: (0.1, 0.1, 0.1), 4: BRASS},
+    )
+
+
+def e27_holder() -> Part:
+    """Lampholder with an inner thread below its rim, and a contact at the bottom."""
+    bore = E27.wider(E27_GAP)
+    thread = internal_mesh(bore, BORE[1] - BORE[0])
+    thread.apply_transform(trimesh.transformations.rotation_matrix(BORE_TURN, [0, 0, 1]))
+    thread.apply_translation([0, 0, BORE[0]])
+
+    def rim(angles: np.ndarray) -> np.ndarray:
+        return np.full_like(angles, HOLDER_RADIUS)
+
+    shell = ring_of_wedges(24, bore.major_radius, rim, 0.0, BORE[1])
+    guide = ring_of_wedges(24, bore.major_radius + 1e-3, rim, BORE[1], HOLDER_HEIGHT)
+    contact = Cylinder(bore.major_radius, CONTACT_HEIGHT, (0.0, 0.0, CONTACT_HEIGHT / 2))
+    return Part(
+        "holder",
+        (Hulls((*shell, *guide)), Solid(thread), contact),
+        (0.16, 0.16, 0.18),
+        friction=0.2,
+        other_colours={1: GREY, 2: BRASS},
+        springs={2: CONTACT_SPRING},
+    )
+
+
+def bulb_and_holder() -> Screw:
+    return Screw(
+        held=e27_bulb(),
+        fixed=e27_holder(),
+        grip_width=2 * GLASS_RADIUS,
+        engaged=BULB_SEATED + BULB_TRAVEL,
+        pitch=E27.pitch,
+        seated=BULB_SEATED,
+        tightening=np.deg2rad(120),
+        symmetry=np.deg2rad(15),
+        grip_force=12.0,
+    )

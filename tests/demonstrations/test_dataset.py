@@ -1,0 +1,125 @@
+"""The full set: two forms of every episode, a manifest, and what finds fault with it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, materialize, record
+from manifeel_ms3.demonstrations.trajectory_file import read_header
+from manifeel_ms3.demonstrations.validate import validate
+from manifeel_ms3.paths import data_dir
+from tests.conftest import PEG, needs_renderer
+
+SEARCH = "ManiFeel-ObjectSearch-v1"
+
+
+def contents(path: Path) -> dict[str, np.ndarray]:
+    out = {}
+    with h5py.File(path) as file:
+        file.visititems(lambda name, item: out.__setitem__(name, item[()]) if isinstance(item, h5py.Dataset) else None)
+    return out
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("set")
+    dataset.main(dataset.Args(out, (PEG,), num=2, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
+    return out
+
+
+def test_states_are_small_and_observations_are_beside_them(folder):
+    states, trajectory = folder / PEG / "states.h5", folder / PEG / "trajectory.h5"
+    assert states.stat().st_size / 2 < 0.5e6
+    bare, full = contents(states), contents(trajectory)
+    assert not any("/obs/" in name for name in bare)
+    assert any(name.endswith("tactile_right/force_field") for name in full)
+    for name, values in bare.items():
+        assert np.array_equal(full[name], values), name
+
+
+def test_manifest_says_what_is_there(folder):
+    files = json.loads((folder / "manifest.json").read_text())["files"]
+    assert set(files) == {f"{PEG}/states.h5", f"{PEG}/trajectory.h5"}
+    for entry in files.values():
+        assert entry["seeds"] == [0, 1]
+        assert entry["success"] == 2
+        assert entry["env_id"] == PEG
+        assert {"mani-skill", "sapien"} <= set(entry["versions"])
+    assert validate(folder, num_replays=1) == []
+
+
+def test_same_command_again_does_nothing(folder):
+    before = (folder / PEG / "trajectory.h5").stat().st_mtime_ns
+    dataset.main(dataset.Args(folder, (PEG,), num=2, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
+    assert (folder / PEG / "trajectory.h5").stat().st_mtime_ns == before
+
+
+def damaged(folder: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(folder, tmp_path / "copy"))
+
+
+def test_a_changed_action_is_found(folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    with h5py.File(copy / PEG / "states.h5", "r+") as file:
+        file["traj_1/actions"][3, 0] = 0.123
+    problems = validate(copy, num_replays=2)
+    assert any("sha256" in problem for problem in problems)
+    assert any("seed 1 does not come out as recorded" in problem for problem in problems)
+    with pytest.raises(DemonstrationError, match="seed 1 .* does not come out as it was recorded"):
+        materialize.main(materialize.Args(copy / PEG / "states.h5", copy / "again.h5", "tacff", ()))
+    with h5py.File(copy / "again.h5") as file:  # what was finished before is kept
+        assert len(file) == 1
+
+
+def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    whole = (copy / PEG / "states.h5").read_bytes()
+    (copy / PEG / "states.h5").write_bytes(whole[: len(whole) // 2])
+    (copy / PEG / "trajectory.h5").unlink()
+    problems = validate(copy)
+    assert any("states.h5" in problem and "truncated" in problem for problem in problems)
+    assert any("trajectory.h5" in problem and "does not exist" in problem for problem in problems)
+
+
+def test_set_without_manifest_says_what_writes_one(tmp_path):
+    with pytest.raises(FileNotFoundError, match="demonstrations.dataset"):
+        validate(tmp_path)
+
+
+def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
+    with pytest.raises(ValueError, match="Juggling"):
+        dataset.main(dataset.Args(tmp_path, ("ManiFeel-Juggling-v1",)))
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda path: type("Usage", (), dict(free=1e6)))
+    with pytest.raises(OSError, match="0.0 GB free"):
+        dataset.main(dataset.Args(tmp_path, (PEG,)))
+    states = folder / PEG / "states.h5"
+    with pytest.raises(ValueError, match="is the file that is read"):
+        materialize.main(materialize.Args(states, states))
+
+
+@needs_renderer
+def test_materialised_observations_are_those_of_the_recording(tmp_path):
+    """Recorded with pictures at once, and recorded without and played again: the same bits."""
+    kwargs = dict(seed=3, cameras=("front",), tactile_sensors=("right",))
+    direct = record.main(record.Args(SEARCH, 1, out=tmp_path / "direct.h5", obs_mode="rgb+tacrgb+tacff", **kwargs))
+    bare = record.main(
+        record.Args(SEARCH, 1, seed=3, out=tmp_path / "bare.h5", obs_mode="none", cameras=(), tactile_sensors=())
+    )
+    again = materialize.main(materialize.Args(bare, tmp_path / "again.h5", cameras=("front",), tactile_sensors=("right",)))
+    first, second = contents(direct), contents(again)
+    assert set(first) == set(second)
+    for name, values in first.items():
+        assert np.array_equal(second[name], values), name
+    assert read_header(direct)["env_info"] == read_header(again)["env_info"]
+
+
+def test_sample_is_sound():
+    """The sample in data/: two episodes of every task."""
+    assert validate(data_dir() / "sample") == []
+    files = json.loads((data_dir() / "sample" / "manifest.json").read_text())["files"]
+    assert {entry["env_id"] for entry in files.values()} == set(dataset.PAPER_COUNTS)
+    assert all(len(entry["seeds"]) == 2 for entry in files.values())

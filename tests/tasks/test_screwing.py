@@ -1,0 +1,93 @@
+"""The screwing tasks: near misses do not count, and what the hand feels is the torque that acts."""
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.structs import Pose
+from scipy.spatial.transform import Rotation
+
+NUT, BULB = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"
+
+
+def goal_with_held_at(env, height: float, offset: float = 0.0, tilt_degrees: float = 0.0, torque: float | None = None) -> bool:
+    """Whether it is the goal with the held part's origin at `height` over the fixed part's underside."""
+    base = env.unwrapped
+    fixed = base.fixed.pose.raw_pose[0, :3].double().numpy()
+    quaternion = Rotation.from_euler("x", tilt_degrees, degrees=True).as_quat()[[3, 0, 1, 2]]
+    place = torch.tensor((fixed + [offset, 0, height])[None]).float()
+    base.held.set_pose(Pose.create_from_pq(place, torch.tensor(quaternion[None]).float()))
+    measures = base.measure()
+    if torque is not None:
+        measures["torque"] = torch.tensor([torque])
+    return bool(base.goal_reached(measures))
+
+
+@pytest.mark.parametrize(
+    ("turns", "offset", "tilt", "goal"),
+    [
+        (1.55, 0.0, 0.0, True),
+        (1.45, 0.0, 0.0, False),  # not far enough
+        (0.0, 0.0, 0.0, False),  # resting on the bolt
+        (-0.5, 0.0, 4.0, False),  # resting on it, askew
+        (1.55, 0.0, 2.5, False),  # not square
+        (1.55, 0.002, 0.0, False),  # beside the axis
+        (20.0, 0.1, 0.0, False),  # on the table
+    ],
+)
+def test_nut_must_be_screwed_on_square(make_env, turns, offset, tilt, goal):
+    env = make_env(NUT, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    screw = env.unwrapped.screw
+    assert goal_with_held_at(env, screw.engaged - turns * screw.pitch, offset, tilt) is goal
+
+
+def test_nut_dropped_on_the_bolt_does_not_reach_the_goal(make_env):
+    """Let go over the bolt, and pushed on it by its weight alone, it stays above where the threads first meet."""
+    env = make_env(NUT, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for yaw in np.linspace(0, 2 * np.pi, 6, endpoint=False):
+        quaternion = torch.tensor(Rotation.from_euler("z", yaw).as_quat()[[3, 0, 1, 2]][None]).float()
+        place = base.fixed.pose.p + torch.tensor([0.0, 0.0, base.screw.engaged + 0.004])
+        base.held.set_pose(Pose.create_from_pq(place, quaternion))
+        base.held.set_linear_velocity(torch.zeros(1, 3))
+        base.held.set_angular_velocity(torch.zeros(1, 3))
+        for _ in range(200):
+            base.scene.step()
+        measures = base.measure()
+        assert not base.goal_reached(measures)
+        assert measures["descent"] < 0.5 * base.screw.pitch
+
+
+@pytest.mark.parametrize(
+    ("gap", "torque", "goal"),
+    [(0.0, 0.15, True), (0.0, 0.05, False), (0.0, 0.0, False), (0.0006, 0.15, False), (0.02, 0.15, False)],
+)
+def test_bulb_must_be_in_and_tight(make_env, gap, torque, goal):
+    env = make_env(BULB, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    assert goal_with_held_at(env, env.unwrapped.screw.seated + gap, torque=torque) is goal
+
+
+@pytest.mark.parametrize("task", [NUT, BULB])
+def test_hand_feels_the_torque_that_acts(make_env, task):
+    """A torque on the held part, in the air, is what the pads report, about the vertical."""
+    env = make_env(task, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    before = float(base.measure()["torque"])
+    for _ in range(240):
+        base.held._bodies[0].add_force_torque([0, 0, 0], [0, 0, 0.05])
+        base.scene.step()
+    assert float(base.measure()["torque"]) - before == pytest.approx(0.05, abs=3e-3)  # the hand resists, clockwise
+
+
+@pytest.mark.parametrize("task", [NUT, BULB])
+def test_held_part_starts_at_rest_in_the_hand(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none")
+    for seed in range(3):
+        _, info = env.reset(seed=seed)
+        base = env.unwrapped
+        assert torch.linalg.norm(base.held.pose.p - base.agent.tcp.pose.p) < 1e-3
+        assert info["tilt"] < np.deg2rad(1)
+        assert torch.linalg.norm(base.fixed.pose.p[0, :2] - torch.tensor([0.5, 0.0])) < 0.05 * np.sqrt(2)
