@@ -22,8 +22,7 @@ def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarr
     base = env.unwrapped
     obs, _ = env.reset(seed=seed)
     observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
-    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[])
-    peak = 0.0
+    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[], contact_force=[])
     for action in actions():
         action = action.astype(np.float32)
         obs, _, terminated, truncated, info = env.step(action)
@@ -32,7 +31,7 @@ def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarr
         flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
         for name, value in (dict(actions=action) | {k: bool(v) for k, v in flags.items()}).items():
             steps[name].append(value)
-        peak = max(peak, float(info["contact_force"]))
+        steps["contact_force"].append(np.float32(float(info["contact_force"])))
         if terminated or truncated:
             break
     arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}
@@ -45,7 +44,7 @@ def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarr
         elapsed_steps=len(steps["actions"]),
         success=steps["success"][-1],
         fail=steps["fail"][-1],
-        peak_contact_force=round(peak, 3),
+        peak_contact_force=round(float(max(steps["contact_force"], default=0.0)), 3),
     )
     return Episode(seed, arrays, info)
 

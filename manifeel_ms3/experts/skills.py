@@ -109,7 +109,7 @@ class Skills:
 
     def move_fingers(self, opening: float, steps: int) -> Actions:
         """Stay, and move the gripper at a steady pace; then give it two steps to come to rest."""
-        start = self.gripper
+        start = self.gripper or 0.0
         for step in range(steps + 2):
             yield from self.set_gripper(start + (opening - start) * min((step + 1) / steps, 1.0), steps=1)
 
