@@ -38,6 +38,26 @@ class ScrewingExpert:
         return Rotation.from_euler("z", self.yaw) * DOWNWARD
 
     def actions(self) -> Actions:
+        if self.env.start == "holder":
+            yield from self._take()
+        else:
+            yield from self._set_down()
+        while True:
+            yield from self._turn(WOUND_UP - SWEEP)
+            yield from self._regrasp()
+
+    def _take(self) -> Actions:
+        """Grasp what sits in its thread already."""
+        skills = self.skills
+        skills.gripper = 1.0
+        place = self.axis + [0, 0, self.screw.engaged]
+        yield from skills.reach(place + [0, 0, CLEAR], self._facing(), tolerance=2e-3)
+        yield from skills.reach(place, self._facing(), tolerance=1.5e-3)
+        yield from skills.move_fingers(self._closed, steps=6)
+        skills.tare()
+
+    def _set_down(self) -> Actions:
+        """Bring the held part over the axis, lower it until it touches, and let it find its place."""
         skills = self.skills
         yield skills.command(*skills.commanded)
         skills.tare()
@@ -46,9 +66,6 @@ class ScrewingExpert:
         yield from skills.reach(over, self._facing(), tolerance=1e-3)
         yield from skills.lower_until_contact(self._facing(), lowest=over[2] - 0.02, speed=0.001)
         yield from self._centre()
-        while True:
-            yield from self._turn(WOUND_UP - SWEEP)
-            yield from self._regrasp()
 
     def _centre(self) -> Actions:
         """Press, and go where the chamfer pushes the part, until it sinks no more."""

@@ -70,10 +70,13 @@ class Skills:
     # ---------------------------------------------------------------- moving
 
     def command(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        """Action (6,), or (7,) with a gripper, that puts the controller's target at a pose, or as near as the limits allow."""
+        """Action (6,), or (7,) with a gripper, that puts the controller's target at a pose, or as near as the limits allow.
+
+        It is shorter where the controller turns about fewer axes.
+        """
         here, facing = self.commanded
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
-        action = np.clip(twist / self._scale, -1.0, 1.0)
+        action = np.clip(twist / self._scale, -1.0, 1.0)[[0, 1, 2, *(3 + axis for axis in self.arm.config.rotation_axes)]]
         return action if self.gripper is None else np.r_[action, self.gripper]
 
     def towards(self, rotation: Rotation, rate: float) -> Rotation:

@@ -1,10 +1,13 @@
 """Things to look for, and what they are hidden in."""
 
-from .part import Box, Part
+import numpy as np
+
+from .part import Box, Cylinder, Hulls, Part, ring_of_wedges
 
 CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004  # m
 CONTAINER_FLOOR = 0.004
 BATTERY_SIZE = 0.025
+BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010  # m, inside; the floor's thickness
 
 
 def container(front_drawn: bool) -> Part:
@@ -31,3 +34,14 @@ def battery() -> Part:
     return Part(
         "battery", (Box((size, size, size)), terminal), (0.12, 0.35, 0.20), density=2000.0, other_colours={1: (0.8, 0.7, 0.3)}
     )
+
+
+def bowl(name: str, colour: tuple[float, float, float]) -> Part:
+    """Round bowl with an upright wall; its frame in the middle of its underside."""
+
+    def rim(angles: np.ndarray) -> np.ndarray:
+        return np.full_like(angles, BOWL_RADIUS + 0.005)
+
+    wall = ring_of_wedges(16, BOWL_RADIUS, rim, 0.0, BOWL_HEIGHT)
+    floor = Cylinder(BOWL_RADIUS, BOWL_FLOOR, (0.0, 0.0, BOWL_FLOOR / 2))
+    return Part(name, (Hulls(tuple(wall)), floor), colour)

@@ -113,6 +113,11 @@ def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int
     )
 
 
+def bulb_yaw(height: float | np.ndarray) -> float | np.ndarray:
+    """rad, of a bulb whose ridge lies in the middle of the holder's groove; `height`, m: of its glass over the underside."""
+    return BORE_TURN + 2 * np.pi * (height + CAP_RIDGE - BORE[0]) / E27.pitch
+
+
 def e27_bulb() -> Part:
     """Light bulb: glass, neck, and a cap with two turns of thread, an insulator and a contact at its foot."""
     core = E27.minor_radius

@@ -9,14 +9,18 @@ from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
+from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
 
-from .placement import start_pose
+from .placement import OUT_OF_REACH, REACH_XY, height_range, start_pose
 from .visuotactile_env import VisuotactileEnv
 
 STAND_XY = (0.5, 0.0)  # m, nominal
 START_XYZ = (0.5, 0.0, 0.17)  # m
 LIFTED = 0.10  # m above its seat
 IN_PLACE = 0.010  # m from its seat
+PAD_END = 0.021  # m under the tool, and some air
+BOWLS = {"golf": ((0.40, 0.19), (0.90, 0.45, 0.10)), "tennis": ((0.40, -0.19), (0.15, 0.35, 0.75))}  # xy, m; orange, blue
+GOALS = ("lift", "bowls")
 
 
 @dataclass
@@ -46,7 +50,9 @@ class BallSortingEnv(VisuotactileEnv):
     - the golf ball is 100 mm or more above its seat
     - the table-tennis ball is in its own (10 mm)
 
-    **Fail Conditions:** a ball lies off the stand.
+    **Fail Conditions:** a ball lies on the table.
+
+    `goal="bowls"` is the paper's task on the real robot: the golf ball goes into an orange bowl and the other into a blue one.
     """
 
     Randomization = Randomization
@@ -54,7 +60,24 @@ class BallSortingEnv(VisuotactileEnv):
     default_control_mode = "pd_ee_delta_pose"
     front_camera_at = (0.80, 0.0, 0.15)
 
+    def __init__(self, *args, goal: str = "lift", **kwargs):
+        if goal not in GOALS:
+            raise ValueError(f"goal={goal!r} is unknown; choose from {list(GOALS)}")
+        self.goal = goal
+        super().__init__(*args, **kwargs)
+
+    def _largest_ranges(self):
+        lowest = SEAT_HEIGHT + BALL_RADIUS + PAD_END
+        return dict(
+            stand_xy=(REACH_XY - SEAT_SPACING / 2, OUT_OF_REACH),
+            start_xy=(REACH_XY, OUT_OF_REACH),
+            start_z=(height_range(START_XYZ[2], lowest), "the fingers would start in the balls, or out of reach"),
+        )
+
     def _load_task(self):
+        if self.goal == "bowls":
+            for name, ((x, y), colour) in BOWLS.items():
+                bowl(f"{name}_bowl", colour).build(self.scene, "static", sapien.Pose([x, y, 0]))
         self.stand = ball_stand().build(self.scene, "kinematic", sapien.Pose([*STAND_XY, 0]))
         self.golf = golf_ball().build(self.scene, "dynamic", sapien.Pose([0.45, 0, 0.1]))
         self.tennis = tennis_ball().build(self.scene, "dynamic", sapien.Pose([0.55, 0, 0.1]))
@@ -85,9 +108,16 @@ class BallSortingEnv(VisuotactileEnv):
         return dict(
             golf_height=self.golf.pose.p[:, 2] - golf_seat[:, 2],  # m, over its seat
             tennis_away=torch.linalg.norm(self.tennis.pose.p - tennis_seat, dim=1),  # m, from its seat
-        )
+        ) | {f"{name}_to_bowl": self._to_bowl(name) for name in BOWLS if self.goal == "bowls"}
+
+    def _to_bowl(self, ball: str) -> torch.Tensor:
+        """Distance (N,), m, of a ball from where it would lie in the middle of its bowl."""
+        middle = torch.tensor([*BOWLS[ball][0], BOWL_FLOOR + BALL_RADIUS], device=self.device)
+        return torch.linalg.norm(getattr(self, ball).pose.p - middle, dim=1)
 
     def goal_reached(self, measures):
+        if self.goal == "bowls":
+            return (measures["golf_to_bowl"] < BOWL_RADIUS) & (measures["tennis_to_bowl"] < BOWL_RADIUS)
         return (measures["golf_height"] > LIFTED) & (measures["tennis_away"] < IN_PLACE)
 
     def failed(self, measures):
@@ -98,7 +128,13 @@ class BallSortingEnv(VisuotactileEnv):
         return dict(golf_pose=self.golf.pose.raw_pose, tennis_pose=self.tennis.pose.raw_pose)
 
     def compute_dense_reward(self, obs, action, info):
-        """In [0, 4]: 1 for reaching the golf ball, 1 for lifting it, 1 for leaving the other, 1 for success."""
+        """In [0, 4]: 1 for reaching the golf ball, 1 for lifting it, 1 for leaving the other, 1 for success.
+
+        With bowls: 1.5 for each ball's way to its own, 1 for success.
+        """
+        if self.goal == "bowls":
+            near = [1 - torch.tanh(4 * info[f"{name}_to_bowl"]) for name in BOWLS]
+            return 1.5 * (near[0] + near[1]) + info["success"].float()
         reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.golf.pose.p, dim=1))
         lifted = (info["golf_height"] / LIFTED).clamp(0.0, 1.0)
         return reach + lifted + (info["tennis_away"] < IN_PLACE).float() + info["success"].float()

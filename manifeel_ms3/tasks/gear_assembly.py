@@ -1,8 +1,10 @@
 """ManiFeel-GearAssembly-v1"""
 
+from dataclasses import dataclass
+
 import sapien
 import torch
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_apply
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
@@ -10,9 +12,18 @@ from manifeel_ms3.geometry import gear_fit
 from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
 
 from .insertion import SOCKET_XY, InsertionEnv
+from .insertion import Randomization as InsertionRandomization
 
 NEIGHBOURS = ("small", "large")
 ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
+
+
+@dataclass
+class Randomization(InsertionRandomization):
+    """Half ranges of the uniform distributions; the defaults are the paper's, of its simulation."""
+
+    base_yaw: float = 0.0
+    """rad, of the base about the vertical"""
 
 
 @register_env("ManiFeel-GearAssembly-v1", max_episode_steps=300)
@@ -23,7 +34,8 @@ class GearAssemblyEnv(InsertionEnv):
     base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
-    - base: xy +-50 mm around (0.5, 0) m; the neighbours are turned at random
+    - base: xy +-50 mm around (0.5, 0) m; the neighbours are turned at random; `base_yaw`, 0 by default, turns the base in its
+      plane, as the paper does on the real robot
     - gripper start: 200 mm above the table, xy +-100 mm, z +-50 mm, +-0.1 rad about each axis
     - gear in hand: pitch about the closing axis +-10 degrees
 
@@ -34,6 +46,7 @@ class GearAssemblyEnv(InsertionEnv):
     **Fail Conditions:** the gear has left the grip (30 mm).
     """
 
+    Randomization = Randomization
     fit = gear_fit()
     max_gap = 1.0e-3
     lift = 0.05
@@ -47,17 +60,22 @@ class GearAssemblyEnv(InsertionEnv):
             for name in NEIGHBOURS
         }
 
+    def _largest_ranges(self):
+        return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is all the way round"))
+
     def _initialize_task(self, env_idx: torch.Tensor):
         super()._initialize_task(env_idx)
         n = len(env_idx)
+        if self.randomization.base_yaw > 0:
+            turned = _random_yaw(n, self.randomization.base_yaw)
+            self.socket.set_pose(Pose.create_from_pq(self.socket.pose.p[env_idx], turned))
         for name, actor in self.neighbours.items():
-            turn = torch.zeros(n, 3)
-            turn[:, 2] = (2 * torch.rand(n) - 1) * torch.pi
-            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], axis_angle_to_quaternion(turn)))
+            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], _random_yaw(n, torch.pi)))
 
     def _place_of(self, neighbour: str) -> torch.Tensor:
         """Where a neighbour belongs, (N, 3), m."""
-        return self.socket.pose.p + torch.tensor([SHAFT_X[neighbour], 0.0, BASE_SIZE[2]], device=self.device)
+        place = torch.tensor([SHAFT_X[neighbour], 0.0, BASE_SIZE[2]], device=self.device).expand(self.num_envs, 3)
+        return self.socket.pose.p + quaternion_apply(self.socket.pose.q, place)
 
     def measure(self) -> dict[str, torch.Tensor]:
         off = [torch.linalg.norm(actor.pose.p - self._place_of(name), dim=1) for name, actor in self.neighbours.items()]
@@ -68,3 +86,10 @@ class GearAssemblyEnv(InsertionEnv):
 
     def _privileged_state(self):
         return super()._privileged_state() | {f"{name}_gear_pose": a.pose.raw_pose for name, a in self.neighbours.items()}
+
+
+def _random_yaw(n: int, half_range: float) -> torch.Tensor:
+    """Quaternions (n, 4), turned about the vertical."""
+    turn = torch.zeros(n, 3)
+    turn[:, 2] = (2 * torch.rand(n) - 1) * half_range
+    return axis_angle_to_quaternion(turn)

@@ -10,7 +10,7 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Fit
 
-from .placement import start_pose
+from .placement import OUT_OF_REACH, REACH_XY, height_range, start_pose
 from .visuotactile_env import VisuotactileEnv
 
 SOCKET_XY = (0.5, 0.0)  # m, nominal
@@ -19,6 +19,8 @@ GRIP_FORCE = 20.0  # N
 GRIP_INDENTATION = 6e-4  # m: each gel under the grip of 20 N (four contact points of 8 kN/m)
 MAX_TILT = np.deg2rad(3.0)
 LOST = 0.03  # m between plug and where it was held
+CLEAR = 0.010  # m over the socket, of a plug at the start
+MAX_ROTATION, MAX_PITCH = 0.4, 0.8  # rad
 BESIDE = 0.005  # m off the axis: lower is not better there
 
 
@@ -33,7 +35,7 @@ class Randomization:
     start_z: float = 0.05
     """m"""
     start_rotation: float = 0.1
-    """rad, about each axis of the base"""
+    """rad, about each axis of the robot's base"""
     in_hand_pitch: float = float(np.deg2rad(10))
     """rad, of the plug about the closing axis"""
 
@@ -49,6 +51,16 @@ class InsertionEnv(VisuotactileEnv):
     fit: Fit
     max_gap: float
     lift: float = 0.0
+
+    def _largest_ranges(self):
+        lowest = self.fit.rim + CLEAR + self.fit.reach - self.fit.grip
+        return dict(
+            socket_xy=(REACH_XY, OUT_OF_REACH),
+            start_xy=(REACH_XY, OUT_OF_REACH),
+            start_z=(height_range(START_XYZ[2] + self.lift, lowest), "the plug would start in the socket, or out of reach"),
+            start_rotation=(MAX_ROTATION, "the hand would reach the table, or the end of a joint"),
+            in_hand_pitch=(MAX_PITCH, "the plug would lie across the fingers"),
+        )
 
     def _load_task(self):
         self.plug = self.fit.plug.build(self.scene, "dynamic", sapien.Pose([0.5, 0, 0.3], [0, 1, 0, 0]))

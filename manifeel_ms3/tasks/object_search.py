@@ -7,14 +7,15 @@ import torch
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
-from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR, battery, container
+from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR, CONTAINER_OUTER, CONTAINER_WALL, battery, container
 
-from .placement import start_pose
+from .placement import height_range, start_pose
 from .visuotactile_env import VisuotactileEnv
 
 CONTAINER_XY = (0.5, 0.0)  # m
 PLACES_X = (-0.075, 0.075)  # m from the container's middle
 START_XYZ = (0.5, 0.0, 0.23)  # m
+HAND, LOWEST = 0.08, 0.07  # m: half of the hand's width; of the tool over the table, clear of the battery
 LIFTED = 0.10  # m above where it lies
 
 
@@ -54,6 +55,15 @@ class ObjectSearchEnv(VisuotactileEnv):
     default_control_mode = "pd_ee_delta_pose"
     has_occluder = True
     front_camera_at = (0.80, 0.0, 0.15)
+
+    def _largest_ranges(self):
+        to_wall = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - PLACES_X[1] - BATTERY_SIZE / 2
+        to_hand = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - HAND
+        return dict(
+            place_xy=(to_wall, "the battery would start in the container's wall"),
+            start_xy=(to_hand, "the hand would start in the container's wall"),
+            start_z=(height_range(START_XYZ[2], LOWEST), "the fingers would start in the battery, or out of reach"),
+        )
 
     def _load_task(self):
         self.container = container(self.occlusion).build(self.scene, "static", sapien.Pose([*CONTAINER_XY, 0]))

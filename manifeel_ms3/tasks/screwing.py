@@ -10,12 +10,14 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Screw
 
-from .placement import start_pose
+from .placement import height_range, start_pose
 from .visuotactile_env import VisuotactileEnv
 
 FIXED_XY = (0.5, 0.0)  # m, nominal
 START_Z = 0.15  # m
 WOUND_UP = np.deg2rad(200)  # about the vertical, that the hand starts turned by: near the end of its joint
+MAX_XY, CLEAR = 0.07, 0.02  # m; m over where the threads first meet
+WRIST_END = "further out the wrist comes to its end"
 LOST = 0.05  # m from the hand, and
 OFF_AXIS = 0.004  # m from the axis
 
@@ -42,6 +44,16 @@ class ScrewingEnv(VisuotactileEnv):
     default_control_mode = "pd_ee_delta_pose"
     screw: Screw
     grip_indentation: float
+    start = "hand"
+    """where the held part is at the start: in the hand, or already in the "holder"."""
+
+    def _largest_ranges(self):
+        lowest = self.screw.engaged + CLEAR
+        return dict(
+            fixed_xy=(MAX_XY, WRIST_END),
+            start_xy=(MAX_XY, WRIST_END),
+            start_z=(height_range(START_Z, lowest), "the threads would start in each other, or out of reach"),
+        )
 
     @property
     def _default_sim_config(self):
@@ -59,12 +71,18 @@ class ScrewingEnv(VisuotactileEnv):
         fixed = torch.tensor([*FIXED_XY, 0.0]).repeat(n, 1)
         fixed[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.fixed_xy
         self.fixed.set_pose(Pose.create_from_pq(fixed))
-        start = start_pose(n, (*FIXED_XY, START_Z), (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
+        opening = self.screw.grip_width / 2 - self.grip_indentation
+        start = self._start_tool(env_idx, START_Z, opening, self.screw.grip_force)
+        self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([[0.0, 1.0, 0.0, 0.0]])))
+
+    def _start_tool(self, env_idx: torch.Tensor, height: float, opening: float, grip_force: float) -> Pose:
+        """Put the wound-up tool at a random start around a height, and return where."""
+        n, ranges = len(env_idx), self.randomization
+        start = start_pose(n, (*FIXED_XY, height), (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
         wound = axis_angle_to_quaternion(torch.tensor([[0.0, 0.0, WOUND_UP]])).expand(n, 4)
         start = Pose.create_from_pq(start.p, quaternion_multiply(wound, start.q))
-        opening = self.screw.grip_width / 2 - self.grip_indentation
-        self.agent.reset_tool(start, opening, self.screw.grip_force, wrist_turn=-WOUND_UP)
-        self.held.set_pose(Pose.create_from_pq(start.p, wound))
+        self.agent.reset_tool(start, opening, grip_force, wrist_turn=-WOUND_UP)
+        return start
 
     def measure(self) -> dict[str, torch.Tensor]:
         held = self.fixed.pose.inv() * self.held.pose

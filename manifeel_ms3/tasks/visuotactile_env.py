@@ -115,6 +115,9 @@ class VisuotactileEnv(BaseEnv):
                 raise ValueError(f"randomization[{name!r}] is unknown for {type(self).__name__}; known: {list(known)}")
             if not (np.isscalar(value) and np.isfinite(value) and value >= 0):
                 raise ValueError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
+            limit, reason = self._largest_ranges().get(name, (np.inf, ""))
+            if value > limit:
+                raise ValueError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
         return self.Randomization(**overrides)
 
     @staticmethod
@@ -128,6 +131,10 @@ class VisuotactileEnv(BaseEnv):
         return self._full_obs_mode
 
     # ---------------------------------------------------------------- for tasks to define
+
+    def _largest_ranges(self) -> dict[str, tuple[float, str]]:
+        """For fields of `Randomization`: the largest half range that can be played, and what happens beyond."""
+        return {}
 
     def _load_task(self) -> None:
         """Build the task's parts."""
