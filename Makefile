@@ -1,5 +1,6 @@
 # make demo: from an empty machine to a trained visuotactile policy and its report. make test: the whole test suite.
-# Both install what is missing first, and do again only what is out of date.
+# make data: the paper's number of demonstrations of every task, hours of work; it goes on where it was stopped.
+# All install what is missing first, and do again only what is out of date.
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 RUN := runs/demo
@@ -8,8 +9,9 @@ TASK := ManiFeel-PegInsertion-v1
 # the loose fit, and half ranges that a small network can learn from 120 demonstrations in minutes; the report states them
 TASK_ARGS := {"fit": "loose", "randomization": {"socket_xy": 0.01, "start_xy": 0.02, "start_z": 0.02, "start_rotation": 0.05, "in_hand_pitch": 0.09}}
 READY := .venv/.ready
+WORKERS := $(shell nproc)
 
-.PHONY: setup demo test lint types
+.PHONY: setup demo data test lint types
 setup: $(READY)
 
 $(READY): pyproject.toml scripts/setup.sh
@@ -34,6 +36,9 @@ $(RUN)/evaluation.json: $(RUN)/.trained
 
 $(RUN)/report.html: $(RUN)/evaluation.json
 	$(PYTHON) -m manifeel_ms3.evaluation.report --run-dir $(RUN)
+
+data: $(READY)
+	$(PYTHON) -m manifeel_ms3.demonstrations.dataset --workers $(WORKERS) --out data/demos
 
 test: $(READY)
 	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile

@@ -10,9 +10,9 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
-import h5py
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
@@ -28,6 +28,7 @@ FOLDS = 5
 COMPONENTS = 64  # principal components of the features that a probe sees
 GRID, SCALES = 16, (1.0, 2.0, 4.0, 8.0)  # cells a side; pixels
 TOUCHES, FREE = 1.5, 0.5  # N: of a held part on the world
+Recorded = Any  # an episode's group in a trajectory file
 Samples = Iterator[tuple[int, float]]
 
 
@@ -40,42 +41,42 @@ class Question:
 
     name: str
     env_id: str
-    samples: Callable[[h5py.Group], Samples]
+    samples: Callable[[Recorded], Samples]
     unit: str = ""
     """of a number to estimate; "" where the answer is one of two classes"""
 
 
-def _position(episode: h5py.Group, name: str) -> np.ndarray:
+def _position(episode: Recorded, name: str) -> np.ndarray:
     return episode[f"env_states/actors/{name}"][:, :3]
 
 
-def _closings(episode: h5py.Group) -> list[int]:
+def _closings(episode: Recorded) -> list[int]:
     """Observations at which the fingers have just closed."""
     closed = episode["actions"][:, -1] < 0.5
     starts = np.flatnonzero(closed & ~np.r_[False, closed[:-1]])
     return [int(start) + 6 for start in starts if start + 6 < len(closed)]
 
 
-def _which_ball(episode: h5py.Group) -> Samples:
+def _which_ball(episode: Recorded) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
     for t in _closings(episode)[:1]:  # the first guess is right as often as wrong
         away = [np.linalg.norm(_position(episode, f"{ball}_ball")[t] - tool[t]) for ball in ("golf", "tennis")]
         yield t, float(away[0] < away[1])
 
 
-def _battery_place(episode: h5py.Group) -> Samples:
+def _battery_place(episode: Recorded) -> Samples:
     far = float(_position(episode, "battery")[0, 0] > CONTAINER_XY[0])
     for t in (1, 4, 7):
         yield t, far
 
 
-def _battery_in_hand(episode: h5py.Group) -> Samples:
+def _battery_in_hand(episode: Recorded) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
     for t in _closings(episode)[:1]:
         yield t, float(np.linalg.norm((_position(episode, "battery")[t] - tool[t])[:2]) < 0.04)
 
 
-def _pitch_in_hand(episode: h5py.Group) -> Samples:
+def _pitch_in_hand(episode: Recorded) -> Samples:
     (name,) = [name for name in episode["env_states/actors"] if name.endswith("peg")]
     plug = episode[f"env_states/actors/{name}"][:, 3:7]
     tool = episode["obs/extra/tcp_pose"][:, 3:7]
@@ -84,24 +85,24 @@ def _pitch_in_hand(episode: h5py.Group) -> Samples:
         yield t, float(np.rad2deg(held.as_rotvec()[1]))
 
 
-def _in_contact(episode: h5py.Group) -> Samples:
+def _in_contact(episode: Recorded) -> Samples:
     force = episode["contact_force"][()]
     for t in range(0, len(force), 4):
         if force[t] > TOUCHES or force[t] < FREE:
             yield t + 1, float(force[t] > TOUCHES)
 
 
-def _descent(episode: h5py.Group, held: str, fixed: str, engaged: float) -> np.ndarray:
+def _descent(episode: Recorded, held: str, fixed: str, engaged: float) -> np.ndarray:
     return engaged - (_position(episode, held)[:, 2] - _position(episode, fixed)[:, 2])
 
 
-def _touching(episode: h5py.Group, every: int) -> Iterator[int]:
+def _touching(episode: Recorded, every: int) -> Iterator[int]:
     """Observations of a held part that touches the world."""
     force = episode["contact_force"][()]
     return (t + 1 for t in range(0, len(force), every) if force[t] > TOUCHES)
 
 
-def _thread_engaged(episode: h5py.Group) -> Samples:
+def _thread_engaged(episode: Recorded) -> Samples:
     screw = nut_and_bolt()
     descent = _descent(episode, "nut", "bolt", screw.engaged)
     for t in _touching(episode, 4):
@@ -109,7 +110,7 @@ def _thread_engaged(episode: h5py.Group) -> Samples:
             yield t, float(descent[t] > 0)
 
 
-def _tightened(episode: h5py.Group) -> Samples:
+def _tightened(episode: Recorded) -> Samples:
     screw = bulb_and_holder()
     gap = screw.engaged - screw.seated - _descent(episode, "bulb", "holder", screw.engaged)
     for t in _touching(episode, 3):
@@ -146,7 +147,7 @@ def image_features(image: np.ndarray) -> np.ndarray:
     return np.concatenate([pooled(picture), *(pooled(band) for band in bands)])
 
 
-def _features(episode: h5py.Group, modality: str, t: int) -> np.ndarray:
+def _features(episode: Recorded, modality: str, t: int) -> np.ndarray:
     sensors = episode["obs/sensor_data"]
     pads = [name for name in sensors if name.startswith("tactile_")]
     cameras = [name for name in sensors if name not in pads]
@@ -199,6 +200,10 @@ def ask(question: Question, path: Path) -> list[Answer]:
                         raise DemonstrationError(
                             f"{path} lacks {modality} ({error}); record it with obs_mode rgb+tacrgb+tacff, a camera and a pad"
                         ) from error
+    if len(set(groups)) < 2 * FOLDS:
+        raise DemonstrationError(
+            f"{path}: {len(set(groups))} episodes answer {question.name!r}, {2 * FOLDS} are needed; record more"
+        )
     truth, episodes = np.array(answers), np.array(groups)
     out = []
     for modality, rows in features.items():

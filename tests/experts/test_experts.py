@@ -49,6 +49,38 @@ def test_every_expert_succeeds_gently(make_env, task):
         gentle_success(env, task, seed)
 
 
+@pytest.mark.parametrize(
+    ("task", "variant"),
+    [
+        ("ManiFeel-BallSorting-v1", dict(goal="bowls")),
+        ("ManiFeel-BulbInstallation-v1", dict(start="holder")),
+        ("ManiFeel-GearAssembly-v1", dict(randomization=dict(base_yaw=0.3))),
+    ],
+)
+def test_variants_of_the_real_robot_are_demonstrated(make_env, task, variant):
+    env = make_env(task, obs_mode="none", render_backend="none", **variant)
+    gentle_success(env, task, 0)
+    assert env.action_space.shape == ((5,) if variant.get("start") == "holder" else env.unwrapped.action_space.shape)
+
+
+def test_screwing_regrasps_and_stops_when_it_is_tight(make_env):
+    """The bulb is let go of, and turned until the pads feel the torque, not for a set number of turns."""
+    task = "ManiFeel-BulbInstallation-v1"
+    env = make_env(task, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    openings, torques = [], []
+    for action in make_expert(task, env.unwrapped, 0).actions():
+        *_, terminated, truncated, info = env.step(action)
+        openings.append(action[-1])
+        torques.append(float(info["torque"]))
+        if terminated or truncated:
+            break
+    assert info["success"].all()
+    assert max(openings) > 0.5  # let go
+    assert np.median(np.abs(torques[:-60])) < 0.02
+    assert min(torques[-5:]) > 0.1
+
+
 def test_search_goes_to_the_other_place_when_it_feels_nothing(make_env):
     env = make_env("ManiFeel-ObjectSearch-v1", obs_mode="none", render_backend="none")
     visited = []

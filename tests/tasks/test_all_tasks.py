@@ -60,3 +60,26 @@ def test_task_says_what_it_is(task):
     cls = text if isinstance(text, type) else None
     doc = (cls or gym.make(task, obs_mode="none", render_backend="none").unwrapped.__class__).__doc__
     assert "at 5 % of the light" in doc or all(h in doc for h in ("Task Description", "Randomizations", "Success Conditions"))
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_ranges_as_large_as_allowed_give_sound_starts(make_env, task):
+    """At the limits nothing lies in anything else, and the hand is where it is to start."""
+    cls = gym.make(task, obs_mode="none", render_backend="none").unwrapped
+    limits = {name: 0.999 * limit for name, (limit, _) in cls._largest_ranges().items()}
+    assert set(limits) == set(cls.Randomization.__dataclass_fields__)
+    env = make_env(task, obs_mode="none", render_backend="none", randomization=limits)
+    for seed in range(6):
+        env.reset(seed=seed)
+        *_, info = env.step(np.zeros(env.action_space.shape))
+        assert not info["fail"].any(), seed
+        assert float(info["contact_force"]) < 8.0, seed
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_ranges_that_cannot_be_played_are_refused_at_construction(make_env, task):
+    cls = gym.make(task, obs_mode="none", render_backend="none").unwrapped
+    for name, (limit, reason) in cls._largest_ranges().items():
+        with pytest.raises(ValueError, match=name) as error:
+            make_env(task, obs_mode="none", render_backend="none", randomization={name: 1.01 * limit})
+        assert reason in str(error.value)

@@ -6,6 +6,7 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
+from manifeel_ms3.tasks.ball_sorting import BOWLS
 from tests.conftest import needs_renderer
 
 SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
@@ -82,3 +83,24 @@ def test_front_camera_cannot_see_into_the_container_unless_its_front_is_left_out
             base.battery.set_pose(Pose.create_from_pq(torch.tensor([[x, 0.0, 0.0165]])))
             pictures.append(base.get_obs()["sensor_data"]["front"]["rgb"].int())
         assert bool((pictures[0] != pictures[1]).any()) is not occlusion
+
+
+@pytest.mark.parametrize(
+    ("golf", "tennis", "goal"), [("golf", "tennis", True), ("tennis", "golf", False), ("golf", None, False)]
+)
+def test_each_ball_belongs_in_its_own_bowl(make_env, golf, tennis, goal):
+    env = make_env(SORTING, obs_mode="none", render_backend="none", goal="bowls")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for ball, place in ((base.golf, golf), (base.tennis, tennis)):
+        if place:
+            ball.set_pose(Pose.create_from_pq(torch.tensor([[*BOWLS[place][0], 0.05]])))
+    for _ in range(200):
+        base.scene.step()
+    assert bool(base.goal_reached(base.measure())) is goal
+    assert not base.failed(base.measure()).any()
+
+
+def test_unknown_goal_is_refused(make_env):
+    with pytest.raises(ValueError, match="goal='basket'"):
+        make_env(SORTING, obs_mode="none", render_backend="none", goal="basket")

@@ -91,3 +91,17 @@ def test_held_part_starts_at_rest_in_the_hand(make_env, task):
         assert torch.linalg.norm(base.held.pose.p - base.agent.tcp.pose.p) < 1e-3
         assert info["tilt"] < np.deg2rad(1)
         assert torch.linalg.norm(base.fixed.pose.p[0, :2] - torch.tensor([0.5, 0.0])) < 0.05 * np.sqrt(2)
+
+
+def test_bulb_may_start_in_its_holder_at_a_random_depth(make_env):
+    env = make_env(BULB, obs_mode="none", render_backend="none", start="holder")
+    depths = []
+    for seed in range(8):
+        _, info = env.reset(seed=seed)
+        depths.append(float(info["descent"]))
+        assert info["tilt"] < np.deg2rad(4)
+        assert not info["fail"].any()
+    assert max(depths) - min(depths) > 1e-3
+    assert 0.7e-3 < min(depths) < max(depths) < 3.9e-3  # the thread's play is half a millimetre
+    with pytest.raises(ValueError, match="start='drawer'"):
+        make_env(BULB, obs_mode="none", render_backend="none", start="drawer")
