@@ -7,7 +7,7 @@ from manifeel_ms3.geometry.balls import SEAT_HEIGHT, SEAT_SPACING
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
 from manifeel_ms3.tasks.ball_sorting import BOWLS, BallSortingEnv
 
-from .skills import DOWNWARD, SIGHT_ERROR, Actions, Skills
+from .skills import DOWNWARD, Actions, Skills, seen
 
 GRASP_ABOVE = 0.004  # m over the ball's middle, clear of the stand
 OVER = 0.075  # m over the ball's middle
@@ -26,8 +26,7 @@ class BallSortingExpert:
         self.skills = Skills(env)
         self.skills.gripper = 1.0
         self.guess = int(rng.integers(2))
-        stand = env.stand.pose.raw_pose[0, :3].cpu().numpy().astype(np.float64)
-        self.stand = stand + np.r_[rng.uniform(-1, 1, 2) * SIGHT_ERROR, 0.0]
+        self.stand = seen(env.stand, rng)
         self._pad = TactileSensor(gelsight_r15("feel", "gel_right"), env.scene, env.agent.robot, ("rgb",))
         self._untouched = self._look()
 

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.insertion import InsertionEnv
 
-from .skills import DOWNWARD, SIGHT_ERROR, Actions, Skills
+from .skills import DOWNWARD, Actions, Skills, seen
 
 GRASP_ERROR = np.deg2rad(0.5)  # how well TacRGB shows the plug's pitch in the hand
 HOVER = 0.010  # m above the socket
@@ -53,9 +53,7 @@ class InsertionExpert:
 
     def _look(self) -> None:
         """See where the socket is, a little off."""
-        angle, radius = self._rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(self._rng.uniform())
-        socket = self.env.socket.pose.raw_pose[0, :3].cpu().numpy().astype(np.float64)
-        self.socket = socket + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+        self.socket = seen(self.env.socket, self._rng)
 
     # ---------------------------------------------------------------- the plug in the hand
 

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.screwing import WOUND_UP, ScrewingEnv
 
-from .skills import DOWNWARD, SIGHT_ERROR, Actions, Skills
+from .skills import DOWNWARD, Actions, Skills, seen
 
 HOVER, CLEAR = 0.010, 0.020  # m over where the threads meet: where it begins to feel its way; where it may move sideways
 SWEEP = np.deg2rad(310)  # that the wrist has
@@ -23,15 +23,12 @@ class ScrewingExpert:
     """Knows the parts, sees roughly where the axis is, and goes by the loads that the pads feel."""
 
     def __init__(self, env: ScrewingEnv, seed: int):
-        rng = np.random.default_rng([seed, 17])
         self.env, self.screw = env, env.screw
         self.skills = Skills(env)
         self._closed = self.skills.grip_action(self.screw.grip_width, self.screw.grip_force)
         self._open = self.skills.finger_action(self.screw.grip_width / 2 + OPEN_BY)
         self.skills.gripper = self._closed
-        angle, radius = rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(rng.uniform())
-        fixed = env.fixed.pose.raw_pose[0, :3].cpu().numpy().astype(np.float64)
-        self.axis = fixed + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+        self.axis = seen(env.fixed, np.random.default_rng([seed, 17]))
         self.yaw = WOUND_UP
 
     def _facing(self) -> Rotation:
@@ -94,7 +91,6 @@ class ScrewingExpert:
 
     def _torque(self) -> float:
         """What the hand turns with, N m, clockwise, as the pads feel it."""
-        tool, _ = self.skills.tool
         return -float(self.env.agent.torque_on_held(self.env.agent.tcp.pose.p)[0])
 
     def _height(self) -> float:

@@ -7,6 +7,7 @@ does, within the same limits, and feels through the pads: the load it acts on is
 from collections.abc import Iterator
 
 import numpy as np
+from mani_skill.utils.structs import Actor
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks import VisuotactileEnv
@@ -140,6 +141,13 @@ class Skills:
             if self.load[2] > threshold or tool[2] < lowest:
                 return
             yield self.command(here - [0.0, 0.0, speed], rotation)
+
+
+def seen(actor: Actor, rng: np.random.Generator) -> np.ndarray:
+    """Where a thing seems to be, (3,), m, base frame: up to SIGHT_ERROR off, to any side."""
+    angle, radius = rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(rng.uniform())
+    position, _ = _position_rotation(actor.pose.raw_pose)
+    return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _position_rotation(raw_pose) -> tuple[np.ndarray, Rotation]:

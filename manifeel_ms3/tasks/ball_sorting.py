@@ -139,9 +139,6 @@ class BallSortingEnv(VisuotactileEnv):
         lifted = (info["golf_height"] / LIFTED).clamp(0.0, 1.0)
         return reach + lifted + (info["tennis_away"] < IN_PLACE).float() + info["success"].float()
 
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 4.0
-
 
 @register_env("ManiFeel-BallSortingDim-v1", max_episode_steps=400)
 class BallSortingDimEnv(BallSortingEnv):

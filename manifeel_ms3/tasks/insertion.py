@@ -114,6 +114,3 @@ class InsertionEnv(VisuotactileEnv):
         upright = near * (1 - torch.tanh(10 * info["tilt"]))
         inserted = ((depth - info["gap"]) / (depth - self.max_gap)).clamp(0.0, 1.0)
         return near + upright + inserted * (info["offset"] < BESIDE).float() + info["success"].float()
-
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 4.0

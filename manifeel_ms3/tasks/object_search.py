@@ -54,6 +54,7 @@ class ObjectSearchEnv(VisuotactileEnv):
     policy_cameras = ("front",)
     default_control_mode = "pd_ee_delta_pose"
     has_occluder = True
+    max_reward = 3.0
     front_camera_at = (0.80, 0.0, 0.15)
 
     def _largest_ranges(self):
@@ -101,6 +102,3 @@ class ObjectSearchEnv(VisuotactileEnv):
         """In [0, 3]: 1 for reaching the battery, 1 for lifting it, 1 for success."""
         reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.battery.pose.p, dim=1))
         return reach + (info["height"] / LIFTED).clamp(0.0, 1.0) + info["success"].float()
-
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 3.0

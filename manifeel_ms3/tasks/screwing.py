@@ -107,6 +107,3 @@ class ScrewingEnv(VisuotactileEnv):
         upright = near * (1 - torch.tanh(10 * info["tilt"]))
         deep = (info["descent"] / (self.screw.engaged - self.screw.seated)).clamp(0.0, 1.0)
         return near + upright + deep * (info["offset"] < OFF_AXIS).float() + info["success"].float()
-
-    def compute_normalized_dense_reward(self, obs, action, info):
-        return self.compute_dense_reward(obs, action, info) / 4.0

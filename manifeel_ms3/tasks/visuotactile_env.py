@@ -65,6 +65,8 @@ class VisuotactileEnv(BaseEnv):
     policy_cameras: tuple[str, ...] = ("wrist",)
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
+    max_reward = 4.0
+    """Of the dense reward."""
     front_camera_at = (0.68, 0.0, 0.15)  # m
     agent: PandaGelSight
 
@@ -159,6 +161,9 @@ class VisuotactileEnv(BaseEnv):
     def _privileged_state(self) -> dict[str, torch.Tensor]:
         """What the state modes hold of the task's parts."""
         raise NotImplementedError
+
+    def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        return self.compute_dense_reward(obs, action, info) / self.max_reward
 
     # ---------------------------------------------------------------- scene
 

@@ -1,0 +1,65 @@
+"""How fast each task is simulated: `python benchmarks/physics_speed.py`.
+
+Plays the sample demonstrations again, contacts and all, without observations. Prints multiples of real time: of the engine
+alone, and of whole steps (controller and measures, no reward).
+"""
+
+import time
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import manifeel_ms3  # noqa: F401
+from manifeel_ms3.demonstrations.dataset import PAPER_COUNTS
+from manifeel_ms3.demonstrations.trajectory_file import open_trajectories, read_header
+from manifeel_ms3.paths import data_dir
+
+
+@dataclass
+class Args:
+    tasks: tuple[str, ...] = tuple(PAPER_COUNTS)
+    """tasks to time"""
+
+
+def real_time_factors(task: str) -> tuple[float, float]:
+    """Simulated seconds a second: of the engine alone, of whole steps."""
+    path = data_dir() / "sample" / task / "states.h5"
+    episode = read_header(path)["episodes"][0]
+    with open_trajectories(path) as file:
+        actions = np.asarray(file[f"traj_{episode['episode_id']}/actions"])
+    env = gym.make(task, obs_mode="none", reward_mode="none", render_backend="none")
+    env.reset(seed=episode["episode_seed"])
+    scene, spent = env.unwrapped.scene, [0.0]
+    step = scene.step
+
+    def timed_step():
+        start = time.perf_counter()
+        step()
+        spent[0] += time.perf_counter() - start
+
+    scene.step = timed_step
+    start = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    whole = time.perf_counter() - start
+    simulated = len(actions) / env.unwrapped.control_freq
+    env.close()
+    return simulated / spent[0], simulated / whole
+
+
+def main(args: Args) -> None:
+    torch.set_num_threads(1)
+    table = Table("task", "engine alone", "whole steps", title="times real time, one core")
+    for task in args.tasks:
+        engine, whole = real_time_factors(task)
+        table.add_row(task, f"{engine:.1f}", f"{whole:.1f}")
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
