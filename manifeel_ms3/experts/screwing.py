@@ -83,9 +83,9 @@ class ScrewingExpert:
             load = skills.load
             load[:2] -= np.clip(load[:2], -SIDEWAYS, SIDEWAYS)
             move = np.clip(YIELD * (load - [0, 0, PUSH]), -STEP, STEP)
-            if self._torque() < TIGHTEN:
-                self.yaw -= TURN
-                move[2] -= self.screw.pitch * TURN / (2 * np.pi)
+            turn = TURN * np.clip(1 - self._torque() / TIGHTEN, 0.0, 1.0)  # slower as it gets tight
+            self.yaw -= turn
+            move[2] -= self.screw.pitch * turn / (2 * np.pi)
             move[2] = min(move[2], 0.0)  # what it holds stays down
             yield skills.command(command + move, self._facing())
 

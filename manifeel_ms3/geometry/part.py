@@ -18,6 +18,8 @@ from sapien.render import RenderMaterial
 from manifeel_ms3.paths import cache_dir
 from manifeel_ms3.sensors.surfaces import give_relief
 
+MILLIMETRES = (1e-3, 1e-3, 1e-3)
+"""Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""
 UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
 
 
@@ -72,14 +74,14 @@ class Hulls:
 
     def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
         path = str(self.file)
-        builder.add_multiple_convex_collisions_from_file(path, material=material, density=density)
+        builder.add_multiple_convex_collisions_from_file(path, scale=MILLIMETRES, material=material, density=density)
         if look is not None:
-            builder.add_visual_from_file(path, material=look)
+            builder.add_visual_from_file(path, scale=MILLIMETRES, material=look)
 
     @cached_property
     def file(self) -> Path:
         """The hulls as meshes of one file, which is how the engine takes them."""
-        return _cached_obj([trimesh.convex.convex_hull(points) for points in self.points])
+        return _cached_obj([trimesh.convex.convex_hull(points / MILLIMETRES[0]) for points in self.points])
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +106,7 @@ Piece = Box | Cylinder | Ball | Hulls | Solid
 
 
 def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
-    """A file with these meshes as its objects, made once; to nanometres."""
+    """A file with these meshes as its objects, made once."""
     lines, first = [], 1
     for k, mesh in enumerate(meshes):
         lines.append(f"o piece{k}")

@@ -92,13 +92,13 @@ def nut_and_bolt() -> Screw:
 
 # IEC 60061-1: cap 7004-21, holder 7005-20, both in the middle of their tolerances
 E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025)
-E27_GAP = 2.0e-4  # m, radial
+E27_GAP, GUIDE = 2.0e-4, 1.0e-3  # m, radial: between the threads, and of the smooth wall around them
 GLASS_RADIUS = 0.030
 CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
 CAP_RIDGE, CAP_TURNS = -0.056, 2.0
 HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
 CONTACT_HEIGHT = 0.012  # m, over the underside
-BORE = (0.018, 0.0285)  # m: the thread's ends
+BORE = (0.018, 0.0296)  # m: the thread's ends, the upper one with the mouth's chamfer
 BORE_TURN = np.deg2rad(-10)  # so that the threads meet soon after the hand begins to turn
 CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.1 N m of the thread
 BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)
@@ -141,19 +141,17 @@ def e27_bulb() -> Part:
 def e27_holder() -> Part:
     """Lampholder with an inner thread below its rim, and a contact at the bottom."""
     bore = E27.wider(E27_GAP)
-    thread = internal_mesh(bore, BORE[1] - BORE[0])
+    mouth = bore.major_radius + GUIDE
+    thread = internal_mesh(bore, BORE[1] - BORE[0], mouth + 1e-4)
     thread.apply_transform(trimesh.transformations.rotation_matrix(BORE_TURN, [0, 0, 1]))
     thread.apply_translation([0, 0, BORE[0]])
 
-    def rim(angles: np.ndarray) -> np.ndarray:
-        return np.full_like(angles, HOLDER_RADIUS)
-
-    shell = ring_of_wedges(24, bore.major_radius, rim, 0.0, BORE[1])
-    guide = ring_of_wedges(24, bore.major_radius + 1e-3, rim, BORE[1], HOLDER_HEIGHT)
-    contact = Cylinder(bore.major_radius, CONTACT_HEIGHT, (0.0, 0.0, CONTACT_HEIGHT / 2))
+    shell = trimesh.creation.annulus(mouth, HOLDER_RADIUS, HOLDER_HEIGHT, sections=64)
+    shell.apply_translation([0, 0, HOLDER_HEIGHT / 2])
+    contact = Cylinder(mouth, CONTACT_HEIGHT, (0.0, 0.0, CONTACT_HEIGHT / 2))
     return Part(
         "holder",
-        (Hulls((*shell, *guide)), Solid(thread), contact),
+        (Solid(shell), Solid(thread), contact),
         (0.16, 0.16, 0.18),
         friction=0.2,
         other_colours={1: GREY, 2: BRASS},

@@ -66,13 +66,13 @@ def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: in
     return _clean(np.r_[vertices, [[0, 0, 0], [0, 0, length]]], faces)
 
 
-def internal_mesh(thread: Thread, length: float, per_turn: int = 48) -> trimesh.Trimesh:
+def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: int = 48) -> trimesh.Trimesh:
     """Surface of a bore with this thread from z = 0 to `length`, seen from its axis; open at its ends and behind.
 
-    Its mouth, at the top, is chamfered by 45 degrees, out to the thread's major radius.
+    Its mouth, at the top, is chamfered by 45 degrees, out to `mouth_radius`.
     """
     rim = _helix(thread, length, per_turn)
-    rim[..., 0] = np.maximum(rim[..., 0], thread.major_radius - (length - rim[..., 1]))
+    rim[..., 0] = np.maximum(rim[..., 0], mouth_radius - (length - rim[..., 1]))
     vertices, faces = _skin(rim, len(thread.profile))
     return _clean(vertices, np.fliplr(faces))
 

@@ -143,7 +143,7 @@ def test_edison_thread_is_the_standards():
 
 def test_bore_is_the_thread_seen_from_inside():
     bore = E27.wider(2e-4)
-    mesh = internal_mesh(bore, 0.012)
+    mesh = internal_mesh(bore, 0.012, bore.major_radius)
     radius = np.linalg.norm(mesh.vertices[:, :2], axis=1)
     assert radius.min() == pytest.approx(E27.minor_radius + 2e-4, abs=1e-9)
     assert radius.max() == pytest.approx(E27.major_radius + 2e-4, abs=1e-9)
