@@ -60,6 +60,12 @@ class GearAssemblyEnv(InsertionEnv):
             for name in NEIGHBOURS
         }
 
+    @property
+    def _default_sim_config(self):
+        config = super()._default_sim_config
+        config.scene_config.enable_pcm = False  # persistent manifolds find teeth millimetres deep in each other that only touch
+        return config
+
     def _largest_ranges(self):
         return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is all the way round"))
 
