@@ -24,6 +24,7 @@ YIELD = 1.5e-4  # m/N a step: how the hand goes after a force that it does not w
 STEP = 0.0012  # m, at most, of a step under force
 WRIGGLE = 4e-4  # m
 TWIST_RATE = 0.15  # rad a step, of a sine
+TWIST_GROWS = 50  # steps in which it swings as far again
 STRAIGHT = Rotation.identity()
 
 
@@ -159,7 +160,8 @@ class InsertionExpert:
             move = np.clip(YIELD * (load - [0, 0, FEEL_PRESS if leaning else PRESS_FORCE]), -STEP, STEP)
             if stuck > 4:
                 move[:2] += WRIGGLE * np.array([np.cos(1.3 * step), np.sin(1.3 * step)])
-            twist = Rotation.from_euler("z", self.twist * np.sin(TWIST_RATE * stuck))
+            swing = self.twist * min(1 + stuck / TWIST_GROWS, 2.0)
+            twist = Rotation.from_euler("z", swing * np.sin(TWIST_RATE * stuck))
             command, _ = skills.commanded
             yield skills.command(command + move, skills.towards(twist * self._facing(STRAIGHT), STAND_UP_TURN))
 
