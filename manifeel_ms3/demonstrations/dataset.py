@@ -22,7 +22,6 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from . import materialize, record
 from .trajectory_file import finished_episodes, read_header, write_json
 
-log = logging.getLogger(__name__)
 PAPER_COUNTS = {
     "ManiFeel-PegInsertion-v1": 50,
     "ManiFeel-USBInsertion-v1": 50,

@@ -33,7 +33,7 @@ class BulbInstallationEnv(ScrewingEnv):
     """
     **Task Description:**
     The gripper holds a light bulb by its glass and screws its E27 cap (pitch 3.63 mm) into a holder that hides the thread,
-    until it is tight. The hand turns 300 degrees at most; then it lets go, turns back, and takes the bulb again.
+    until it is tight. The hand turns 310 degrees at most; then it lets go, turns back, and takes the bulb again.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - holder: xy +-50 mm around (0.5, 0) m

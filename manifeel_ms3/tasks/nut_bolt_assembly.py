@@ -16,7 +16,7 @@ class NutBoltAssemblyEnv(ScrewingEnv):
     """
     **Task Description:**
     The gripper holds an M16 nut and screws it onto a bolt that stands up. Both have real threads, 2 mm of pitch. The hand turns
-    300 degrees at most; then it lets go, turns back, and takes the nut again.
+    310 degrees at most; then it lets go, turns back, and takes the nut again.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - bolt: xy +-50 mm around (0.5, 0) m

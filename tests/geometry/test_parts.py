@@ -1,5 +1,7 @@
 """What is drawn is what collides: both are sampled as the engine and the renderer hold them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import sapien
@@ -40,8 +42,6 @@ def bodies():
 
 
 def _renamed(parts):
-    import dataclasses
-
     return [dataclasses.replace(part, name=f"{part.name}_{k}") for k, part in enumerate(parts)]
 
 
