@@ -73,7 +73,7 @@ def main(args: Args) -> Path:
     files = {task: (args.out / task / "states.h5", args.out / task / "trajectory.h5") for task in counts}
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
-        done = sum(_there(path) for paths in files.values() for path in paths[: 1 + observed])
+        done = sum(len(finished_episodes(path)) for paths in files.values() for path in paths[: 1 + observed])
         whole = bar.add_task("all tasks", total=total, completed=min(done, total))
 
         def count() -> None:
@@ -89,11 +89,6 @@ def main(args: Args) -> Path:
                 materialize.main(materialize.Args(states, trajectory, *pictures, workers=args.workers), count)
             write_manifest(args.out)
     return args.out / "manifest.json"
-
-
-def _there(path: Path) -> int:
-    """Episodes that an earlier run has left."""
-    return len(read_header(path)["episodes"]) if path.is_file() else len(finished_episodes(path))
 
 
 def _check_room(args: Args, episodes: int) -> None:

@@ -135,8 +135,6 @@ def _without_renderer(env_kwargs: dict[str, Any]) -> dict[str, Any]:
 
 def already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
     """Episodes and failed seeds that an earlier run has left."""
-    if not path.is_file() and not episode_folder(path).is_dir():
-        return {}, set()
     failed: set[int] = set()
     if path.is_file():
         before = read_header(path)
@@ -146,8 +144,6 @@ def already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], 
                 "or delete the file"
             )
         failed = set(before.get("failed_seeds", []))
-        if not episode_folder(path).is_dir():
-            split(path)
     return finished_episodes(path), failed
 
 
@@ -160,6 +156,8 @@ worker: dict[str, Any] = {}
 def worker_pool(workers: int, env_id: str, env_kwargs: dict[str, Any], path: Path) -> ProcessPoolExecutor:
     """Processes with one environment each, for episodes that are written beside `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_file() and not episode_folder(path).is_dir():
+        split(path)
     context = get_context("spawn")  # a forked renderer does not work
     return ProcessPoolExecutor(workers, context, _start_worker, (env_id, env_kwargs, path))
 

@@ -69,8 +69,11 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def finished_episodes(path: Path) -> dict[int, dict[str, Any]]:
-    """Infos of the episodes beside `path` that are whole, by seed in rising order."""
-    infos = (json.loads(file.read_text()) for file in sorted(episode_folder(path).glob("seed_*.json")))
+    """Infos of the episodes in `path`, or finished beside it, by seed in rising order."""
+    if episode_folder(path).is_dir():
+        infos = [json.loads(file.read_text()) for file in sorted(episode_folder(path).glob("seed_*.json"))]
+    else:
+        infos = read_header(path)["episodes"] if path.is_file() else []
     return {info["episode_seed"]: info for info in infos}
 
 
@@ -97,15 +100,17 @@ def consolidate(path: Path) -> None:
 
 def split(path: Path) -> None:
     """Turn a whole file back into an index and its episodes, so that more can be recorded."""
-    header = read_header(path)
+    folder = episode_folder(path)
+    draft = folder.with_name(folder.name + ".partial")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir()
     with h5py.File(path, "r") as whole:
-        for i, info in enumerate(header["episodes"]):
-            folder, name = episode_folder(path), f"seed_{info['episode_seed']:08d}"
-            folder.mkdir(parents=True, exist_ok=True)
-            with h5py.File(folder / f"{name}.h5.partial", "w") as file:
+        for i, info in enumerate(read_header(path)["episodes"]):
+            name = f"seed_{info['episode_seed']:08d}"
+            with h5py.File(draft / f"{name}.h5", "w") as file:
                 whole.copy(f"traj_{i}", file, "traj_0")
-            (folder / f"{name}.h5.partial").replace(folder / f"{name}.h5")
-            write_json(folder / f"{name}.json", info)
+            write_json(draft / f"{name}.json", info)
+    draft.rename(folder)
 
 
 def _numbered(infos: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:

@@ -56,6 +56,7 @@ def test_same_command_again_does_nothing(folder):
     before = (folder / PEG / "trajectory.h5").stat().st_mtime_ns
     dataset.main(dataset.Args(folder, (PEG,), num=2, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
     assert (folder / PEG / "trajectory.h5").stat().st_mtime_ns == before
+    assert not list(folder.rglob("*.episodes"))
 
 
 def damaged(folder: Path, tmp_path: Path) -> Path:
