@@ -5,17 +5,20 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.screwing import WOUND_UP, ScrewingEnv
 
-from .skills import DOWNWARD, Actions, Skills, seen
+from .skills import DOWNWARD, Actions, Skills, position_rotation, seen
 
 HOVER, CLEAR = 0.010, 0.020  # m over where the threads meet: where it begins to feel its way; where it may move sideways
 SWEEP = np.deg2rad(310)  # that the wrist has
 TURN = 0.047  # rad a step
 PUSH = 1.5  # N, downwards, while it turns
-CENTRE_PUSH, CENTRE_STEPS, SUNK = 4.0, 3, 5e-5  # N, steps, m
+CENTRE_PUSH, CENTRE_STEPS, CENTRE_TRIES, SUNK = 4.0, 3, 15, 5e-5  # N, steps, how often, m
+ON_THREAD = 0.0015  # m over where the threads meet: higher up it is not on the thread yet
 YIELD = 1.0e-4  # m/N a step: how the hand goes after a force that it does not want
 SIDEWAYS = 1.0  # N that it bears
 STEP = 8e-4  # m, at most, of a step under force
 OPEN_BY = 0.007  # m on each side, to let go
+STRAIGHTEN = 0.2  # of its lean, a step
+RUB, SLOW_TURN = 0.03, 0.02  # N m from which it turns slower; rad a step
 TIGHTEN = 0.16  # N m, at which it stops turning and holds
 
 
@@ -65,13 +68,13 @@ class ScrewingExpert:
         yield from self._centre()
 
     def _centre(self) -> Actions:
-        """Press, and go where the chamfer pushes the part, until it sinks no more."""
+        """Press, and go where the chamfer pushes the part, until it sinks no more, nor stands on the rim."""
         skills = self.skills
-        lowest = np.inf
-        while self._height() < lowest - SUNK:
-            lowest = self._height()
+        lowest, deep_enough, tries = np.inf, self.screw.engaged + ON_THREAD, 0
+        while self._height() < lowest - SUNK or self._height() > deep_enough and tries < CENTRE_TRIES:
+            lowest, tries = self._height(), tries + 1
             for _ in range(CENTRE_STEPS):
-                move = np.clip(2 * YIELD * (skills.load - [0, 0, CENTRE_PUSH]), -STEP, STEP)
+                move = np.clip(2 * YIELD * (skills.load - [0, 0, CENTRE_PUSH]) + self._straighten(), -STEP, STEP)
                 command, _ = skills.commanded
                 yield skills.command(command + move, self._facing())
 
@@ -82,12 +85,18 @@ class ScrewingExpert:
             command, _ = skills.commanded
             load = skills.load
             load[:2] -= np.clip(load[:2], -SIDEWAYS, SIDEWAYS)
-            move = np.clip(YIELD * (load - [0, 0, PUSH]), -STEP, STEP)
-            turn = TURN * np.clip(1 - self._torque() / TIGHTEN, 0.0, 1.0)  # slower as it gets tight
+            move = np.clip(YIELD * (load - [0, 0, PUSH]) + self._straighten(), -STEP, STEP)
+            felt = self._torque()
+            turn = TURN if felt < RUB else SLOW_TURN * np.clip((TIGHTEN - felt) / (TIGHTEN - RUB), 0.0, 1.0)
             self.yaw -= turn
             move[2] -= self.screw.pitch * turn / (2 * np.pi)
             move[2] = min(move[2], 0.0)  # what it holds stays down
             yield skills.command(command + move, self._facing())
+
+    def _straighten(self) -> np.ndarray:
+        """How the hand moves, m a step, to stand up what leans in it, about the foot of its thread."""
+        leaning = position_rotation(self.env.held.pose.raw_pose)[1].apply([0.0, 0.0, 1.0])
+        return -STRAIGHTEN * self.screw.reach * np.r_[leaning[:2], 0.0]
 
     def _torque(self) -> float:
         """What the hand turns with, N m, clockwise, as the pads feel it."""

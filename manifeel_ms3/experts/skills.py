@@ -39,12 +39,12 @@ class Skills:
     @property
     def tool(self) -> tuple[np.ndarray, Rotation]:
         """Where the tool is."""
-        return _position_rotation(self.agent.tcp_pose_at_base.raw_pose)
+        return position_rotation(self.agent.tcp_pose_at_base.raw_pose)
 
     @property
     def commanded(self) -> tuple[np.ndarray, Rotation]:
         """Where the next action counts from."""
-        return _position_rotation(self.arm.commanded_pose.raw_pose)
+        return position_rotation(self.arm.commanded_pose.raw_pose)
 
     @property
     def load(self) -> np.ndarray:
@@ -59,7 +59,7 @@ class Skills:
         total = np.zeros(3)
         for side, gel in self.agent.gels.items():
             force = self.agent.pad_wrench(side)[0, :3].cpu().numpy()
-            _, pad = _position_rotation(gel.pose.raw_pose)
+            _, pad = position_rotation(gel.pose.raw_pose)
             total += pad.apply(force)
         return total  # the object passes on to the pads what the world does to it
 
@@ -146,10 +146,11 @@ class Skills:
 def seen(actor: Actor, rng: np.random.Generator) -> np.ndarray:
     """Where a thing seems to be, (3,), m, base frame: up to SIGHT_ERROR off, to any side."""
     angle, radius = rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(rng.uniform())
-    position, _ = _position_rotation(actor.pose.raw_pose)
+    position, _ = position_rotation(actor.pose.raw_pose)
     return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-def _position_rotation(raw_pose) -> tuple[np.ndarray, Rotation]:
+def position_rotation(raw_pose) -> tuple[np.ndarray, Rotation]:
+    """Of the only environment, from a pose (1, 7)."""
     pose = raw_pose[0].cpu().numpy().astype(np.float64)
     return pose[:3], Rotation.from_quat(pose[[4, 5, 6, 3]])  # SAPIEN has w first

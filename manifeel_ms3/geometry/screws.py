@@ -29,6 +29,8 @@ class Screw:
     """The same height where it is far enough in."""
     tightening: float
     """rad to turn it further there."""
+    reach: float
+    """How far below the held part's origin its thread begins."""
     symmetry: float
     """rad between grips that are alike."""
     grip_force: float
@@ -85,25 +87,27 @@ def nut_and_bolt() -> Screw:
         pitch=M16.pitch,
         seated=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED - 1.5 * M16.pitch,
         tightening=np.deg2rad(40),
+        reach=NUT_HEIGHT / 2,
         symmetry=np.deg2rad(60),
         grip_force=20.0,
     )
 
 
 # IEC 60061-1: cap 7004-21, holder 7005-20, both in the middle of their tolerances
-E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025)
+E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025, points=3)
 E27_GAP, GUIDE = 2.0e-4, 1.0e-3  # m, radial: between the threads, and of the smooth wall around them
 GLASS_RADIUS = 0.030
 CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
 CAP_RIDGE, CAP_TURNS = -0.056, 2.0
 HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
 CONTACT_HEIGHT = 0.012  # m, over the underside
-BORE = (0.018, 0.0296)  # m: the thread's ends, the upper one with the mouth's chamfer
+BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's chamfer
 BORE_TURN = np.deg2rad(-10)  # so that the threads meet soon after the hand begins to turn
-CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.1 N m of the thread
+CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.3 N m of the thread
+DRY = 0.35  # friction of brass on brass, neither greased nor polished
 BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)
 BULB_SEATED = CONTACT_HEIGHT - CAP_TIP
-BULB_TRAVEL = 0.0042  # m down from where the ridge's lower end just passes under the bore's crest
+BULB_TRAVEL = 0.0034  # m down from where the ridge's lower end just passes under the bore's crest
 
 
 def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int = 24) -> np.ndarray:
@@ -125,7 +129,7 @@ def e27_bulb() -> Part:
     section = np.r_[crest, [[core - 5e-4, side * E27.pitch / 4] for side in (-1, 1)]]
     section[:, 1] += CAP_RIDGE
     neck = _cone((0.018, core), (-0.024, CAP_TOP))
-    cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, per_turn=36, lead_in=0.25))
+    cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, per_turn=24, lead_in=0.25))
     foot = _cone((core, 0.005), (CAP_FOOT, CAP_TIP + 0.001))
     tip = Cylinder(0.004, 0.003, (0.0, 0.0, CAP_TIP + 0.0015))
     return Part(
@@ -133,7 +137,7 @@ def e27_bulb() -> Part:
         (Ball(GLASS_RADIUS), Hulls((neck,)), Hulls(cap), Hulls((foot,)), tip),
         GLASS,
         density=400.0,
-        friction=0.2,
+        friction=DRY,
         other_colours={2: GREY, 3: (0.1, 0.1, 0.1), 4: BRASS},
     )
 
@@ -153,7 +157,7 @@ def e27_holder() -> Part:
         "holder",
         (Solid(shell), Solid(thread), contact),
         (0.16, 0.16, 0.18),
-        friction=0.2,
+        friction=DRY,
         other_colours={1: GREY, 2: BRASS},
         springs={2: CONTACT_SPRING},
     )
@@ -168,6 +172,7 @@ def bulb_and_holder() -> Screw:
         pitch=E27.pitch,
         seated=BULB_SEATED,
         tightening=np.deg2rad(120),
+        reach=-CAP_FOOT,
         symmetry=np.deg2rad(15),
         grip_force=12.0,
     )

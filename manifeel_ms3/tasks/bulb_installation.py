@@ -63,6 +63,12 @@ class BulbInstallationEnv(ScrewingEnv):
             control_mode = control_mode or "pd_ee_delta_yaw"
         super().__init__(*args, control_mode=control_mode, **kwargs)
 
+    @property
+    def _default_sim_config(self):
+        config = super()._default_sim_config
+        config.scene_config.enable_pcm = False  # persistent manifolds make a tight thread rattle, and so lose its friction
+        return config
+
     def _largest_ranges(self):
         return super()._largest_ranges() | dict(screw_depth=(SCREWED_IN, "the bulb would not be in its thread"))
 

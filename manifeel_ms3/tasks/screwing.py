@@ -13,6 +13,11 @@ from manifeel_ms3.geometry import Screw
 from .placement import height_range, start_pose
 from .visuotactile_env import VisuotactileEnv
 
+THREAD_RATE = 480  # Hz: at 240 a thread tilts and jams
+THREAD_CONTACTS = dict(
+    contact_offset=5e-5,  # m: threads have a tenth of a millimetre of play
+    solver_position_iterations=40,
+)
 FIXED_XY = (0.5, 0.0)  # m, nominal
 START_Z = 0.15  # m
 WOUND_UP = np.deg2rad(200)  # about the vertical, that the hand starts turned by: near the end of its joint
@@ -58,8 +63,9 @@ class ScrewingEnv(VisuotactileEnv):
     @property
     def _default_sim_config(self):
         config = super()._default_sim_config
-        config.sim_freq = 480  # at 240 Hz a thread tilts and jams
-        config.scene_config.contact_offset = 2e-4  # m: threads have a tenth of a millimetre of play
+        config.sim_freq = THREAD_RATE
+        for name, value in THREAD_CONTACTS.items():
+            setattr(config.scene_config, name, value)
         return config
 
     def _load_task(self):
