@@ -10,14 +10,19 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.geometry import bulb_and_holder
 from manifeel_ms3.geometry.screws import BULB_TRAVEL, bulb_yaw
 
+from .screwing import THREAD_CONTACTS, ScrewingEnv
 from .screwing import Randomization as ScrewingRandomization
-from .screwing import ScrewingEnv
 
 MAX_GAP = 0.5e-3  # m
 TIGHT = 0.1  # N m
 STARTS = ("hand", "holder")
-SCREWED_IN = 0.0020  # m down from where the threads first meet, on average
+SCREWED_IN = 0.0015  # m down from where the threads first meet, on average
+SUNK = 2.2e-4  # m that it sits lower than the middle of the groove, on the thread
 OVER_BULB = 0.17  # m, of the open fingers over the table
+BULB_CONTACTS = THREAD_CONTACTS | dict(
+    enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
+    contact_offset=7.5e-5,  # m: without them, and with less, a bulb that is let go of slips through its thread
+)
 
 
 @dataclass
@@ -46,14 +51,15 @@ class BulbInstallationEnv(ScrewingEnv):
 
     **Fail Conditions:** the bulb is out of the hand (50 mm) and off the holder.
 
-    `start="holder"` is the paper's task on the real robot: the bulb has been screwed in by a random depth already, 2 mm +- 1.2,
-    and the open gripper, over it, moves and turns about the vertical alone (5-D actions).
+    `start="holder"` is the paper's task on the real robot: the bulb has been screwed in by a random depth (1.5 mm +- 1.2), and
+    the open gripper, over it, moves and turns about the vertical alone (5-D actions).
     """
 
     Randomization = Randomization
 
     screw = bulb_and_holder()
     grip_indentation = 1.5e-3  # m: one contact point of 8 kN/m
+    thread_contacts = BULB_CONTACTS
 
     def __init__(self, *args, start: str = "hand", control_mode: str | None = None, **kwargs):
         if start not in STARTS:
@@ -63,24 +69,21 @@ class BulbInstallationEnv(ScrewingEnv):
             control_mode = control_mode or "pd_ee_delta_yaw"
         super().__init__(*args, control_mode=control_mode, **kwargs)
 
-    @property
-    def _default_sim_config(self):
-        config = super()._default_sim_config
-        config.scene_config.enable_pcm = False  # persistent manifolds make a tight thread rattle, and so lose its friction
-        return config
-
     def _largest_ranges(self):
         return super()._largest_ranges() | dict(screw_depth=(SCREWED_IN, "the bulb would not be in its thread"))
 
-    def _initialize_task(self, env_idx: torch.Tensor):
-        super()._initialize_task(env_idx)
+    def _initialize_held(self, env_idx: torch.Tensor):
         if self.start == "hand":
-            return
+            super()._initialize_held(env_idx)
+        else:
+            self._initialize_in_holder(env_idx)
+
+    def _initialize_in_holder(self, env_idx: torch.Tensor) -> None:
         n = len(env_idx)
         place = self.fixed.pose.p[env_idx]
         place[:, 2] += self.screw.engaged - SCREWED_IN + (2 * torch.rand(n) - 1) * self.randomization.screw_depth
         turn = torch.zeros(n, 3)
-        turn[:, 2] = bulb_yaw(place[:, 2])
+        turn[:, 2] = bulb_yaw(place[:, 2] + SUNK)
         self.held.set_pose(Pose.create_from_pq(place, axis_angle_to_quaternion(turn)))
         self._start_tool(env_idx, OVER_BULB, opening=0.04, grip_force=0.0)
 

@@ -42,13 +42,14 @@ class Randomization:
 class ScrewingEnv(VisuotactileEnv):
     """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, takes it again.
 
-    Subclasses define `screw` and `grip_indentation`, m, of each gel under its grip.
+    Subclasses define `screw` and `grip_indentation`, m, under its grip; `thread_contacts`: settings of the engine.
     """
 
     Randomization = Randomization
     default_control_mode = "pd_ee_delta_pose"
     screw: Screw
     grip_indentation: float
+    thread_contacts = THREAD_CONTACTS
     start = "hand"
     """where the held part is at the start: in the hand, or already in the "holder"."""
 
@@ -64,7 +65,7 @@ class ScrewingEnv(VisuotactileEnv):
     def _default_sim_config(self):
         config = super()._default_sim_config
         config.sim_freq = THREAD_RATE
-        for name, value in THREAD_CONTACTS.items():
+        for name, value in self.thread_contacts.items():
             setattr(config.scene_config, name, value)
         return config
 
@@ -77,6 +78,10 @@ class ScrewingEnv(VisuotactileEnv):
         fixed = torch.tensor([*FIXED_XY, 0.0]).repeat(n, 1)
         fixed[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.fixed_xy
         self.fixed.set_pose(Pose.create_from_pq(fixed))
+        self._initialize_held(env_idx)
+
+    def _initialize_held(self, env_idx: torch.Tensor) -> None:
+        """Put the tool at its start, the held part in it."""
         opening = self.screw.grip_width / 2 - self.grip_indentation
         start = self._start_tool(env_idx, START_Z, opening, self.screw.grip_force)
         self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([[0.0, 1.0, 0.0, 0.0]])))

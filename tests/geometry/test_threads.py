@@ -19,6 +19,7 @@ from manifeel_ms3.geometry.screws import (
     NUT_MOUTH,
 )
 from manifeel_ms3.geometry.threads import external_mesh, internal_mesh, iso_metric, ridge
+from manifeel_ms3.tasks.bulb_installation import BULB_CONTACTS
 from manifeel_ms3.tasks.screwing import THREAD_CONTACTS
 from manifeel_ms3.tasks.screwing import THREAD_RATE as RATE
 from tests.sensors.bench import PadBench
@@ -36,14 +37,12 @@ def cap_on_thread(height: float) -> float:
 class Screwing:
     """A held part on its thread, turned by a torque, pushed by a force; a stiff hand keeps it upright if asked to."""
 
-    def __init__(
-        self, screw: Screw, height: float, yaw: float, torque: float, upright: float = 0.0, persistent_contacts: bool = True
-    ):
+    def __init__(self, screw: Screw, height: float, yaw: float, torque: float, upright: float = 0.0, contacts=THREAD_CONTACTS):
         def build(env):
             fixed = screw.fixed.build(env.scene, "kinematic", sapien.Pose([0.5, 0, 0]))
             return [fixed, screw.held.build(env.scene, "dynamic", sapien.Pose([0.5, 0, 0.3]))]
 
-        rates = dict(sim_freq=RATE, control_freq=10, scene_config=THREAD_CONTACTS | dict(enable_pcm=persistent_contacts))
+        rates = dict(sim_freq=RATE, control_freq=10, scene_config=contacts)
         self.env = PadBench(build, obs_mode="none", render_backend="none", sim_config=rates)
         self.env.reset(seed=0)
         self.held = self.env.objects[1]
@@ -116,7 +115,7 @@ def test_nut_follows_the_pitch_stays_under_a_push_and_comes_off():
 def test_bulb_follows_the_pitch_and_gets_tight():
     screw = bulb_and_holder()
     start = screw.engaged - 0.0008
-    bulb = Screwing(screw, start, cap_on_thread(start), torque=0.2, upright=0.5, persistent_contacts=False)
+    bulb = Screwing(screw, start, cap_on_thread(start), torque=0.2, upright=0.5, contacts=BULB_CONTACTS)
     bulb.run(0.1, -4 * np.pi, 2.0)
     turned, height = bulb.turned, bulb.height
     bulb.run(0.3, -4 * np.pi, 2.0)
