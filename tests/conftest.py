@@ -1,6 +1,7 @@
 """Shared fixtures. Tests run on the real simulator; those that need a picture are skipped only where no renderer can be had."""
 
 import os
+from collections import Counter
 
 import gymnasium as gym
 import pytest
@@ -29,3 +30,26 @@ def make_env():
     yield make
     for env in made:
         env.close()
+
+
+@pytest.fixture
+def figure(record_property):
+    """Hold a measured figure against its bound; the end of the run names the worst of each."""
+
+    def check(what: str, value: float, at_most: float | None = None, at_least: float | None = None) -> None:
+        record_property("figure", [what, float(value), at_most, at_least])
+        assert at_most is None or value <= at_most, what
+        assert at_least is None or value >= at_least, what
+
+    return check
+
+
+def pytest_terminal_summary(terminalreporter):
+    worst, count = {}, Counter()
+    for report in terminalreporter.stats.get("passed", []):
+        for what, value, at_most, at_least in (made for name, made in report.user_properties if name == "figure"):
+            count[what] += 1
+            if what not in worst or (value > worst[what][0]) == (at_least is None):
+                worst[what] = value, f"at least {at_least:g}" if at_most is None else f"at most {at_most:g}"
+    for what, (value, wanted) in sorted(worst.items()):
+        terminalreporter.write_line(f"{what}: {value:.3g} (worst of {count[what]}; {wanted})")

@@ -83,7 +83,7 @@ def heights(env: PadBench, backend: str) -> tuple[np.ndarray, np.ndarray]:
 @needs_renderer
 @pytest.mark.parametrize("backend", ["raycast", "sapien"])
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (5e-3, -9e-3), (-6e-3, 8e-3)])
-def test_shapes_are_seen_within_five_micrometres(shape_env, backend, x, y):
+def test_shapes_are_seen_within_five_micrometres(shape_env, backend, x, y, figure):
     env, origin, height = shape_env
     env.place(env.objects[0], sapien.Pose([x, y, origin - DEEP]))
     seen, pixels = heights(env, backend)
@@ -91,17 +91,17 @@ def test_shapes_are_seen_within_five_micrometres(shape_env, backend, x, y):
     near = expected > -1.5e-3
     error = (seen - expected)[near]
     assert near.sum() > 1000
-    assert np.sqrt((error**2).mean()) < 5e-6
+    figure(f"shapes, {backend}, micrometres RMS off the closed form", 1e6 * np.sqrt((error**2).mean()), at_most=5)
 
 
 @needs_renderer
-def test_backends_agree_within_five_micrometres(shape_env):
+def test_backends_agree_within_five_micrometres(shape_env, figure):
     env, origin, height = shape_env
     env.place(env.objects[0], sapien.Pose([1e-3, 2e-3, origin - DEEP]))
     rays, pixels = heights(env, "raycast")
     camera, _ = heights(env, "sapien")
     near = height(pixels[:, 0] - 1e-3, pixels[:, 1] - 2e-3) + DEEP > -1.5e-3
-    assert np.sqrt(((rays - camera)[near] ** 2).mean()) < 5e-6
+    figure("depth backends, micrometres RMS apart", 1e6 * np.sqrt(((rays - camera)[near] ** 2).mean()), at_most=5)
 
 
 def test_several_objects_and_the_table_are_felt_without_registration_or_renderer():

@@ -31,30 +31,33 @@ def press(request):
     press.close()
 
 
-def assert_carries(press: Press, normal: float, rows: float, cols: float, twist: float) -> None:
+def assert_carries(figure, press: Press, normal: float, rows: float, cols: float) -> None:
     sums, wrench = press.sums, press.wrench
-    assert sums[:3] == pytest.approx(wrench[:3], rel=0.01, abs=0.002 * normal)
-    assert sums[3] == pytest.approx(wrench[3], rel=0.01, abs=2e-5 * normal)
+    figure("field's normal sum against the engine's, share", abs(sums[0] / wrench[0] - 1), at_most=0.01)
+    figure("field's shear sums against the engine's, share", np.abs(sums[1:3] / wrench[1:3] - 1).max(), at_most=0.01)
+    off = abs(sums[3] - wrench[3])
+    figure("field's moment against the engine's, share, or mm", min(off / abs(wrench[3]), 1e3 * off / normal), at_most=0.01)
     bottoms_out = normal > 20 and press.touching == BALL  # one contact point of 8 kN/m: the housing behind takes its share
     if not bottoms_out:
         assert wrench[:3] == pytest.approx([normal, rows, cols], rel=0.01, abs=0.005 * normal)
 
 
 @pytest.mark.parametrize("force", [1.0, 3.0, 10.0, 30.0])
-def test_sums_are_the_load_and_the_engines_wrench(press, force):
+def test_sums_are_the_load_and_the_engines_wrench(press, force, figure):
     press.place(press.touching + 2e-4, 1e-3, -2e-3)
     twist = 0.0 if press.touching == BALL else 4e-4 * force  # a ball on a point contact would spin
     press.push(force, 0.25 * force, -0.15 * force, twist)
-    assert_carries(press, force, 0.25 * force, -0.15 * force, twist)
+    assert_carries(figure, press, force, 0.25 * force, -0.15 * force)
     field, at = press.field, press.sensor.model.taxels.centres.numpy()
     wrench = press.sensor.wrench()[0].numpy()
     centre = (field[..., :1] * at).sum((0, 1)) / field[..., 0].sum()
-    assert np.abs(centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max() < 5e-4
+    off = np.abs(centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max()
+    figure("centre of pressure, mm off", 1e3 * off, at_most=0.5)
     assert (np.linalg.norm(field[..., 1:], axis=-1) <= press.sensor.config.gel.friction * field[..., 0] + 1e-6).all()
 
 
 @needs_renderer
-def test_a_thread_carries_the_load_on_its_crests(tmp_path):
+def test_a_thread_carries_the_load_on_its_crests(tmp_path, figure):
     mesh = thread_mesh()
     mesh.export(tmp_path / "thread.obj")
 
@@ -72,7 +75,7 @@ def test_a_thread_carries_the_load_on_its_crests(tmp_path):
     for force in (1.0, 3.0, 10.0, 30.0):
         press.place(0.0082)
         press.push(force, 0.2 * force, 0.1 * force, 2e-4 * force)
-        assert_carries(press, force, 0.2 * force, 0.1 * force, 2e-4 * force)
+        assert_carries(figure, press, force, 0.2 * force, 0.1 * force)
     press.close()
 
 
@@ -103,7 +106,7 @@ class HoldBench(PadBench):
 
 
 @pytest.mark.parametrize("mass", [0.01, 0.05, 0.1, 0.2])
-def test_fingers_feel_the_weight_of_what_they_hold(mass):
+def test_fingers_feel_the_weight_of_what_they_hold(mass, figure):
     def build(env):
         builder = env.scene.create_actor_builder()
         builder.add_box_collision(half_size=[0.008, 0.006, 0.012])
@@ -113,7 +116,7 @@ def test_fingers_feel_the_weight_of_what_they_hold(mass):
 
     control = dict(control_mode="pd_ee_delta_pose_fixed_gripper", reward_mode="none")
     env = HoldBench(build, obs_mode="tacff", render_backend="none", tactile_sensors=("left", "right"), **control)
-    for degrees, env.arm in ARMS.items():
+    for env.arm in ARMS.values():
         env.reset(seed=0)
         for _ in range(5):
             obs, *_ = env.step(np.zeros(6))
@@ -122,8 +125,9 @@ def test_fingers_feel_the_weight_of_what_they_hold(mass):
             _, rows, cols = obs["sensor_data"][f"tactile_{side}"]["force_field"][0].sum((0, 1)).tolist()
             felt += env.agent.gels[side].pose.sp.to_transformation_matrix()[:3, :3] @ [rows, cols, 0.0]
         weight = 9.81 * mass
-        assert np.linalg.norm(felt) == pytest.approx(weight, rel=0.01), degrees
-        assert -felt[2] / np.linalg.norm(felt) > np.cos(np.deg2rad(5)), degrees
+        figure("weight felt by both fingers, share off", abs(np.linalg.norm(felt) / weight - 1), at_most=0.01)
+        lean = np.rad2deg(np.arctan2(np.linalg.norm(felt[:2]), -felt[2]))
+        figure("weight's direction, degrees off", lean, at_most=5)
     env.close()
 
 
@@ -135,7 +139,7 @@ def ball():
     press.close()
 
 
-def test_stuck_area_shrinks_as_the_closed_form(ball):
+def test_stuck_area_shrinks_as_the_closed_form(ball, figure):
     """Winkler paraboloid: stuck share of the area = sqrt(1 - Q / mu P)."""
     ball.place(0.0202)
     ball.push(8.0)
@@ -149,10 +153,11 @@ def test_stuck_area_shrinks_as_the_closed_form(ball):
         limit = gel.friction * gel.normal_stiffness * depth
         touching = depth > 0
         stuck = touching & (gel.shear_stiffness * model._bristle[0].norm(dim=-1) < 0.999 * limit)
-        assert (stuck.sum() / touching.sum()).item() == pytest.approx(np.sqrt(1 - share), abs=0.02)
+        off = abs((stuck.sum() / touching.sum()).item() - np.sqrt(1 - share))
+        figure("stuck share of a pressed ball, off the closed form", off, at_most=0.02)
 
 
-def test_held_shear_does_not_drift_and_unloading_dissipates(ball):
+def test_held_shear_does_not_drift_and_unloading_dissipates(ball, figure):
     ball.place(0.0202)
     ball.push(8.0)
     path = []
@@ -161,7 +166,7 @@ def test_held_shear_does_not_drift_and_unloading_dissipates(ball):
         path.append(ball.field[..., 1].copy())
     held = ball.field.copy()
     ball.hold(10.0)
-    assert np.abs(ball.field - held).max() < 0.01 * np.abs(held).max()
+    figure("drift of a shear held for 10 s, share", np.abs(ball.field - held).max() / np.abs(held).max(), at_most=0.01)
     for shear in (3.0, 2.0, 1.0, 0.0):
         ball.push(8.0, shear, seconds=0.1)
         path.append(ball.field[..., 1].copy())
@@ -187,17 +192,18 @@ def test_release_clears_and_reset_clears(ball):
     assert (ball.field == 0).all()
 
 
-def test_twist_gives_an_antisymmetric_swirl():
+def test_twist_gives_an_antisymmetric_swirl(figure):
     press = Press(indenter("box", half_size=[0.005, 0.005, 0.004]))
     press.place(0.0042)
     press.push(10.0, twist=0.01)
     swirl = press.field[..., 1:]
     assert press.sums[3] == pytest.approx(0.01, rel=0.01)
-    assert np.abs(swirl + swirl[::-1, ::-1]).max() < 0.05 * np.abs(swirl).max()
+    uneven = np.abs(swirl + swirl[::-1, ::-1]).max() / np.abs(swirl).max()
+    figure("swirl of a twist, share that is not antisymmetric", uneven, at_most=0.05)
     press.close()
 
 
-def test_field_does_not_depend_on_control_or_physics_rate():
+def test_field_does_not_depend_on_control_or_physics_rate(figure):
     fields = []
     for sim_freq, control_freq in ((240, 5), (240, 10), (240, 20), (120, 10)):
         rates = dict(sim_config=dict(sim_freq=sim_freq, control_freq=control_freq))
@@ -210,8 +216,8 @@ def test_field_does_not_depend_on_control_or_physics_rate():
         press.close()
     normal, shear = np.abs(fields[0][..., 0]).max(), np.abs(fields[0][..., 1:]).max()
     for field in fields[1:]:
-        assert np.abs(field - fields[0])[..., 0].max() < 0.03 * normal
-        assert np.abs(field - fields[0])[..., 1:].max() < 0.03 * shear
+        off = np.abs(field - fields[0])
+        figure("field at other rates, share off", max(off[..., 0].max() / normal, off[..., 1:].max() / shear), at_most=0.03)
 
 
 def test_tacsl_units_give_penetration_and_speed():
