@@ -98,11 +98,11 @@ E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025, points=3)
 E27_GAP, GUIDE = 2.0e-4, 1.0e-3  # m, radial: between the threads, and of the smooth wall around them
 GLASS_RADIUS = 0.030
 CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
-CAP_RIDGE, CAP_TURNS = -0.056, 2.0
+CAP_RIDGE, CAP_TURNS = -0.056, 1.5
 HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
 CONTACT_HEIGHT = 0.012  # m, over the underside
 BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's chamfer
-BORE_TURN = np.deg2rad(-10)  # so that the threads meet soon after the hand begins to turn
+BORE_TURN = np.deg2rad(-10)  # the hand turns by 80 degrees before the threads meet, while the cap finds its place in the mouth
 CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.3 N m of the thread
 DRY = 0.35  # friction of brass on brass, neither greased nor polished
 BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)

@@ -10,8 +10,9 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.geometry import bulb_and_holder
 from manifeel_ms3.geometry.screws import BULB_TRAVEL, bulb_yaw
 
-from .screwing import THREAD_CONTACTS, ScrewingEnv
 from .screwing import Randomization as ScrewingRandomization
+from .screwing import ScrewingEnv
+from .visuotactile_env import CONTACTS
 
 MAX_GAP = 0.5e-3  # m
 TIGHT = 0.1  # N m
@@ -19,10 +20,6 @@ STARTS = ("hand", "holder")
 SCREWED_IN = 0.0015  # m down from where the threads first meet, on average
 SUNK = 2.2e-4  # m that it sits lower than the middle of the groove, on the thread
 OVER_BULB = 0.17  # m, of the open fingers over the table
-BULB_CONTACTS = THREAD_CONTACTS | dict(
-    enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
-    contact_offset=7.5e-5,  # m: without them, and with less, a bulb that is let go of slips through its thread
-)
 
 
 @dataclass
@@ -59,7 +56,10 @@ class BulbInstallationEnv(ScrewingEnv):
 
     screw = bulb_and_holder()
     grip_indentation = 1.5e-3  # m: one contact point of 8 kN/m
-    thread_contacts = BULB_CONTACTS
+    contacts = CONTACTS | dict(
+        enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
+        contact_offset=4e-5,  # m; without them, what moves further than twice that in a physics step slips through a thread
+    )
 
     def __init__(self, *args, start: str = "hand", control_mode: str | None = None, **kwargs):
         if start not in STARTS:

@@ -13,6 +13,7 @@ from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
 
 from .insertion import SOCKET_XY, InsertionEnv
 from .insertion import Randomization as InsertionRandomization
+from .visuotactile_env import CONTACTS
 
 NEIGHBOURS = ("small", "large")
 ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
@@ -47,6 +48,7 @@ class GearAssemblyEnv(InsertionEnv):
     """
 
     Randomization = Randomization
+    contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
     fit = gear_fit()
     max_gap = 1.0e-3
     lift = 0.05
@@ -59,12 +61,6 @@ class GearAssemblyEnv(InsertionEnv):
             )
             for name in NEIGHBOURS
         }
-
-    @property
-    def _default_sim_config(self):
-        config = super()._default_sim_config
-        config.scene_config.enable_pcm = False  # persistent manifolds find teeth millimetres deep in each other that only touch
-        return config
 
     def _largest_ranges(self):
         return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is all the way round"))

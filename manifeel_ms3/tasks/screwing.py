@@ -11,13 +11,8 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.geometry import Screw
 
 from .placement import height_range, start_pose
-from .visuotactile_env import VisuotactileEnv
+from .visuotactile_env import CONTACTS, VisuotactileEnv
 
-THREAD_RATE = 480  # Hz: at 240 a thread tilts and jams
-THREAD_CONTACTS = dict(
-    contact_offset=5e-5,  # m: threads have a tenth of a millimetre of play
-    solver_position_iterations=40,
-)
 FIXED_XY = (0.5, 0.0)  # m, nominal
 START_Z = 0.15  # m
 WOUND_UP = np.deg2rad(200)  # about the vertical, that the hand starts turned by: near the end of its joint
@@ -42,14 +37,15 @@ class Randomization:
 class ScrewingEnv(VisuotactileEnv):
     """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, takes it again.
 
-    Subclasses define `screw` and `grip_indentation`, m, under its grip; `thread_contacts`: settings of the engine.
+    Subclasses define `screw` and `grip_indentation`, m, of each gel under its grip.
     """
 
     Randomization = Randomization
     default_control_mode = "pd_ee_delta_pose"
+    physics_rate = 720  # at 240 a thread tilts and jams
+    contacts = CONTACTS | dict(contact_offset=5e-5)  # m: threads have a tenth of a millimetre of play
     screw: Screw
     grip_indentation: float
-    thread_contacts = THREAD_CONTACTS
     start = "hand"
     """where the held part is at the start: in the hand, or already in the "holder"."""
 
@@ -60,14 +56,6 @@ class ScrewingEnv(VisuotactileEnv):
             start_xy=(MAX_XY, WRIST_END),
             start_z=(height_range(START_Z, lowest), "the threads would start in each other, or out of reach"),
         )
-
-    @property
-    def _default_sim_config(self):
-        config = super()._default_sim_config
-        config.sim_freq = THREAD_RATE
-        for name, value in self.thread_contacts.items():
-            setattr(config.scene_config, name, value)
-        return config
 
     def _load_task(self):
         self.held = self.screw.held.build(self.scene, "dynamic", sapien.Pose([0.5, 0, 0.3]))

@@ -27,6 +27,12 @@ LIGHTING = {"normal": 1.0, "dim": 0.05}  # dim: the paper's 5 % of normal
 HOLD_SECONDS = 0.5  # a goal counts once it has held this long
 SETTLE_SECONDS = 0.2  # the grip settles before the first observation
 FIELD_OF_VIEW = np.deg2rad(75)
+CONTACTS: dict[str, Any] = dict(
+    enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
+    contact_offset=5e-4,  # m: clearances are below a millimetre
+    solver_position_iterations=25,
+    sleep_threshold=0.0,  # a sleeping body's contacts freeze
+)
 TABLE = Part("table", (Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02)),), colour=(0.55, 0.52, 0.48), friction=0.5)
 FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), colour=(0.30, 0.31, 0.33))
 
@@ -65,6 +71,10 @@ class VisuotactileEnv(BaseEnv):
     policy_cameras: tuple[str, ...] = ("wrist",)
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
+    physics_rate = 240
+    """Hz."""
+    contacts = CONTACTS
+    """How the engine solves contacts: fields of ManiSkill's `SceneConfig`."""
     max_reward = 4.0
     """Of the dense reward."""
     front_camera_at = (0.68, 0.0, 0.15)  # m
@@ -170,14 +180,10 @@ class VisuotactileEnv(BaseEnv):
     @property
     def _default_sim_config(self):
         return SimConfig(
-            sim_freq=240,
+            sim_freq=self.physics_rate,
             control_freq=10,
             gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=2**21, max_rigid_patch_count=2**19),
-            # PGS: with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone).
-            # contact_offset 0.5 mm: clearances are below a millimetre. sleep_threshold 0: a sleeping body's contacts freeze
-            scene_config=SceneConfig(
-                enable_tgs=False, contact_offset=0.0005, solver_position_iterations=25, sleep_threshold=0.0
-            ),
+            scene_config=SceneConfig(**self.contacts),
         )
 
     @property

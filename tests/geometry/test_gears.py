@@ -7,6 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry import gear_fit
 from manifeel_ms3.geometry.gears import BACKLASH, BASE_SIZE, MODULE, SHAFT_X, TEETH, gear_base, neighbour_gear, tooth_polygon
+from manifeel_ms3.tasks.gear_assembly import GearAssemblyEnv
 from tests.sensors.bench import PadBench
 
 SPEED = 1.0  # rad/s
@@ -19,7 +20,7 @@ def test_turning_the_medium_gear_turns_its_neighbours_by_the_tooth_ratio():
         neighbours = [neighbour_gear(name).build(env.scene, "dynamic", sapien.Pose([0.5, 0, 1])) for name in ("small", "large")]
         return [base, medium, *neighbours]
 
-    env = PadBench(build, obs_mode="none", render_backend="none", sim_config=dict(scene_config=dict(enable_pcm=False)))
+    env = PadBench(build, obs_mode="none", render_backend="none", sim_config=dict(scene_config=GearAssemblyEnv.contacts))
     env.reset(seed=0)
     height = BASE_SIZE[2] + 1e-4
     _, medium, *neighbours = env.objects
