@@ -123,7 +123,7 @@ def bulb_yaw(height: float | np.ndarray) -> float | np.ndarray:
 
 
 def e27_bulb() -> Part:
-    """Light bulb: glass, neck, and a cap with two turns of thread, an insulator and a contact at its foot."""
+    """Light bulb: glass, neck, and a cap with one and a half turns of thread, an insulator and a contact at its foot."""
     core = E27.minor_radius
     crest = np.array([(radius, height) for height, radius in E27.profile if abs(height) < E27.pitch / 3])
     section = np.r_[crest, [[core - 5e-4, side * E27.pitch / 4] for side in (-1, 1)]]
