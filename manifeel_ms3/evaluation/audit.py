@@ -8,13 +8,14 @@ policy that has that modality alone will hardly know. Answers are cross-validate
 import json
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import tyro
+from mani_skill.utils.registration import REGISTERED_ENVS
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
@@ -120,6 +121,7 @@ def _tightened(episode: Recorded) -> Samples:
 
 QUESTIONS = (
     Question("ball in the hand: golf or table tennis", "ManiFeel-BallSorting-v1", _which_ball),
+    Question("ball in the hand: golf or table tennis", "ManiFeel-BallSortingDim-v1", _which_ball),
     Question("battery's place, before contact", "ManiFeel-ObjectSearch-v1", _battery_place),
     Question("battery between the fingers or not, once closed", "ManiFeel-ObjectSearch-v1", _battery_in_hand),
     Question("peg's pitch in the hand", "ManiFeel-PegInsertion-v1", _pitch_in_hand, "degrees"),
@@ -147,19 +149,21 @@ def image_features(image: np.ndarray) -> np.ndarray:
     return np.concatenate([pooled(picture), *(pooled(band) for band in bands)])
 
 
-def _features(episode: Recorded, modality: str, t: int) -> np.ndarray:
-    sensors = episode["obs/sensor_data"]
-    pads = [name for name in sensors if name.startswith("tactile_")]
-    cameras = [name for name in sensors if name not in pads]
-    if modality == "tacff":
-        return np.concatenate([sensors[f"{pad}/force_field"][t].ravel() for pad in pads])
-    return np.concatenate([image_features(sensors[f"{name}/rgb"][t]) for name in (pads if modality == "tacrgb" else cameras)])
+def _sensor(env_id: str, modality: str) -> str:
+    """What a probe sees: the task's policy camera, or the right pad."""
+    return REGISTERED_ENVS[env_id].cls.policy_cameras[0] if modality == "camera" else "tactile_right"
+
+
+def _features(episode: Recorded, sensor: str, modality: str, t: int) -> np.ndarray:
+    seen = episode[f"obs/sensor_data/{sensor}"]
+    return seen["force_field"][t].ravel() if modality == "tacff" else image_features(seen["rgb"][t])
 
 
 @dataclass
 class Answer:
-    """How well one modality answers a question. `score`: share of right answers, or root mean square error in `unit`;
-    `interval`: 95 %, from a bootstrap over episodes; `chance`: the score of an answer that never looks."""
+    """How well one modality answers a question. `score`: share of right answers, each class weighing the same, or root mean
+    square error in `unit`; `interval`: 95 %, from a bootstrap over episodes; `chance`: the score of an answer that never looks.
+    """
 
     question: str
     env_id: str
@@ -170,7 +174,7 @@ class Answer:
     chance: float
     episodes: int
     samples: int
-    sensors: list[str] = field(default_factory=list)
+    sensor: str
 
 
 def ask(question: Question, path: Path) -> list[Answer]:
@@ -187,7 +191,6 @@ def ask(question: Question, path: Path) -> list[Answer]:
     answers, groups = [], []
     features: dict[str, list[np.ndarray]] = {modality: [] for modality in MODALITIES}
     with open_trajectories(path) as file:
-        sensors = list(file["traj_0"].get("obs/sensor_data", {}))
         for i in range(len(header["episodes"])):
             episode = file[f"traj_{i}"]
             for t, answer in question.samples(episode):
@@ -195,10 +198,11 @@ def ask(question: Question, path: Path) -> list[Answer]:
                 groups.append(i)
                 for modality, rows in features.items():
                     try:
-                        rows.append(_features(episode, modality, t))
-                    except (KeyError, ValueError) as error:
+                        rows.append(_features(episode, _sensor(question.env_id, modality), modality, t))
+                    except KeyError as error:
                         raise DemonstrationError(
-                            f"{path} lacks {modality} ({error}); record it with obs_mode rgb+tacrgb+tacff, a camera and a pad"
+                            f"{path} lacks {modality} of {_sensor(question.env_id, modality)} ({error}); record it with "
+                            "obs_mode rgb+tacrgb+tacff, the task's policy camera and the right pad"
                         ) from error
     if len(set(groups)) < 2 * FOLDS:
         raise DemonstrationError(
@@ -211,11 +215,8 @@ def ask(question: Question, path: Path) -> list[Answer]:
         score, low, high = _score(truth, guess, episodes, bool(question.unit))
         usual = np.full_like(truth, truth.mean() if question.unit else float(truth.mean() > 0.5))
         chance = _score(truth, usual, episodes, bool(question.unit))[0]
-        seen = [name for name in sensors if name.startswith("tactile_") is (modality != "camera")]
-        counts = (len(set(groups)), len(truth))
-        out.append(
-            Answer(question.name, question.env_id, modality, question.unit, score, (low, high), chance, *counts, sensors=seen)
-        )
+        seen = (len(set(groups)), len(truth), _sensor(question.env_id, modality))
+        out.append(Answer(question.name, question.env_id, modality, question.unit, score, (low, high), chance, *seen))
     return out
 
 
@@ -240,17 +241,22 @@ def probe(features: np.ndarray, truth: np.ndarray, episodes: np.ndarray, numeric
         kernel = ConstantKernel(1.0) * RBF(10.0) + WhiteKernel(0.1)
         pipeline = make_pipeline(components, GaussianProcessRegressor(kernel, normalize_y=True))
     else:
-        pipeline = make_pipeline(StandardScaler(), components, SVC(C=10.0))
+        pipeline = make_pipeline(StandardScaler(), components, SVC(C=10.0, class_weight="balanced"))
     return cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS))
 
 
 def _score(truth: np.ndarray, guess: np.ndarray, episodes: np.ndarray, numeric: bool, resamples: int = 1000):
     """Score and its 95 % interval, from a bootstrap over episodes."""
     right = (guess - truth) ** 2 if numeric else (guess == truth).astype(float)
-    names = np.unique(episodes)
-    sums = np.array([[right[episodes == name].sum(), (episodes == name).sum()] for name in names])
-    drawn = sums[np.random.default_rng(0).integers(len(names), size=(resamples, len(names)))].sum(1)
-    values = np.r_[sums.sum(0)[0] / sums.sum(0)[1], drawn[:, 0] / drawn[:, 1]]
+    kinds = np.zeros(len(truth)) if numeric else truth
+    own = (episodes[:, None] == np.unique(episodes)).T[:, None] & (
+        kinds[:, None] == np.unique(kinds)
+    ).T  # episode, class, sample
+    sums, counts = own @ right, own.sum(-1)
+    drawn = np.random.default_rng(0).integers(len(own), size=(resamples, len(own)))
+    drawn = np.concatenate([np.arange(len(own))[None], drawn])  # the first is the recording itself
+    with np.errstate(invalid="ignore"):  # a class that was not drawn
+        values = np.nanmean(sums[drawn].sum(1) / counts[drawn].sum(1), axis=1)
     values = np.sqrt(values) if numeric else values
     return float(values[0]), *(float(x) for x in np.quantile(values[1:], [0.025, 0.975]))
 
@@ -266,10 +272,8 @@ def table(answers: list[Answer]) -> str:
         first = rows[0]
         chance = f"{first.chance:.1f}°" if first.unit else f"{first.chance:.0%}"
         task = first.env_id.removeprefix("ManiFeel-").removesuffix("-v1")
-        camera = ", ".join(rows[0].sensors)
-        lines.append(
-            f"| {task} | {first.question} | {chance} | {cells['camera']} ({camera}) | {cells['tacrgb']} | {cells['tacff']} |"
-        )
+        scores = f"{cells['camera']} ({first.sensor}) | {cells['tacrgb']} | {cells['tacff']}"
+        lines.append(f"| {task} | {first.question} | {chance} | {scores} |")
     return "\n".join(lines) + "\n"
 
 

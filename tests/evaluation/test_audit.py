@@ -31,6 +31,12 @@ def test_probe_does_not_learn_an_episode_by_heart():
     assert (audit.probe(names, truth, episodes, numeric=False) == truth).mean() < 0.75
 
 
+def test_an_answer_that_never_looks_scores_a_half_however_rare_a_class():
+    truth, episodes = np.r_[np.zeros(95), np.ones(5)], np.arange(100) // 5
+    assert audit._score(truth, np.zeros(100), episodes, numeric=False)[0] == 0.5
+    assert audit._score(truth, truth, episodes, numeric=False) == (1.0, 1.0, 1.0)
+
+
 def test_probe_estimates_a_number():
     angle = RNG.uniform(-30, 30, 80)
     features = np.stack([np.sin(np.deg2rad(angle + k)) for k in range(0, 90, 5)], axis=1)
@@ -73,7 +79,7 @@ def test_audit_writes_table_figure_and_numbers(recorded, tmp_path):
     before = {answer.modality: answer for answer in answers if "before" in answer.question}
     assert before["tacff"].score == 1.0
     assert before["camera"].score < 0.8
-    assert before["camera"].sensors == ["front"]
+    assert before["camera"].sensor == "front"
     low, high = before["camera"].interval
     assert low < before["camera"].score < high
     assert "100%" in (tmp_path / "out/audit.md").read_text()
