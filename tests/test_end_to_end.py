@@ -7,7 +7,7 @@ import pytest
 
 from baselines.common.encoders import EncoderConfig
 from baselines.diffusion_policy import train
-from baselines.diffusion_policy.policy import PolicyConfig
+from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation import report, run
 from tests.conftest import PEG, needs_renderer
@@ -20,7 +20,7 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     demos = record.main(
         record.Args(PEG, 2, 2, out=tmp_path / "trajectory.h5", obs_mode="rgb+tacff", cameras=("wrist",), env_kwargs=TASK_ARGS)
     )
-    small = PolicyConfig(encoder=EncoderConfig("small_cnn", "small"), channels=(32, 64), step_embedding=32)
+    small = DiffusionConfig(encoder=EncoderConfig("small_cnn", "small"), channels=(32, 64), step_embedding=32)
     args = train.Args(
         (demos,),
         policy=small,

@@ -35,6 +35,24 @@ def save_checkpoint(
     partial.replace(folder)
 
 
+def make_last(folder: Path) -> None:
+    """Let `last`, beside a checkpoint, point to it."""
+    link = folder.with_name("last.partial")
+    link.unlink(missing_ok=True)
+    link.symlink_to(folder.name)
+    link.replace(folder.with_name("last"))
+
+
+def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
+    """Delete all checkpoints but the newest `keep` and those in use; of older ones, what only resuming needs."""
+    folders = sorted(path for path in checkpoints.iterdir() if path.name.isdigit())
+    for folder in folders[:-1]:
+        (folder / TRAINING).unlink(missing_ok=True)
+    for folder in folders[:-keep]:
+        if folder not in in_use:
+            shutil.rmtree(folder)
+
+
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
     try:
         return load_file(path)
@@ -74,11 +92,13 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
 
 
 def pack(optimizer: torch.optim.Optimizer, model: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Optimiser state, raw weights and torch's random state as named tensors."""
+    """Optimiser state, raw weights and torch's random states as named tensors."""
     packed = {f"model.{name}": t for name, t in model.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         packed |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
     packed["random"] = torch.get_rng_state()
+    if torch.cuda.is_available():
+        packed["cuda_random"] = torch.cuda.get_rng_state()
     return packed
 
 
@@ -86,12 +106,16 @@ def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, mo
     """Undo `pack`."""
     load_weights(model, {n.removeprefix("model."): t for n, t in packed.items() if n.startswith("model.")}, source)
     state: dict[int, dict[str, torch.Tensor]] = {}
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for name, tensor in packed.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".", 2)
-            state.setdefault(int(index), {})[key] = tensor
+            own = parameters[int(index)]  # fused optimisers take it that moments lie in memory as their weights do
+            state.setdefault(int(index), {})[key] = torch.empty_like(own).copy_(tensor) if tensor.shape == own.shape else tensor
     optimizer.load_state_dict(optimizer.state_dict() | dict(state=state))
     torch.set_rng_state(packed["random"])
+    if "cuda_random" in packed and torch.cuda.is_available():
+        torch.cuda.set_rng_state(packed["cuda_random"])
 
 
 def as_json(config: Any) -> dict[str, Any]:

@@ -61,6 +61,7 @@ class SequenceDataset:
         starts = ends - lengths
         step = np.arange(ends[-1])
         episode_of = np.repeat(np.arange(len(lengths)), lengths)
+        self._place = torch.as_tensor(np.stack([episode_of, step - starts[episode_of]], axis=1))
         first, last = starts[episode_of][:, None], ends[episode_of][:, None] - 1
         begin = step[:, None] - obs_horizon + 1
         self._obs_index = torch.as_tensor(np.clip(begin + np.arange(obs_horizon), first, last), device=device)
@@ -68,6 +69,11 @@ class SequenceDataset:
 
     def _load(self, parts: list[np.ndarray]) -> torch.Tensor:
         return torch.as_tensor(np.concatenate(parts), device=self.device)
+
+    def names(self, index: torch.Tensor) -> str:
+        """Where samples are in the files, for messages."""
+        episode, step = self._place[index.cpu()].T
+        return ", ".join(f"episode {e} step {t}" for e, t in zip(episode.tolist(), step.tolist(), strict=True))
 
     def __len__(self) -> int:
         return len(self._obs_index)

@@ -8,9 +8,8 @@ import torch
 import torch.nn as nn
 from transformers import ResNetConfig, ResNetModel
 
-from .observation import POSE, ObservationSpec
+from .observation import POSE, POSE_FEATURES, ObservationSpec
 
-POSE_FEATURES = 9
 IMAGE_FEATURES = 64  # per image: 32 key points
 
 
@@ -139,21 +138,21 @@ class ObservationEncoder(nn.Module):
         batch, horizon = obs[POSE].shape[:2]
         features = [obs[POSE].flatten(0, 1)]
         for key, net in zip(self.spec.images, self.images, strict=True):
-            features.append(net(self._cropped(obs[key]).flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0))
+            features.append(net(cropped(obs[key], self.crop, self.training).flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0))
         for key, net in zip(self.spec.force_fields, self.fields, strict=True):
             features.append(net(obs[key].flatten(0, 1).movedim(-1, 1)))
         return torch.cat(features, dim=-1).view(batch, horizon, -1).flatten(1)
 
-    def _cropped(self, images: torch.Tensor) -> torch.Tensor:
-        """Crop (B, T, H, W, 3): in training at random, the same over a window's time; else the middle."""
-        size = images.shape[2]
-        if not 0 < self.crop < size:
-            return images
-        free = size - self.crop
-        if not self.training:
-            return images[:, :, free // 2 : free // 2 + self.crop, free // 2 : free // 2 + self.crop]
-        batch = torch.arange(len(images), device=images.device)
-        top, left = torch.randint(free + 1, (2, len(images)), device=images.device)
-        span = torch.arange(self.crop, device=images.device)
-        rows, cols = (top[:, None] + span)[:, :, None], (left[:, None] + span)[:, None, :]
-        return images.movedim(1, 3)[batch[:, None, None], rows, cols].movedim(3, 1)
+
+def cropped(images: torch.Tensor, size: int, at_random: bool) -> torch.Tensor:
+    """Crop (B, T, H, W, 3) to squares: at random, the same over a window's time, or the middle; 0: leave it whole."""
+    free = images.shape[2] - size
+    if not 0 < size < images.shape[2]:
+        return images
+    if not at_random:
+        return images[:, :, free // 2 : free // 2 + size, free // 2 : free // 2 + size]
+    batch = torch.arange(len(images), device=images.device)
+    top, left = torch.randint(free + 1, (2, len(images)), device=images.device)
+    span = torch.arange(size, device=images.device)
+    rows, cols = (top[:, None] + span)[:, :, None], (left[:, None] + span)[:, None, :]
+    return images.movedim(1, 3)[batch[:, None, None], rows, cols].movedim(3, 1)

@@ -11,6 +11,7 @@ import numpy as np
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 
 POSE = "extra/tcp_pose"
+POSE_FEATURES = 9
 
 
 @dataclass(frozen=True)

@@ -104,7 +104,7 @@ def video(frames: list[Frame], fps: int = 10) -> bytes:
 
 def training_curve(log_file: Path) -> str:
     """The loss over gradient steps, as a plotly figure that needs no network."""
-    entries = [json.loads(line) for line in log_file.read_text().splitlines()]
+    entries = [entry for line in log_file.read_text().splitlines() if "loss" in (entry := json.loads(line))]
     figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e["loss"] for e in entries], mode="lines"))
     figure.update_layout(
         xaxis_title="gradient step",

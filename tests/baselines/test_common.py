@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from baselines.common.dataset import SequenceDataset
-from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18
+from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE, observation_spec, pose_features, prepare
 from baselines.common.unet import ConditionalUnet1D
@@ -108,13 +108,11 @@ def test_encoder_sees_every_modality(name):
 
 
 def test_crops_are_random_in_training_and_central_in_evaluation():
-    spec = observation_spec("rgb", ("wrist",), (), 64)
-    encoder = ObservationEncoder(EncoderConfig(image="small_cnn", crop=48), spec, 2)
     images = torch.randint(0, 255, (4, 2, 64, 64, 3), dtype=torch.uint8)
     images[:, 1] = images[:, 0]
-    central = encoder.eval()._cropped(images)
+    central = cropped(images, 48, at_random=False)
     assert torch.equal(central, images[:, :, 8:56, 8:56])
-    crops = encoder.train()._cropped(images)
+    crops = cropped(images, 48, at_random=True)
     assert crops.shape == (4, 2, 48, 48, 3)
     assert torch.equal(crops[:, 0], crops[:, 1])  # the same over a window
     assert not torch.equal(crops, central)

@@ -1,6 +1,9 @@
-"""A trained Diffusion Policy as evaluation wants it: an environment's observations in, one action out."""
+"""A trained policy as evaluation wants it: an environment's observations in, one action out."""
 
+import importlib
+import typing
 from collections import deque
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,28 +11,39 @@ import numpy as np
 import torch
 from mani_skill.utils import common
 
-from baselines.common.checkpoint import load_weights, read_tensors
-from baselines.common.encoders import EncoderConfig
-from baselines.common.observation import ObservationSpec, observation_spec, prepare
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 
-from .policy import DiffusionPolicy, PolicyConfig
+from .checkpoint import WEIGHTS, load_weights, read_tensors
+from .observation import ObservationSpec, observation_spec, prepare
+from .policy import VisuotactilePolicy
+
+KIND = "baselines.common.agent:PolicyAgent"
 
 
-def build_policy(config: dict[str, Any]) -> DiffusionPolicy:
-    """The untrained network of a checkpoint's config.
+def build_policy(config: dict[str, Any]) -> VisuotactilePolicy:
+    """The untrained network of a checkpoint's config, whose "policy_class" reads "module:Class".
 
     Raises:
-        CheckpointError: the config is not one of this policy.
+        CheckpointError: the config is not one of a policy of these baselines.
     """
     try:
-        fields = dict(config["policy"])
-        policy = PolicyConfig(**fields | dict(encoder=EncoderConfig(**fields["encoder"]), channels=tuple(fields["channels"])))
-        return DiffusionPolicy(policy, spec_of(config), config["action_dim"])
-    except (KeyError, TypeError) as error:
+        module, _, name = config["policy_class"].partition(":")
+        policy_class = getattr(importlib.import_module(module), name)
+        return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
+    except (KeyError, TypeError, ValueError, ImportError, AttributeError) as error:
         raise CheckpointError(
-            f"config is not one of a Diffusion Policy ({error!r}); evaluate it with its own script"
+            f"config is not one of a policy of these baselines ({error!r}); evaluate it with the code it was trained with"
         ) from error
+
+
+def _from_json(cls: Any, value: Any) -> Any:
+    """A dataclass, with those inside it, from what `as_json` made of it."""
+    if is_dataclass(cls):
+        types = typing.get_type_hints(cls)
+        if unknown := set(value) - {f.name for f in fields(cls)}:
+            raise TypeError(f"{cls.__name__} has no {sorted(unknown)}")
+        return cls(**{name: _from_json(types[name], part) for name, part in value.items()})
+    return tuple(value) if typing.get_origin(cls) is tuple else value
 
 
 def spec_of(config: dict[str, Any]) -> ObservationSpec:
@@ -37,19 +51,19 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
     return observation_spec(config["obs_mode"], cameras, pads, config["image_size"])
 
 
-class DiffusionPolicyAgent:
+class PolicyAgent:
     """Carries out `action_horizon` actions of a prediction, then predicts anew from the last `obs_horizon` observations.
 
     Args:
         checkpoint: folder with config.json and model.safetensors.
-        inference_steps: denoising steps; None: as trained (DDPM).
+        inference_steps: of generation; None: as trained.
         seed: of the sampled noise; `reset` starts it anew, so that an episode depends on its observations alone.
     """
 
     def __init__(self, checkpoint: Path, inference_steps: int | None = None, seed: int = 0, device: str = "cpu"):
         self.config = checkpoint_config(checkpoint)
         self.policy = build_policy(self.config).to(device).eval()
-        load_weights(self.policy, read_tensors(Path(checkpoint) / "model.safetensors"), checkpoint)
+        load_weights(self.policy, read_tensors(Path(checkpoint) / WEIGHTS), checkpoint)
         self.device, self.seed = torch.device(device), seed
         self.inference_steps = inference_steps or self.config["inference_steps"]
         self.reset()

@@ -1,0 +1,35 @@
+"""Training on several devices at once, one process each, as `torchrun` starts them."""
+
+import os
+
+import torch
+import torch.distributed as dist
+import torch.nn as nn
+
+
+class Processes:
+    """This process among those of a run; alone if `torchrun` did not start it."""
+
+    def __init__(self, device: str):
+        self.rank, self.count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+        local = f":{os.environ['LOCAL_RANK']}" if "LOCAL_RANK" in os.environ and device == "cuda" else ""
+        self.device = torch.device(device + local)
+        if self.count > 1:
+            dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+
+    @property
+    def first(self) -> bool:
+        """Whether this one writes logs and checkpoints."""
+        return self.rank == 0
+
+    def joined(self, model: nn.Module) -> nn.Module:
+        """The model, its gradients the mean over all processes."""
+        return nn.parallel.DistributedDataParallel(model) if self.count > 1 else model
+
+    def wait(self) -> None:
+        if self.count > 1:
+            dist.barrier()
+
+    def close(self) -> None:
+        if self.count > 1:
+            dist.destroy_process_group()

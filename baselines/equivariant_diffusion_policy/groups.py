@@ -1,0 +1,114 @@
+"""Layers that turn with what they see, by eighths of a turn: the cyclic group C8 (Cohen & Welling 2016).
+
+A regular field holds, for each of its channels, one value for every rotation g: (B, C, 8, ...). When what is seen turns by h,
+the values of a regular field move from g to g + h. Rotations are counter-clockwise, of images as they are looked at (columns to
+the right, rows down) and of vectors with x to the right and y up.
+"""
+
+import math
+
+import numpy as np
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+
+ORDER = 8
+RING_WIDTH = 0.6  # pixels
+
+
+def rotation(g: int) -> np.ndarray:
+    """(2, 2): turns vectors by g eighths of a turn."""
+    c, s = math.cos(2 * math.pi * g / ORDER), math.sin(2 * math.pi * g / ORDER)
+    return np.array([[c, -s], [s, c]])
+
+
+def representation(size: int, pairs: tuple[tuple[int, int], ...]) -> torch.Tensor:
+    """(8, size, size): how numbers turn of which these pairs are vectors and the others are scalars."""
+    turns = np.tile(np.eye(size), (ORDER, 1, 1))
+    for g in range(ORDER):
+        for pair in pairs:
+            turns[g][np.ix_(pair, pair)] = rotation(g)
+    return torch.as_tensor(turns, dtype=torch.float32)
+
+
+def in_every_frame(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """Numbers (..., D) as they look from frames turned by every g: (8, ..., D). They are regular, along the first axis."""
+    return torch.einsum("gba,...b->g...a", turns, values)  # the inverse of a rotation is its transpose
+
+
+def from_every_frame(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """The mean (..., D) of numbers (8, ..., D) that were said in every frame."""
+    return torch.einsum("gab,g...b->...a", turns, values) / ORDER
+
+
+def filter_basis(size: int) -> torch.Tensor:
+    """(8, n, size^2): rings of n circular waves, of unit norm, turned by every g (Weiler & Cesa 2019, section 2.7).
+
+    What is made of them turns as smoothly as they do, where a free filter of 3 x 3 has nothing between its weights.
+    """
+    half = size // 2
+    row, column = np.divmod(np.arange(size * size), size)
+    radius, angle = np.hypot(column - half, half - row), np.arctan2(half - row, column - half)
+    waves = []
+    for ring in range(half + 1):
+        profile = np.exp(-((radius - ring) ** 2) / (2 * RING_WIDTH**2)) * (radius <= half + 0.5)
+        for frequency in range(2 * ring + 1):
+            for phase in (0.0, np.pi / 2)[: 1 + (frequency > 0)]:
+                turned = [np.cos(frequency * (angle - 2 * np.pi * g / ORDER) - phase) * profile for g in range(ORDER)]
+                if frequency:
+                    turned = [np.where(radius == 0, 0.0, wave) for wave in turned]
+                waves.append(np.stack(turned) / np.linalg.norm(turned[0]))
+    return torch.as_tensor(np.stack(waves, axis=1), dtype=torch.float32)
+
+
+class GroupConv(nn.Module):
+    """Convolution of regular fields, or of an image's plain channels (`lifting`), into regular fields.
+
+    Takes and gives (B, C * 8, H, W), the rotations of a channel side by side; lifting takes (B, C, H, W). Its sides keep their
+    lengths.
+    """
+
+    basis: torch.Tensor
+    shift: torch.Tensor
+
+    def __init__(self, inputs: int, outputs: int, size: int, lifting: bool = False):
+        super().__init__()
+        self.size, self.lifting = size, lifting
+        seen = 1 if lifting else ORDER
+        self.register_buffer("basis", filter_basis(size), persistent=False)
+        waves = self.basis.shape[1]
+        self.weight = nn.Parameter(torch.randn(outputs, inputs, seen, waves) * math.sqrt(2 / (inputs * seen * waves)))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        g = torch.arange(ORDER)
+        self.register_buffer("shift", (g - g[:, None]) % ORDER, persistent=False)  # of the input's rotation, seen from g
+
+    def forward(self, fields: torch.Tensor) -> torch.Tensor:
+        turned = torch.einsum("gqp,oihq->goihp", self.basis, self.weight)
+        if not self.lifting:
+            index = self.shift[:, None, None, :, None].expand(*turned.shape)
+            turned = turned.gather(3, index)
+        outputs, inputs, seen, _ = self.weight.shape
+        kernel = turned.movedim(0, 1).reshape(outputs * ORDER, inputs * seen, self.size, self.size)
+        rim = self.size // 2
+        if rim:  # zeros would draw a square, which no turn but a quarter leaves as it is
+            fields = F.pad(fields, (rim, rim, rim, rim), mode="replicate")
+        return F.conv2d(fields, kernel, self.bias.repeat_interleave(ORDER))
+
+
+class FieldNorm(nn.Module):
+    """GroupNorm that treats the rotations of a channel alike."""
+
+    def __init__(self, groups: int, channels: int):
+        super().__init__()
+        self.groups = groups
+        self.weight, self.bias = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+
+    def forward(self, fields: torch.Tensor) -> torch.Tensor:
+        return F.group_norm(fields, self.groups, self.weight.repeat_interleave(ORDER), self.bias.repeat_interleave(ORDER))
+
+
+def halve(fields: torch.Tensor) -> torch.Tensor:
+    """Half the height and width, by means over places that lie symmetrically, of even and of odd sides."""
+    if fields.shape[-1] % 2 == 0:
+        return F.avg_pool2d(fields, 2)
+    return F.avg_pool2d(fields, 3, stride=2, padding=1, count_include_pad=False)

@@ -1,0 +1,40 @@
+"""Train an Equivariant Diffusion Policy on demonstrations.
+
+    python baselines/equivariant_diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
+    python baselines/equivariant_diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
+
+`paper` has the paper's hyperparameters, `cpu` a small network for two cores.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from baselines.common.encoders import EncoderConfig
+from baselines.common.presets import for_cpu
+from baselines.common.training import TrainArgs, train
+from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
+
+
+@dataclass
+class Args(TrainArgs):
+    policy: EquivariantConfig = field(default_factory=lambda: EquivariantConfig(encoder=EncoderConfig(crop=230)))
+    inference_steps: int = 100
+    """denoising steps of DDIM, in evaluation"""
+    run_dir: Path = Path("runs/equivariant_diffusion_policy")
+
+
+PRESETS = {
+    "paper": ("the paper's hyperparameters", Args(demos=())),
+    "cpu": ("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, hidden=16)),
+}
+
+
+def main(args: Args) -> Path:
+    """Train, and return the last checkpoint."""
+    return train(args, EquivariantDiffusionPolicy)
+
+
+if __name__ == "__main__":
+    main(tyro.extras.overridable_config_cli(PRESETS))

@@ -1,0 +1,240 @@
+"""Every policy learns, saves, resumes, and refuses what is not its own."""
+
+import dataclasses
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from baselines.common import training
+from baselines.common.agent import PolicyAgent
+from baselines.common.background_evaluation import BackgroundEvaluation
+from baselines.common.checkpoint import read_tensors
+from baselines.common.encoders import EncoderConfig
+from baselines.common.training import TrainArgs, TrainingError
+from baselines.diffusion_policy import train as diffusion
+from baselines.equivariant_diffusion_policy import train as equivariant
+from baselines.flow_matching import train as flow
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from tests.conftest import PEG
+
+POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
+POLICIES["consistency"] = (flow, dict(consistency=True))
+
+
+@dataclasses.dataclass
+class Run:
+    """A policy's training on the recorded episodes."""
+
+    train: Callable[[TrainArgs], Path]
+    args: TrainArgs
+
+    def again(self, **changes) -> Path:
+        return self.train(dataclasses.replace(self.args, **changes))
+
+
+@pytest.fixture(scope="module", params=POLICIES)
+def run(request, demos, tmp_path_factory):
+    script, own = POLICIES[request.param]
+    paper = script.PRESETS["paper"][1]
+    small = dict(encoder=EncoderConfig(force_field="small"), channels=(32, 64), step_embedding=32, **own)
+    if script is not flow:
+        small |= dict(diffusion_steps=20)
+    args = dataclasses.replace(
+        paper,
+        demos=(demos,),
+        obs_mode="tacff",
+        cameras=(),
+        policy=dataclasses.replace(paper.policy, **small),
+        inference_steps=20,
+        batch_size=32,
+        steps=120,
+        lr=1e-3,
+        warmup_steps=5,
+        save_every=60,
+        log_every=30,
+        device="cpu",
+        precision="fp32",
+        compile=False,
+        run_dir=tmp_path_factory.mktemp("run"),
+    )
+    return Run(script.main, args)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(run):
+    return run.again()
+
+
+def log_of(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_presets_hold_the_papers_hyperparameters():
+    for script, lr in ((diffusion, 8e-5), (equivariant, 1e-4), (flow, 1e-4)):
+        paper = script.PRESETS["paper"][1]
+        policy = paper.policy
+        assert (policy.obs_horizon, policy.action_horizon, policy.pred_horizon) == (2, 8, 16)
+        assert (paper.lr, paper.betas, paper.weight_decay, paper.warmup_steps) == (lr, (0.95, 0.999), 1e-6, 500)
+        assert (paper.batch_size, paper.image_size, policy.channels) == (8, 256, (512, 1024, 2048))
+        assert (policy.encoder.image, policy.encoder.force_field) == ("resnet18", "resnet18")
+    ddpm, ddim = diffusion.PRESETS["paper"][1].policy, equivariant.PRESETS["paper"][1].policy
+    assert (ddpm.diffusion_steps, ddpm.sampler, ddpm.prediction, ddpm.encoder.crop) == (100, "ddpm", "epsilon", 0)
+    assert (ddim.diffusion_steps, ddim.sampler, ddim.prediction, ddim.encoder.crop) == (100, "ddim", "sample", 230)
+    assert ddim.hidden == 128
+
+
+def test_loss_falls(run, checkpoint):
+    log = log_of(run.args.run_dir)
+    assert [entry["step"] for entry in log] == [30, 60, 90, 120]
+    assert log[-1]["loss"] < 0.8 * log[0]["loss"]
+
+
+def test_checkpoints_are_json_and_safetensors(run, checkpoint):
+    assert {file.name for file in checkpoint.iterdir()} == {"config.json", "model.safetensors", "training.safetensors"}
+    assert checkpoint_config(checkpoint)["step"] == 120
+    older = run.args.run_dir / "checkpoints/00000060"
+    assert {file.name for file in older.iterdir()} == {"config.json", "model.safetensors"}  # only the last can be resumed
+
+
+def test_only_the_last_checkpoints_are_kept(run, tmp_path):
+    run.again(run_dir=tmp_path, steps=20, save_every=4, keep=3)
+    kept = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
+    assert kept == ["00000012", "00000016", "00000020", "last"]
+
+
+def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkeypatch):
+    class Stop(Exception):
+        pass
+
+    def save_then_stop(*_):
+        raise Stop
+
+    with monkeypatch.context() as patch, pytest.raises(Stop):
+        patch.setattr(training, "prune", save_then_stop)  # what follows the first checkpoint
+        run.again(run_dir=tmp_path)
+    assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60
+    resumed = run.again(run_dir=tmp_path, resume=True)
+    assert checkpoint_config(resumed)["step"] == 120
+    whole, second = read_tensors(checkpoint / "model.safetensors"), read_tensors(resumed / "model.safetensors")
+    assert all(torch.equal(whole[name], second[name]) for name in whole)
+    assert log_of(tmp_path) == log_of(run.args.run_dir)
+
+
+def test_the_seed_fixes_everything(run, tmp_path):
+    losses = []
+    for name, seed in (("first", 0), ("same", 0), ("other", 1)):
+        run.again(run_dir=tmp_path / name, seed=seed, steps=30)
+        losses.append(log_of(tmp_path / name)[0]["loss"])
+    assert losses[0] == losses[1] != losses[2]
+
+
+def test_resume_with_other_settings_names_them(run, checkpoint):
+    with pytest.raises(CheckpointError, match=r"lr: 0.001 there, 0.5 now"):
+        run.again(resume=True, lr=0.5)
+
+
+def test_resume_without_a_checkpoint(run, tmp_path):
+    with pytest.raises(CheckpointError, match="config.json"):
+        run.again(resume=True, run_dir=tmp_path)
+
+
+def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_path):
+    with pytest.raises(TrainingError, match=r"the loss of step \d+ is (nan|inf), on episode \d step \d+, .*--lr"):
+        run.again(run_dir=tmp_path, lr=1e30, save_every=10, log_every=10)
+    weights = sorted((tmp_path / "checkpoints").glob("*/model.safetensors"))
+    assert all(torch.isfinite(tensor).all() for path in weights for tensor in read_tensors(path).values())
+
+
+def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
+    run.again(run_dir=tmp_path, precision="bf16")
+    for half, full in zip(log_of(tmp_path), log_of(run.args.run_dir), strict=True):
+        assert half["loss"] == pytest.approx(full["loss"], rel=0.1)
+
+
+def test_agent_acts_and_repeats_itself_after_reset(make_env, checkpoint):
+    env = make_env(PEG, obs_mode="tacff", render_backend="none")
+    agent = PolicyAgent(checkpoint)
+    obs, _ = env.reset(seed=0)
+    first = [agent.act(obs) for _ in range(10)]
+    agent.reset()
+    second = [agent.act(obs) for _ in range(10)]
+    assert all(a.shape == (6,) and (a == b).all() for a, b in zip(first, second, strict=True))
+    few = PolicyAgent(checkpoint, inference_steps=4)
+    assert few.act(obs).shape == (6,)
+
+
+def test_checkpoint_of_another_architecture_is_refused(checkpoint, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(checkpoint, other)
+    config = checkpoint_config(other)
+    config["policy"]["channels"] = [16, 32]
+    (other / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="another architecture"):
+        PolicyAgent(other)
+
+
+def test_checkpoint_of_another_policy_is_refused(checkpoint, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(checkpoint, other)
+    (other / "config.json").write_text(json.dumps(dict(kind="something:Else")))
+    with pytest.raises(CheckpointError, match="not one of a policy"):
+        PolicyAgent(other)
+
+
+def test_truncated_weights_are_refused(checkpoint, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(checkpoint, other)
+    (other / "model.safetensors").write_bytes((checkpoint / "model.safetensors").read_bytes()[:1000])
+    with pytest.raises(CheckpointError, match="cannot be read"):
+        PolicyAgent(other)
+
+
+@pytest.fixture
+def evaluation(tmp_path, checkpoint):
+    for step in (1, 2):
+        shutil.copytree(checkpoint, tmp_path / f"checkpoints/{step:08d}")
+    return BackgroundEvaluation(tmp_path / "evaluations", episodes=1, workers=1, env_kwargs='{"render_backend": "none"}')
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_checkpoints_are_evaluated_one_after_the_other(evaluation, tmp_path):
+    folders = sorted((tmp_path / "checkpoints").iterdir())
+    for folder in folders:
+        evaluation.submit(folder)
+    assert evaluation.finished() == []
+    assert evaluation.in_use == set(folders)
+    rates = evaluation.finished(wait=True)
+    assert [rate["evaluated_step"] for rate in rates] == [1, 2]
+    assert rates[0]["success_once"] == json.loads((tmp_path / "evaluations/00000001.json").read_text())["success_once"]["rate"]
+    assert evaluation.in_use == set()
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_an_evaluation_that_fails_does_not_stop_training(evaluation, tmp_path, caplog):
+    (tmp_path / "checkpoints/00000001/config.json").write_text("broken")
+    evaluation.submit(tmp_path / "checkpoints/00000001")
+    assert evaluation.finished(wait=True) == []
+    assert "00000001.log says why" in caplog.text
+    assert "is not json" in (tmp_path / "evaluations/00000001.log").read_text()
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_two_processes_train_one_policy(run, tmp_path):
+    arguments = ["cpu", "--demos", str(run.args.demos[0]), "--obs-mode", "tacff", "--steps", "60", "--batch-size", "16"]
+    arguments += ["--save-every", "60", "--log-every", "20", "--run-dir", str(tmp_path)]
+    arguments += ["--policy.channels", "32", "64", "--policy.step-embedding", "32"]
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    done = subprocess.run(
+        [*command, "baselines/diffusion_policy/train.py", *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    losses = [entry["loss"] for entry in log_of(tmp_path)]
+    assert len(losses) == 3
+    assert losses[-1] < 0.8 * losses[0]
+    assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60
