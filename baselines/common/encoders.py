@@ -3,12 +3,19 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 import torch.nn as nn
 from transformers import ResNetConfig, ResNetModel
 
-from .observation import POSE, POSE_FEATURES, ObservationSpec
+from baselines.tactile_representations.anytouch import AnyTouch
+from baselines.tactile_representations.representation import Representation
+from baselines.tactile_representations.sparsh import Sparsh
+from baselines.tactile_representations.t3 import T3
+from baselines.tactile_representations.unit import UniT
+
+from .observation import POSE, POSE_FEATURES, ObservationSpec, is_tactile
 
 IMAGE_FEATURES = 64  # per image: 32 key points
 
@@ -16,7 +23,11 @@ IMAGE_FEATURES = 64  # per image: 32 key points
 @dataclass
 class EncoderConfig:
     image: str = "resnet18"
-    """network of each camera and TacRGB image, by its name in IMAGE_ENCODERS"""
+    """network of each camera, by its name in IMAGE_ENCODERS"""
+    tacrgb: str = "resnet18"
+    """network of each TacRGB image, by its name in TACRGB_ENCODERS"""
+    freeze_tacrgb: bool = False
+    """leave a tactile representation as it was loaded, and train what follows it"""
     force_field: str = "resnet18"
     """network of each TacFF field, by its name in FIELD_ENCODERS"""
     crop: int = 0
@@ -83,6 +94,41 @@ def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> list[n
     return [nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
 
 
+class RepresentationEncoder(nn.Module):
+    """A tactile representation, and a layer to as many features as other images have."""
+
+    def __init__(self, representation: Representation, size: int):
+        super().__init__()
+        if size % representation.patch:
+            name, patch = type(representation).__name__, representation.patch
+            raise ValueError(f"{name} takes pictures whose sides are a multiple of {patch}, not {size}; give --image-size 224")
+        self.representation, self.frozen = representation, False
+        self.out = nn.Linear(representation.out_features, IMAGE_FEATURES)
+
+    def freeze(self) -> None:
+        self.representation.requires_grad_(False)
+        self.frozen = True
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
+            features = self.representation(image)
+        return self.out(features)
+
+
+def load_representations(policy: nn.Module, weights: Path) -> None:
+    """Load weights into every tactile representation of a policy.
+
+    Raises:
+        ValueError: it has none.
+        CheckpointError: the weights are of something else.
+    """
+    encoders = [module for module in policy.modules() if isinstance(module, RepresentationEncoder)]
+    if not encoders:
+        raise ValueError(f"{weights} are given for TacRGB, but no network takes them; give --policy.encoder.tacrgb t3, say")
+    for encoder in encoders:
+        encoder.representation.load(weights)
+
+
 class SmallFieldNet(nn.Module):
     """A force field's 10 x 14 taxels through two convolutions, then all of them at once: its places carry meaning."""
 
@@ -109,27 +155,63 @@ IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {  # of the picture's si
     "resnet18": lambda size: _key_points(ResNet18()),
     "small_cnn": SmallCNN,
 }
+TACRGB_ENCODERS: dict[str, Callable[[int], nn.Module]] = IMAGE_ENCODERS | {
+    "unit": lambda size: RepresentationEncoder(UniT(), size),
+    "unit_released": lambda size: RepresentationEncoder(UniT(attention=True), size),
+    "t3": lambda size: RepresentationEncoder(T3(), size),
+    "anytouch": lambda size: RepresentationEncoder(AnyTouch(), size),
+    "sparsh": lambda size: RepresentationEncoder(Sparsh(), size),
+}
 FIELD_ENCODERS: dict[str, Callable[[], nn.Module]] = {
     "resnet18": lambda: _pooled(ResNet18()),  # the paper's: the field as a small image
     "small": SmallFieldNet,
 }
 
 
+def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.Module:
+    """The network of one camera or TacRGB image.
+
+    Raises:
+        ValueError: its name is unknown, or it does not take pictures of this size.
+    """
+    size = config.crop or spec.image_size
+    if not is_tactile(key):
+        return _known(IMAGE_ENCODERS, config.image)(size)
+    encoder = _known(TACRGB_ENCODERS, config.tacrgb)(size)
+    if config.freeze_tacrgb:
+        if not isinstance(encoder, RepresentationEncoder):
+            raise ValueError(f"freeze_tacrgb: {config.tacrgb!r} is no representation that could be loaded; leave it False")
+        encoder.freeze()
+    return encoder
+
+
+def field_encoder(config: EncoderConfig) -> nn.Module:
+    """The network of one TacFF field.
+
+    Raises:
+        ValueError: its name is unknown.
+    """
+    return _known(FIELD_ENCODERS, config.force_field)()
+
+
+def _known(table: dict, name: str) -> Callable:
+    if name not in table:
+        raise ValueError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
+    return table[name]
+
+
 class ObservationEncoder(nn.Module):
     """Features (B, obs_horizon * F) of a window of observations; networks are shared over time, not over sensors.
 
     Raises:
-        ValueError: an encoder's name is unknown.
+        ValueError: an encoder's name is unknown, or it does not take pictures of this size.
     """
 
     def __init__(self, config: EncoderConfig, spec: ObservationSpec, obs_horizon: int):
         super().__init__()
-        for name, table in ((config.image, IMAGE_ENCODERS), (config.force_field, FIELD_ENCODERS)):
-            if name not in table:
-                raise ValueError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
         self.crop, self.spec = config.crop, spec
-        self.images = nn.ModuleList(IMAGE_ENCODERS[config.image](config.crop or spec.image_size) for _ in spec.images)
-        self.fields = nn.ModuleList(FIELD_ENCODERS[config.force_field]() for _ in spec.force_fields)
+        self.images = nn.ModuleList(image_encoder(config, spec, key) for key in spec.images)
+        self.fields = nn.ModuleList(field_encoder(config) for _ in spec.force_fields)
         per_step = IMAGE_FEATURES * (len(self.images) + len(self.fields)) + POSE_FEATURES
         self.out_features = obs_horizon * per_step
 

@@ -47,16 +47,24 @@ def observation_spec(
     return ObservationSpec(tuple(images), tuple(fields), image_size)
 
 
+def is_tactile(key: str) -> bool:
+    return key.startswith("sensor_data/tactile_")
+
+
 def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:
     """One observation over time, (T, ...): images at the policy's size, poses as 9 numbers that have no jumps."""
     if key in spec.images:
-        size = (spec.image_size, spec.image_size)
-        if value.shape[1:3] == size:
-            return value
-        return np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in value])
+        return prepare_images(value, spec.image_size)
     if key == POSE:
         return pose_features(value)
     return value.astype(np.float32)
+
+
+def prepare_images(images: np.ndarray, size: int) -> np.ndarray:
+    """Images (T, H, W, 3) as squares of so many pixels."""
+    if images.shape[1:3] == (size, size):
+        return images
+    return np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) for image in images])
 
 
 def pose_features(pose: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ def for_cpu(args: Args, inference_steps: int, **policy: Any) -> Args:
         args.policy,
         action_horizon=4,
         obs_horizon=1,  # with two, its own motion tells a policy what to do next, and it stops looking
-        encoder=EncoderConfig(image="small_cnn", force_field="small", crop=76),
+        encoder=EncoderConfig(image="small_cnn", tacrgb="small_cnn", force_field="small", crop=76),
         channels=(64, 128, 256),
         step_embedding=64,
         pose_noise=0.1,

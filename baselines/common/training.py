@@ -29,6 +29,7 @@ from .checkpoint import (
     unpack,
 )
 from .dataset import SequenceDataset
+from .encoders import load_representations
 from .policy import PolicyConfig, VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog
@@ -53,6 +54,8 @@ class TrainArgs:
     cameras: tuple[str, ...] = ("wrist",)
     tactile_sensors: tuple[str, ...] = ("right",)
     image_size: int = 256
+    tacrgb_weights: Path | None = None
+    """weights of the tactile representation to begin with: as its authors released them, or from pretrain.py"""
     num_demos: int | None = None
     """episodes to train on; default: all"""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -93,7 +96,7 @@ class TrainArgs:
 
 
 FREE_ON_RESUME = {
-    *("demos", "run_dir", "resume", "device", "compile", "log_every", "wandb_project"),
+    *("demos", "tacrgb_weights", "run_dir", "resume", "device", "compile", "log_every", "wandb_project"),
     *("steps", "step", "save_every", "keep", "inference_steps"),
     *("eval_episodes", "eval_workers", "eval_env_kwargs"),
 }
@@ -128,6 +131,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
 
     # policy, optimiser, schedule, EMA
     policy = policy_class(args.policy, spec, action_dim).to(device, memory_format=torch.channels_last)
+    if args.tacrgb_weights and not args.resume:
+        load_representations(policy, args.tacrgb_weights)
     policy.fit_normalizers(dataset.observations, dataset.actions)
     if args.compile:
         policy.encoder.compile()

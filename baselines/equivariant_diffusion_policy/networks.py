@@ -3,8 +3,8 @@
 import torch
 import torch.nn as nn
 
-from baselines.common.encoders import FIELD_ENCODERS, IMAGE_ENCODERS, IMAGE_FEATURES, EncoderConfig, cropped
-from baselines.common.observation import POSE, POSE_FEATURES, ObservationSpec
+from baselines.common.encoders import IMAGE_FEATURES, EncoderConfig, cropped, field_encoder, image_encoder
+from baselines.common.observation import POSE, POSE_FEATURES, ObservationSpec, is_tactile
 from baselines.common.unet import ConditionalUnet1D
 
 from .groups import ORDER, FieldNorm, GroupConv, from_every_frame, halve, in_every_frame, representation
@@ -78,11 +78,11 @@ class EquivariantObservationEncoder(nn.Module):
     def __init__(self, config: EncoderConfig, spec: ObservationSpec, hidden: int, obs_horizon: int):
         super().__init__()
         self.crop, self.spec = config.crop, spec
-        self.cameras = [key for key in spec.images if "tactile" not in key]
-        self.pads = [key for key in spec.images if "tactile" in key]
+        self.cameras = [key for key in spec.images if not is_tactile(key)]
+        self.pads = [key for key in spec.images if is_tactile(key)]
         self.views = nn.ModuleList(EquivariantImageEncoder(hidden) for _ in self.cameras)
-        self.images = nn.ModuleList(IMAGE_ENCODERS[config.image](config.crop or spec.image_size) for _ in self.pads)
-        self.fields = nn.ModuleList(FIELD_ENCODERS[config.force_field]() for _ in spec.force_fields)
+        self.images = nn.ModuleList(image_encoder(config, spec, key) for key in self.pads)
+        self.fields = nn.ModuleList(field_encoder(config) for _ in spec.force_fields)
         sensors = len(self.views) + len(self.images) + len(self.fields)
         self.out_features = obs_horizon * (IMAGE_FEATURES * sensors + POSE_FEATURES)
         self.register_buffer("turns", representation(POSE_FEATURES, POSE_PAIRS), persistent=False)

@@ -121,8 +121,10 @@ def test_crops_are_random_in_training_and_central_in_evaluation():
 
 
 def test_unknown_encoder_names_those_there_are():
-    with pytest.raises(ValueError, match="resnet18"):
-        ObservationEncoder(EncoderConfig(image="resnet1800"), SPEC, 2)
+    spec = observation_spec("rgb+tacrgb+tacff", ("wrist",), ("right",), 64)
+    for wrong in (dict(image="resnet1800"), dict(tacrgb="resnet1800"), dict(force_field="resnet1800")):
+        with pytest.raises(ValueError, match="'resnet1800' is unknown; choose from .*resnet18"):
+            ObservationEncoder(EncoderConfig(**wrong), spec, 2)
 
 
 def test_unet_maps_actions_to_noise_and_uses_step_and_condition():

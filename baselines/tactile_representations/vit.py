@@ -1,0 +1,61 @@
+"""A vision transformer whose weights have the names of timm's, which published tactile representations were saved with."""
+
+import torch
+import torch.nn as nn
+import torch.nn.functional as F
+
+EPS = 1e-6  # of the layer norms, timm's
+
+
+class Attention(nn.Module):
+    def __init__(self, width: int, heads: int):
+        super().__init__()
+        self.heads = heads
+        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        q, k, v = self.qkv(tokens).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
+        return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+
+
+class Mlp(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        return self.fc2(F.gelu(self.fc1(tokens)))
+
+
+class LayerScale(nn.Module):
+    def __init__(self, width: int):
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(width))
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        return self.gamma * tokens
+
+
+class Block(nn.Module):
+    """A layer (B, N, width) -> (B, N, width), each half scaled by learned factors if asked for (Touvron et al. 2021)."""
+
+    def __init__(self, width: int, heads: int, scaled: bool = False):
+        super().__init__()
+        self.norm1, self.attn = nn.LayerNorm(width, EPS), Attention(width, heads)
+        self.norm2, self.mlp = nn.LayerNorm(width, EPS), Mlp(width)
+        self.ls1, self.ls2 = (LayerScale(width) if scaled else nn.Identity() for _ in range(2))
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        tokens = tokens + self.ls1(self.attn(self.norm1(tokens)))
+        return tokens + self.ls2(self.mlp(self.norm2(tokens)))
+
+
+class PatchEmbed(nn.Module):
+    """Patches (B, N, width) of pictures (B, C, H, W), row by row."""
+
+    def __init__(self, channels: int, width: int, patch: int):
+        super().__init__()
+        self.proj = nn.Conv2d(channels, width, patch, patch)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return self.proj(image).flatten(2).transpose(1, 2)
