@@ -11,47 +11,44 @@ from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
 
+Episode = dict[str, np.ndarray]
+
+
+def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
+    """Episodes of trajectory files of a task: what a policy sees (T + 1, ...), prepared, and "actions" (T, A).
+
+    Args:
+        num_demos: how many to take, over all files; None: all.
+
+    Raises:
+        DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
+    """
+    files, episodes = list(files), []
+    held = [len(read_header(file)["episodes"]) for file in files]
+    wanted = sum(held) if num_demos is None else num_demos
+    if not 0 < wanted <= sum(held):
+        raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
+    with progress_bar() as bar:
+        for file, count in zip(files, held, strict=True):
+            left = min(count, wanted - len(episodes))
+            if left == 0:
+                break
+            track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
+            for episode in read_demonstrations(file, spec.keys, env_id, left, track):
+                episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
+    return episodes
+
 
 class SequenceDataset:
     """All frames of all episodes on one device, images as uint8; a sample is an index into them.
 
     A sample at step t holds the observations t - obs_horizon + 1 .. t and the actions that begin with the first of them,
     `pred_horizon` in all. Before the start and after the end, the first and last are repeated.
-
-    Args:
-        files: trajectory files of `env_id`.
-        num_demos: how many episodes to take, over all files; None: all.
-
-    Raises:
-        DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
     """
 
     def __init__(
-        self,
-        files: Iterable[Path],
-        env_id: str,
-        spec: ObservationSpec,
-        obs_horizon: int,
-        pred_horizon: int,
-        num_demos: int | None,
-        device: torch.device,
+        self, episodes: list[Episode], spec: ObservationSpec, obs_horizon: int, pred_horizon: int, device: torch.device
     ):
-        files, episodes = list(files), []
-        held = [len(read_header(file)["episodes"]) for file in files]
-        wanted = sum(held) if num_demos is None else num_demos
-        if not 0 < wanted <= sum(held):
-            raise DemonstrationError(
-                f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer"
-            )
-        with progress_bar() as bar:
-            for file, count in zip(files, held, strict=True):
-                left = min(count, wanted - len(episodes))
-                if left == 0:
-                    break
-                track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
-                for episode in read_demonstrations(file, spec.keys, env_id, left, track):
-                    prepared = {key: prepare(key, episode[key], spec) for key in spec.keys}
-                    episodes.append(prepared | dict(actions=episode["actions"]))
         self.spec, self.device, self.num_episodes = spec, device, len(episodes)
         lengths = np.array([len(episode["actions"]) for episode in episodes])
         self.actions = self._load([episode["actions"] for episode in episodes])  # (S, A)

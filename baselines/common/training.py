@@ -28,7 +28,7 @@ from .checkpoint import (
     save_checkpoint,
     unpack,
 )
-from .dataset import SequenceDataset
+from .dataset import SequenceDataset, read_episodes
 from .encoders import load_representations
 from .policy import PolicyConfig, VisuotactilePolicy
 from .processes import Processes
@@ -120,8 +120,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     # data
     config = as_json(args)
     spec = spec_of(config)
-    horizons = (args.policy.obs_horizon, args.policy.pred_horizon)
-    dataset = SequenceDataset(args.demos, args.env_id, spec, *horizons, args.num_demos, device)
+    episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
+    dataset = SequenceDataset(episodes, spec, args.policy.obs_horizon, args.policy.pred_horizon, device)
     batch_size = args.batch_size * processes.count
     steps_per_epoch = math.ceil(len(dataset) / batch_size)
     total_steps = args.steps or steps_per_epoch * round(50_000 / dataset.num_episodes)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from baselines.common.dataset import SequenceDataset
+from baselines.common.dataset import SequenceDataset, read_episodes
 from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE, observation_spec, pose_features, prepare
@@ -20,7 +20,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def dataset(demos):
-    return SequenceDataset([demos], PEG, SPEC, obs_horizon=2, pred_horizon=16, num_demos=None, device=CPU)
+    return SequenceDataset(read_episodes([demos], PEG, SPEC, None), SPEC, obs_horizon=2, pred_horizon=16, device=CPU)
 
 
 def test_samples_are_the_windows_of_the_file(demos, dataset):
@@ -43,11 +43,10 @@ def test_windows_do_not_cross_episodes(demos, dataset):
 
 
 def test_number_of_demonstrations(demos):
-    one = SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=1, device=CPU)
-    assert one.num_episodes == 1
-    assert SequenceDataset([demos, demos], PEG, SPEC, 2, 16, num_demos=3, device=CPU).num_episodes == 3
+    assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
+    assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
     with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, the files hold"):
-        SequenceDataset([demos], PEG, SPEC, 2, 16, num_demos=9, device=CPU)
+        read_episodes([demos], PEG, SPEC, 9)
 
 
 def test_pose_features_are_the_rotation_whatever_the_quaternions_sign():

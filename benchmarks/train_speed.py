@@ -1,0 +1,144 @@
+"""How much faster the training loop is than a plain one: `python benchmarks/train_speed.py`.
+
+The plain one is what one writes first: a DataLoader that makes every sample by itself, fp32, eager, one optimiser step a batch.
+Both train the same Diffusion Policy with the paper's sizes on the same pictures, of two image encoders (camera and TacRGB).
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import cycle, islice
+from typing import Literal
+
+import numpy as np
+import torch
+import tyro
+from diffusers.training_utils import EMAModel
+from rich.console import Console
+from rich.table import Table
+from torch.utils.data import DataLoader, Dataset
+
+from baselines.common.dataset import Episode, SequenceDataset
+from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
+from baselines.common.observation import POSE, observation_spec
+from baselines.common.training import ON_GPU
+from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
+
+RNG = np.random.default_rng(0)
+WARM_UP = 2
+
+
+@dataclass
+class Args:
+    device: str = "cuda" if ON_GPU else "cpu"
+    batch_size: int = 64 if ON_GPU else 8
+    image_size: int = 256
+    steps: int = 30 if ON_GPU else 6
+    """timed steps of each"""
+    precision: Literal["fp32", "bf16"] = "bf16" if ON_GPU else "fp32"
+    compile: bool = ON_GPU
+    tacrgb: tuple[str, ...] = ("resnet18",)
+    """encoders of TacRGB to time; the paper's four: resnet18 unit t3 anytouch"""
+    demos: int = 103
+    """of the paper's runtime set-up, for minutes an epoch"""
+    demo_steps: int = 84
+    """of a demonstration"""
+
+
+SPEC_SENSORS = ("rgb+tacrgb", ("wrist",), ("right",))
+
+
+def made_up_episodes(spec, count: int, length: int) -> list[Episode]:
+    def episode() -> Episode:
+        pictures = {
+            key: RNG.integers(0, 255, (length + 1, spec.image_size, spec.image_size, 3), np.uint8) for key in spec.images
+        }
+        return pictures | {POSE: RNG.random((length + 1, 9), np.float32), "actions": RNG.random((length, 6), np.float32)}
+
+    return [episode() for _ in range(count)]
+
+
+class PlainDataset(Dataset):
+    """Samples one by one, pictures as floats."""
+
+    def __init__(self, data: SequenceDataset):
+        self.data = data
+
+    def __len__(self) -> int:
+        return len(self.data)
+
+    def __getitem__(self, index: int):
+        obs, actions = self.data.sample(torch.tensor([index]))
+        return {key: value[0].float() if value.dtype == torch.uint8 else value[0] for key, value in obs.items()}, actions[0]
+
+
+def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
+    optimizer = torch.optim.AdamW(policy.parameters(), 8e-5, foreach=False)
+    ema = EMAModel(policy.parameters(), power=0.75)
+    for obs, actions in cycle(DataLoader(PlainDataset(data), args.batch_size, shuffle=True)):
+        loss = policy({key: value.to(args.device) for key, value in obs.items()}, actions.to(args.device))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        ema.step(policy.parameters())
+        loss.item()
+        yield
+
+
+def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
+    """What `baselines.common.training` does between two logs."""
+    policy.to(memory_format=torch.channels_last)
+    if args.compile:
+        policy.encoder.compile()
+        policy.unet.compile()
+    optimizer = torch.optim.AdamW(policy.parameters(), 8e-5, fused=True)
+    ema = EMAModel(policy.parameters(), power=0.75, foreach=True)
+    precision = torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16")
+    while True:
+        batch = torch.randperm(len(data))[: args.batch_size].to(args.device)
+        with precision:
+            loss = policy(*data.sample(batch))
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        ema.step(policy.parameters())
+        yield
+
+
+def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) -> float:
+    torch.manual_seed(0)
+    size = args.image_size if tacrgb == "resnet18" else 224
+    spec = observation_spec(*SPEC_SENSORS, size)
+    data = SequenceDataset(made_up_episodes(spec, 4, 60), spec, 2, 16, torch.device("cpu" if plain_data else args.device))
+    policy = DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb=tacrgb)), spec, 6).to(args.device)
+    steps = loop(args, policy, data)
+    for _ in islice(steps, WARM_UP):
+        pass
+    synchronise = torch.cuda.synchronize if args.device == "cuda" else lambda: None
+    synchronise()
+    start = time.perf_counter()
+    for _ in islice(steps, args.steps):
+        pass
+    synchronise()
+    return (time.perf_counter() - start) / args.steps
+
+
+def main(args: Args) -> None:
+    if unknown := set(args.tacrgb) - set(TACRGB_ENCODERS):
+        raise SystemExit(f"tacrgb encoders {sorted(unknown)} are unknown; choose from {sorted(TACRGB_ENCODERS)}")
+    title = (
+        f"batch {args.batch_size}, {args.image_size} pixels, {args.device}, {torch.get_num_threads()} threads, {args.precision}"
+    )
+    table = Table("TacRGB encoder", "plain, img/s", "ours, img/s", "ratio", "ours, min/epoch", title=title)
+    pictures = 2 * 2 * args.batch_size  # two sensors, two steps of observation
+    batches = args.demos * args.demo_steps / args.batch_size
+    for tacrgb in args.tacrgb:
+        plain = seconds_a_step(args, plain_loop, tacrgb, plain_data=True)
+        ours = seconds_a_step(args, our_loop, tacrgb, plain_data=False)
+        row = (f"{pictures / plain:.1f}", f"{pictures / ours:.1f}", f"{plain / ours:.2f}", f"{batches * ours / 60:.1f}")
+        table.add_row(tacrgb, *row)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
