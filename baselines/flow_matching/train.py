@@ -29,7 +29,7 @@ class Args(TrainArgs):
 PRESETS = {
     "paper": ("the paper's hyperparameters", Args(demos=())),
     "consistency": ("for one-step generation", Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1)),
-    "cpu": ("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8)),
+    "cpu": ("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, prediction="sample")),
 }
 
 

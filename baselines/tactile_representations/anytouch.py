@@ -8,6 +8,7 @@ import torch.nn as nn
 from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from .representation import TokenRepresentation, imagenet_normalised
+from .vit import stretched
 
 SENSORS, SENSOR_TOKENS = 10, 5
 GELSIGHT = 0  # its sensor's number
@@ -33,7 +34,8 @@ class AnyTouch(TokenRepresentation):
     def embed(self, image):
         video = imagenet_normalised(image)[:, :, None].expand(-1, -1, FRAMES, -1, -1)
         patches = self.touch_model.embeddings.patch_embedding(video).flatten(2).transpose(1, 2)
-        return patches + self.touch_model.embeddings.position_embedding.weight[1:]
+        grid = [side // self.patch for side in image.shape[2:]]
+        return patches + stretched(self.touch_model.embeddings.position_embedding.weight[None, 1:], grid)
 
     def encode(self, tokens):
         embeddings = self.touch_model.embeddings

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 from .representation import TokenRepresentation, imagenet_normalised, read_pickled
-from .vit import EPS, Block, PatchEmbed
+from .vit import EPS, Block, PatchEmbed, stretched
 
 SENSOR = "gs_green"  # whose encoder the authors take for a sensor that has none
 SIZE = 224  # pixels, that it was trained with
@@ -45,7 +44,7 @@ class T3(TokenRepresentation):
     def embed(self, image):
         patches = self.encoder.patch_embed(imagenet_normalised(image))
         grid = [side // self.patch for side in image.shape[2:]]
-        return patches + _places(self.encoder.pos_embed[:, 1:], grid)
+        return patches + stretched(self.encoder.pos_embed[:, 1:], grid)
 
     def encode(self, tokens):
         first = (self.encoder.cls_token + self.encoder.pos_embed[:, :1]).expand(len(tokens), -1, -1)
@@ -63,12 +62,3 @@ class T3(TokenRepresentation):
 
     def published(self, weights):
         return weights
-
-
-def _places(learned: torch.Tensor, grid: list[int]) -> torch.Tensor:
-    """Places (1, N, width) learned on a square grid, for another."""
-    side = round(learned.shape[1] ** 0.5)
-    if grid == [side, side]:
-        return learned
-    square = learned.transpose(1, 2).unflatten(2, (side, side))
-    return F.interpolate(square, grid, mode="bicubic").flatten(2).transpose(1, 2)

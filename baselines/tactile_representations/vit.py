@@ -59,3 +59,12 @@ class PatchEmbed(nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         return self.proj(image).flatten(2).transpose(1, 2)
+
+
+def stretched(learned: torch.Tensor, grid: list[int]) -> torch.Tensor:
+    """Places (1, N, width) learned on a square grid, for another."""
+    side = round(learned.shape[1] ** 0.5)
+    if grid == [side, side]:
+        return learned
+    square = learned.transpose(1, 2).unflatten(2, (side, side))
+    return F.interpolate(square, grid, mode="bicubic").flatten(2).transpose(1, 2)

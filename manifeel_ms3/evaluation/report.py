@@ -7,30 +7,25 @@ file that needs nothing else.
 import base64
 import json
 import logging
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import gymnasium as gym
-import imageio.v2 as imageio
 import jinja2
 import numpy as np
 import plotly.graph_objects as go
-import torch
 import tyro
-from mani_skill.utils import common
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.sensors.visualisation import force_field_images
 
+from .film import Frame, record_episode, video
 from .policy import load_policy
-from .rollout import EpisodeOutcome, evaluate_episode
+from .result import read_result
 
 log = logging.getLogger(__name__)
 STRIP_FRAMES = 8
-TILE = 240  # pixels, height of a tile
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 
 
@@ -40,41 +35,6 @@ class Args:
     """folder with evaluation.json, log.jsonl and checkpoints/last"""
     out: Path | None = None
     """page to write; default: report.html in run_dir"""
-
-
-@dataclass
-class Frame:
-    """What was seen at one step, uint8 RGB pictures by name."""
-
-    pictures: dict[str, np.ndarray]
-
-
-def record_episode(result: dict[str, Any], checkpoint: Path) -> tuple[EpisodeOutcome, list[Frame]]:
-    """Roll the first successful episode (or the first) of an evaluation out again, with every picture."""
-    torch.set_num_threads(1)  # as in the evaluation: sums, and with them a rollout, depend on it
-    seeds = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
-    seed = (seeds or [result["episodes"][0]["seed"]])[0]
-    cameras = tuple(dict.fromkeys([*result["env_kwargs"]["cameras"], "front"]))
-    env = gym.make(result["env_id"], **result["env_kwargs"] | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras))
-    frames: list[Frame] = []
-
-    def keep(obs: dict[str, Any]) -> None:
-        pictures = {}
-        for name, data in obs["sensor_data"].items():
-            title = name.replace("_", " ")
-            pictures[title if name in cameras else f"{title}: TacRGB"] = common.to_numpy(data["rgb"])[0]
-            if "force_field" in data:
-                pictures[f"{title}: TacFF"] = common.to_numpy(force_field_images(data["force_field"]))[0]
-        frames.append(Frame(pictures))
-
-    outcome = evaluate_episode(env, load_policy(checkpoint), seed, keep)
-    env.close()
-    return outcome, frames
-
-
-def _tile(picture: np.ndarray) -> np.ndarray:
-    height, width = picture.shape[:2]
-    return cv2.resize(picture, (round(TILE * width / height), TILE), interpolation=cv2.INTER_AREA)
 
 
 def strip(frames: list[Frame]) -> tuple[list[str], bytes]:
@@ -90,16 +50,6 @@ def _square(picture: np.ndarray) -> np.ndarray:
     side = min(picture.shape[:2])
     top, left = ((n - side) // 2 for n in picture.shape[:2])
     return cv2.resize(picture[top : top + side, left : left + side], (160, 160), interpolation=cv2.INTER_AREA)
-
-
-def video(frames: list[Frame], fps: int = 10) -> bytes:
-    """An MP4 with all pictures side by side."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "episode.mp4"
-        with imageio.get_writer(path, fps=fps, macro_block_size=8, quality=7) as writer:
-            for frame in frames:
-                writer.append_data(np.concatenate([_tile(picture) for picture in frame.pictures.values()], axis=1))
-        return path.read_bytes()
 
 
 def training_curve(log_file: Path) -> str:
@@ -125,8 +75,11 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
 
 
 def main(args: Args) -> Path:
-    result = json.loads((args.run_dir / "evaluation.json").read_text())
-    outcome, frames = record_episode(result, args.run_dir / "checkpoints/last")
+    result = read_result(args.run_dir / "evaluation.json")
+    won = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
+    seed = (won or [result["episodes"][0]["seed"]])[0]
+    policy = load_policy(args.run_dir / "checkpoints/last")
+    outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, picture = strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         result=result,

@@ -235,7 +235,7 @@ TINY_CLIP = CLIPVisionConfig(
 SMALL = dict(
     t3=(small_t3, 32),
     sparsh=(lambda: Sparsh(32, 2, 4), 32),
-    anytouch=(lambda: AnyTouch(TINY_CLIP), 224),
+    anytouch=(lambda: AnyTouch(TINY_CLIP), 42),
     unit=(lambda: UniT(channels=(32, 32, 32, 64), out_features=16), 32),
 )
 
@@ -261,7 +261,7 @@ def pictures(tmp_path_factory):
 def test_pictures_alone_train_a_representation(name, pictures, tmp_path, monkeypatch):
     make, size = SMALL[name]
     monkeypatch.setitem(pretrain.REPRESENTATIONS, name, make)
-    steps = 20 if name == "anytouch" else 60
+    steps = 60
     sizes = dict(image_size=size, batch_size=8, steps=steps, lr=2e-3, adversary_from=50, every=1, device="cpu")
     losses = pretrain.main(pretrain.Args(name, (pictures,), tmp_path / "weights.safetensors", **sizes))
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:3])

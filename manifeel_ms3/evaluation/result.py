@@ -1,0 +1,91 @@
+"""Result files: what an evaluation writes, and leaderboard and report read."""
+
+import json
+import subprocess
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+
+from manifeel_ms3.paths import data_dir
+
+from .rollout import EpisodeOutcome
+from .statistics import wilson_interval
+
+SCHEMA = "manifeel-evaluation-1"
+
+
+class ResultError(ValueError):
+    """A file that is not a result."""
+
+
+def result_of(
+    env_id: str, env_kwargs: dict[str, Any], config: dict[str, Any], outcomes: list[EpisodeOutcome]
+) -> dict[str, Any]:
+    """The content of a result file; `config`: the policy's."""
+    rates = {}
+    for name in ("success_once", "success_at_end"):
+        won = sum(getattr(outcome, name) for outcome in outcomes)
+        low, high = wilson_interval(won, len(outcomes))
+        rates[name] = dict(rate=won / len(outcomes), low=round(low, 4), high=round(high, 4))
+    return dict(
+        schema=SCHEMA,
+        env_id=env_id,
+        env_kwargs=env_kwargs,
+        obs_mode=config["obs_mode"],
+        policy=config.get("policy_class", config["kind"]),
+        training_seed=config.get("seed"),
+        config=config,
+        versions={name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")},
+        git_commit=_git_commit(),
+        **rates,
+        mean_length=float(np.mean([outcome.length for outcome in outcomes])),
+        episodes=[asdict(outcome) for outcome in outcomes],
+    )
+
+
+def write_result(result: dict[str, Any], path: Path) -> None:
+    """Write a result that is of the published form."""
+    result = json.loads(json.dumps(result, default=str))
+    check_result(result, path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2))
+
+
+def read_result(path: Path) -> dict[str, Any]:
+    """The content of a result file.
+
+    Raises:
+        ResultError: it is missing, no json, of another version, or not of the published form.
+    """
+    try:
+        result = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ResultError(f"{path} cannot be read as a result ({error}); give one that evaluation.run wrote") from error
+    check_result(result, path)
+    return result
+
+
+def check_result(result: Any, source: Path) -> None:
+    """See that a result is of the published form.
+
+    Raises:
+        ResultError: it is not; the message names the place.
+    """
+    given = result.get("schema") if isinstance(result, dict) else None
+    if given != SCHEMA:
+        raise ResultError(f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate again, or update")
+    schema = json.loads((data_dir() / "evaluation_schema.json").read_text())
+    for error in jsonschema.Draft202012Validator(schema).iter_errors(result):
+        place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
+        raise ResultError(f"{source} is not a result: {place}: {error.message[:300]}")
+
+
+def _git_commit() -> str | None:
+    answer = subprocess.run(
+        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
+    )
+    return answer.stdout.strip() or None

@@ -1,0 +1,35 @@
+"""Every policy, in every sensing set-up, learns one demonstration by heart and does it again in the simulator."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from baselines.common.agent import PolicyAgent
+from baselines.diffusion_policy import train as diffusion
+from baselines.equivariant_diffusion_policy import train as equivariant
+from baselines.flow_matching import train as flow
+from manifeel_ms3.demonstrations import record
+from manifeel_ms3.evaluation.rollout import evaluate_episode
+from tests.conftest import PEG, needs_renderer
+
+pytestmark = [pytest.mark.slow, needs_renderer]
+SEED = 0
+
+
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("demo") / "trajectory.h5"
+    return record.main(record.Args(PEG, 1, 1, SEED, path, "rgb+tacrgb+tacff", ("wrist",), ("right",)))
+
+
+@pytest.mark.parametrize("mode", ["rgb", "rgb+tacrgb", "rgb+tacff"])
+@pytest.mark.parametrize("script", [diffusion, equivariant, flow], ids=["diffusion", "equivariant", "flow"])
+def test_one_demonstration_is_learnt_by_heart(make_env, demonstration, tmp_path, script, mode):
+    cpu = script.PRESETS["cpu"][1]
+    policy = dataclasses.replace(cpu.policy, pose_noise=0.0)  # one demonstration can be told by the pose
+    args = dataclasses.replace(cpu, demos=(demonstration,), obs_mode=mode, policy=policy, steps=600, run_dir=tmp_path)
+    checkpoint = script.main(args)
+    env = make_env(PEG, obs_mode=mode, cameras=("wrist",), tactile_sensors=("right",))
+    outcome = evaluate_episode(env, PolicyAgent(checkpoint), SEED)
+    assert outcome.success_once
