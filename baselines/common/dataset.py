@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, read_header
+from manifeel_ms3.demonstrations.lerobot import count_episodes, is_lerobot, read_lerobot
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -15,7 +16,7 @@ Episode = dict[str, np.ndarray]
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
-    """Episodes of trajectory files of a task: what a policy sees (T + 1, ...), prepared, and "actions" (T, A).
+    """Episodes of a task, of trajectory files or LeRobot datasets: what a policy sees (T + 1, ...), and "actions" (T, A).
 
     Args:
         num_demos: how many to take, over all files; None: all.
@@ -24,7 +25,7 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
         DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
     """
     files, episodes = list(files), []
-    held = [len(read_header(file)["episodes"]) for file in files]
+    held = [count_episodes(file) if is_lerobot(file) else len(read_header(file)["episodes"]) for file in files]
     wanted = sum(held) if num_demos is None else num_demos
     if not 0 < wanted <= sum(held):
         raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
@@ -34,7 +35,11 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
             if left == 0:
                 break
             track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
-            for episode in read_demonstrations(file, spec.keys, env_id, left, track):
+            if is_lerobot(file):  # which does not say of what task it is
+                read = read_lerobot(file, spec.keys, left, track)
+            else:
+                read = read_demonstrations(file, spec.keys, env_id, left, track)
+            for episode in read:
                 episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
     return episodes
 

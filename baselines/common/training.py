@@ -46,7 +46,7 @@ class TrainArgs:
     """What all policies' scripts take; the defaults are the paper's."""
 
     demos: tuple[Path, ...]
-    """trajectory files with observations"""
+    """trajectory files with observations, or folders of LeRobot datasets"""
     env_id: str = "ManiFeel-PegInsertion-v1"
     """task; the files must be of it"""
     obs_mode: str = "rgb+tacff"

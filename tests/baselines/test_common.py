@@ -1,5 +1,7 @@
 """Shared pieces of the baselines."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,15 @@ def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
     with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, the files hold"):
         read_episodes([demos], PEG, SPEC, 9)
+
+
+def test_lerobot_datasets_are_read_beside_files(demos):
+    pytest.importorskip("pyarrow")
+    folder = Path(__file__).parents[1] / "demonstrations/lerobot/images"
+    episodes = read_episodes([folder, demos], PEG, SPEC, None)
+    assert [len(episode["actions"]) for episode in episodes[:2]] == [4, 3]
+    assert len(SequenceDataset(episodes, SPEC, 2, 16, CPU)) == sum(len(episode["actions"]) for episode in episodes)
+    assert episodes[0][POSE].shape == (5, 9)
 
 
 def test_pose_features_are_the_rotation_whatever_the_quaternions_sign():

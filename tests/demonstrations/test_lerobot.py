@@ -1,0 +1,83 @@
+"""LeRobot datasets, two written by lerobot 0.4.4 itself: one with pictures, one with videos."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.demonstrations.lerobot import count_episodes, feature_name, is_lerobot, read_lerobot
+
+pytest.importorskip("pyarrow")
+DATASETS = Path(__file__).with_name("lerobot")
+KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
+LENGTHS = (4, 3)
+
+
+def test_features_have_their_names():
+    assert [feature_name(key) for key in (*KEYS, "sensor_data/tactile_left/rgb")] == [
+        "observation.images.wrist",
+        "observation.force_field.tactile_right",
+        "observation.state",
+        "observation.images.tactile_left",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["images", "videos"])
+def test_numbers_are_those_that_were_written(kind):
+    folder = DATASETS / kind
+    assert is_lerobot(folder)
+    assert count_episodes(folder) == 2
+    for e, episode in enumerate(read_lerobot(folder, KEYS, 2)):
+        steps = np.arange(LENGTHS[e])
+        assert np.allclose(episode["actions"], (0.1 * steps - e)[:, None].repeat(6, 1))
+        seen = np.append(steps, steps[-1])  # the last observation twice
+        assert np.allclose(episode["extra/tcp_pose"], np.arange(7) + (10 * e + seen)[:, None])
+        field = episode["sensor_data/tactile_right/force_field"]
+        assert field.shape == (LENGTHS[e] + 1, 10, 14, 3)
+        assert np.allclose(field[:, 3, 2, 1], 10 * e + seen)
+
+
+def test_pictures_are_bit_for_bit():
+    y, x = np.mgrid[:24, :32]
+    for e, episode in enumerate(read_lerobot(DATASETS / "images", KEYS[:1], 2)):
+        for t in range(LENGTHS[e]):
+            written = [(x * 7 + t * 9) % 256, (y * 9 + e * 40) % 256, np.full_like(x, (50 * e + t) % 256)]
+            assert np.array_equal(episode[KEYS[0]][t], np.stack(written, -1))
+
+
+def test_videos_show_each_episodes_frames():
+    for e, episode in enumerate(read_lerobot(DATASETS / "videos", KEYS[:1], 2)):
+        frames = episode[KEYS[0]]
+        assert frames.shape == (LENGTHS[e] + 1, 96, 96, 3)
+        for t in range(LENGTHS[e]):  # compression loses a little
+            assert np.abs(frames[t].mean((0, 1)) - [60 * t + 20, 200 - 50 * t, 90 * e + 30]).max() < 12
+
+
+def test_progress_is_reported_and_fewer_can_be_read():
+    seen = []
+    assert len(read_lerobot(DATASETS / "images", KEYS, 1, lambda indices: seen.append(len(indices)) or indices)) == 1
+    assert seen == [1]
+
+
+@pytest.fixture
+def copy(tmp_path):
+    shutil.copytree(DATASETS / "images", tmp_path / "dataset")
+    return tmp_path / "dataset"
+
+
+def test_what_is_missing_or_broken_is_named(copy):
+    with pytest.raises(DemonstrationError, match=r"lacks \['observation.images.front'\]; it holds .*wrist"):
+        read_lerobot(copy, ["sensor_data/front/rgb"], 1)
+    info = json.loads((copy / "meta/info.json").read_text())
+    (copy / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1 no more")
+    with pytest.raises(DemonstrationError, match="data cannot be read"):
+        read_lerobot(copy, KEYS, 1)
+    (copy / "meta/info.json").write_text(json.dumps(info | dict(codebase_version="v2.1")))
+    with pytest.raises(DemonstrationError, match="convert_dataset_v21_to_v30"):
+        read_lerobot(copy, KEYS, 1)
+    (copy / "meta/info.json").write_text("{")
+    with pytest.raises(DemonstrationError, match="info.json cannot be read"):
+        read_lerobot(copy, KEYS, 1)
