@@ -10,6 +10,7 @@ from baselines.diffusion_policy import train
 from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation import report, run
+from manifeel_ms3.evaluation.result import ResultError
 from tests.conftest import PEG, needs_renderer
 
 TASK_ARGS = json.dumps(dict(fit="loose", randomization=dict(socket_xy=0.01)))
@@ -38,7 +39,9 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     assert len(result["episodes"]) == 1
     assert result["success_once"]["low"] <= result["success_once"]["rate"] <= result["success_once"]["high"]
     assert set(result["versions"]) >= {"mani-skill", "sapien", "torch"}
-    again = json.loads(run.main(run.Args(checkpoint, tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text())
+    again = json.loads(
+        run.main(run.Args(checkpoint, out=tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text()
+    )
     for name in ("success_once", "length", "peak_contact_force"):
         assert again["episodes"][0][name] == result["episodes"][0][name]
     page = report.main(report.Args(tmp_path)).read_text()
@@ -48,5 +51,5 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
 
 
 def test_report_without_an_evaluation(tmp_path):
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(ResultError, match="cannot be read as a result"):
         report.main(report.Args(tmp_path))
