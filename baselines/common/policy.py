@@ -43,7 +43,7 @@ class VisuotactilePolicy(nn.Module):
         self.config, self.spec, self.action_dim = config, spec, action_dim
         self.encoder, self.unet = self.make_networks()
         sizes = {POSE: POSE_FEATURES} | dict.fromkeys(spec.force_fields, 3)
-        self.obs_normalizers = nn.ModuleDict({_name(key): Normalizer(size) for key, size in sizes.items()})
+        self.obs_normalizers = nn.ModuleDict({module_name(key): Normalizer(size) for key, size in sizes.items()})
         self.action_normalizer = Normalizer(action_dim)
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:
@@ -64,12 +64,14 @@ class VisuotactilePolicy(nn.Module):
     def fit_normalizers(self, observations: dict[str, torch.Tensor], actions: torch.Tensor) -> None:
         """Take the ranges of observations {key: (S, ...)} and actions (S, A) from the demonstrations."""
         for key in (POSE, *self.spec.force_fields):
-            self.obs_normalizers[_name(key)].fit(observations[key])
+            self.obs_normalizers[module_name(key)].fit(observations[key])
         self.action_normalizer.fit(actions)
 
     def condition(self, obs: dict[str, torch.Tensor], pose_noise: float = 0.0) -> torch.Tensor:
         """Features (B, ...) of observations {key: (B, obs_horizon, ...)}."""
-        normalised = {key: self.obs_normalizers[_name(key)].normalize(obs[key]) for key in (POSE, *self.spec.force_fields)}
+        normalised = {
+            key: self.obs_normalizers[module_name(key)].normalize(obs[key]) for key in (POSE, *self.spec.force_fields)
+        }
         if pose_noise > 0:
             normalised[POSE] = normalised[POSE] + pose_noise * torch.randn_like(normalised[POSE])
         return self.encoder({**obs, **normalised})
@@ -93,6 +95,6 @@ class VisuotactilePolicy(nn.Module):
         return torch.randn(shape, generator=generator, device=condition.device)
 
 
-def _name(key: str) -> str:
+def module_name(key: str) -> str:
     """Module names must not hold dots; slashes become underscores for looks."""
     return key.replace("/", "_")

@@ -7,9 +7,10 @@ import torch
 
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE
+from baselines.common.policy import module_name
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 
-from .networks import ACTION_PAIRS, EquivariantObservationEncoder, EquivariantUnet
+from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantObservationEncoder, EquivariantUnet
 
 
 @dataclass
@@ -34,10 +35,11 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
 
     def fit_normalizers(self, observations, actions):
         super().fit_normalizers(observations, actions)
-        pose = self.obs_normalizers[POSE.replace("/", "_")]
-        _alike(pose, (0, 1))
-        for columns in ((3, 4), (6, 7)):
-            _alike(pose, columns, centred=True)
+        pose = self.obs_normalizers[module_name(POSE)]
+        position, *columns = POSE_PAIRS
+        _alike(pose, position)
+        for pair in columns:
+            _alike(pose, pair, centred=True)
         for pair in ACTION_PAIRS[self.action_dim]:
             _alike(self.action_normalizer, pair, centred=True)
 

@@ -114,7 +114,7 @@ def what_to_evaluate(args: Args) -> Evaluation:
     """From the checkpoint's config, or from the arguments."""
     if (args.checkpoint is None) == (args.policy is None):
         raise ValueError("give either --checkpoint, or --policy with --env-id and --obs-mode")
-    extra = json.loads(args.env_kwargs) | dict(sim_backend="physx_cpu")
+    extra = dict(sim_backend="physx_cpu") | json.loads(args.env_kwargs)
     if args.checkpoint is not None:
         config = checkpoint_config(args.checkpoint)
         kwargs = json.loads(args.policy_kwargs) | dict(inference_steps=args.inference_steps)
