@@ -4,6 +4,7 @@ import math
 
 import torch
 import torch.nn as nn
+import torch.nn.functional as F
 
 
 class StepEmbedding(nn.Module):
@@ -19,6 +20,18 @@ class StepEmbedding(nn.Module):
         frequency = torch.exp(torch.arange(half, device=step.device) * (-math.log(10_000) / (half - 1)))
         angle = step.float()[:, None] * frequency
         return self.net(torch.cat([angle.sin(), angle.cos()], dim=-1))
+
+
+class SequenceConv(nn.Conv1d):
+    """A convolution over a short sequence, as one matrix product.
+
+    Its weights are many times what they act on, which libraries' convolutions are not made for: with 2048 channels over four
+    steps this takes less than half the time on a CPU (`benchmarks/train_speed.py`).
+    """
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        windows = F.pad(x, 2 * self.padding).unfold(2, *self.kernel_size, *self.stride)  # (B, C, T, kernel)
+        return F.linear(windows.movedim(1, 2).flatten(2), self.weight.flatten(1), self.bias).movedim(1, 2)
 
 
 class ResidualBlock(nn.Module):
@@ -37,7 +50,7 @@ class ResidualBlock(nn.Module):
 
 
 def _conv_block(inputs: int, outputs: int, kernel: int, groups: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv1d(inputs, outputs, kernel, padding=kernel // 2), nn.GroupNorm(groups, outputs), nn.Mish())
+    return nn.Sequential(SequenceConv(inputs, outputs, kernel, padding=kernel // 2), nn.GroupNorm(groups, outputs), nn.Mish())
 
 
 class ConditionalUnet1D(nn.Module):
@@ -61,7 +74,7 @@ class ConditionalUnet1D(nn.Module):
         shape = dict(condition=condition_dim + step_embedding, kernel=kernel, groups=groups)
         pairs = list(zip((action_dim, *channels[:-1]), channels, strict=True))
         self.down = nn.ModuleList(
-            nn.ModuleList([ResidualBlock(i, o, **shape), ResidualBlock(o, o, **shape), nn.Conv1d(o, o, 3, 2, 1)])
+            nn.ModuleList([ResidualBlock(i, o, **shape), ResidualBlock(o, o, **shape), SequenceConv(o, o, 3, 2, 1)])
             for i, o in pairs
         )
         self.down[-1][2] = nn.Identity()

@@ -14,16 +14,17 @@ from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, Equ
 
 SPEC = observation_spec("rgb+tacrgb+tacff", ("front",), ("right",), 48)
 CAMERA = SPEC.images[0]
-RNG = np.random.default_rng(0)
+PICTURES = range(8)
 
 
-def smooth_picture(size: int) -> np.ndarray:
+def smooth_picture(size: int, seed: int = 0) -> np.ndarray:
     """(H, W, 3) in [0, 1]: blobs that end before the picture's rim, on black: nothing is lost when it turns."""
+    rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / (size - 1) * 2 - 1
     picture = np.zeros((size, size, 3))
     for _ in range(6):
-        cx, cy = RNG.uniform(-0.4, 0.4, 2)
-        picture += RNG.uniform(0.3, 1, 3) * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 0.03)[..., None]
+        cx, cy = rng.uniform(-0.4, 0.4, 2)
+        picture += rng.uniform(0.3, 1, 3) * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / 0.03)[..., None]
     return picture / picture.max()
 
 
@@ -42,7 +43,7 @@ def as_batch(picture: np.ndarray) -> torch.Tensor:
 def test_fields_move_on_by_a_rotation_when_the_picture_turns(size):
     torch.manual_seed(0)
     lift, conv = GroupConv(3, 4, 5, lifting=True), GroupConv(4, 4, 3)
-    picture = RNG.random((size, size, 3))
+    picture = np.random.default_rng(0).random((size, size, 3))
 
     def fields(image):
         return halve(conv(lift(as_batch(image)).relu()))[0].unflatten(0, (4, ORDER))
@@ -57,11 +58,12 @@ def test_fields_move_on_by_a_rotation_when_the_picture_turns(size):
 def test_key_points_turn_with_the_picture(g):
     torch.manual_seed(0)
     encoder = EquivariantImageEncoder(16).eval()
-    picture = smooth_picture(96)
+    pictures = [smooth_picture(96, seed) for seed in PICTURES]
     with torch.no_grad():
-        plain, turned = encoder(as_batch(picture)), encoder(as_batch(turned_picture(picture, g)))
+        plain = encoder(torch.cat([as_batch(picture) for picture in pictures]))
+        turned = encoder(torch.cat([as_batch(turned_picture(picture, g)) for picture in pictures]))
     error = (turned - plain.roll(g, dims=0)).norm() / plain.norm()
-    assert error < (1e-4 if g % 2 == 0 else 0.35)  # at 45 degrees every layer's grid is interpolated
+    assert error < (1e-4 if g % 2 == 0 else 0.25)  # at 45 degrees every layer's grid is interpolated
     assert error < 0.7 * (turned - plain).norm() / plain.norm()  # nearer than if it had not turned
 
 
@@ -78,8 +80,9 @@ def policy():
 
 
 def poses_of(count: int) -> np.ndarray:
-    quaternions = Rotation.random(count, random_state=1).as_quat()[:, [3, 0, 1, 2]]
-    return np.concatenate([RNG.uniform([0.4, -0.1, 0.0], [0.6, 0.1, 0.3], (count, 3)), quaternions], axis=1)
+    rng = np.random.default_rng(1)
+    quaternions = Rotation.random(count, random_state=rng).as_quat()[:, [3, 0, 1, 2]]
+    return np.concatenate([rng.uniform([0.4, -0.1, 0.0], [0.6, 0.1, 0.3], (count, 3)), quaternions], axis=1)
 
 
 def observation(policy, pose: np.ndarray, picture: np.ndarray) -> dict[str, torch.Tensor]:
@@ -114,17 +117,18 @@ def turned_actions(actions: torch.Tensor, g: int) -> torch.Tensor:
 
 @pytest.mark.parametrize("g", range(1, ORDER))
 def test_actions_turn_with_the_scene(policy, g, monkeypatch):
-    pose, picture = poses_of(2), smooth_picture(48)
-    noise = torch.randn(1, 16, 6)
+    pose, noise = poses_of(2), torch.randn(1, 16, 6, generator=torch.Generator().manual_seed(0))
 
-    def act(pose, picture, noise):
+    def act(pose, pictures, noise):
         monkeypatch.setattr(policy, "noise", lambda *_: noise)  # what generation begins with turns, too
-        return policy.sample(observation(policy, pose, picture), 10, torch.Generator())
+        seen = [policy.sample(observation(policy, pose, picture), 10, torch.Generator()) for picture in pictures]
+        return torch.cat(seen)
 
-    plain = act(pose, picture, noise)
-    turned = act(turned_pose(policy, pose, g), turned_picture(picture, g), turned_actions(noise, g))
-    error = (turned - turned_actions(plain, g)).abs().max() / plain.abs().max()
-    assert error < (1e-4 if g % 2 == 0 else 0.1)
+    pictures = [smooth_picture(48, seed) for seed in PICTURES]
+    plain = act(pose, pictures, noise)
+    turned = act(turned_pose(policy, pose, g), [turned_picture(picture, g) for picture in pictures], turned_actions(noise, g))
+    error = (turned - turned_actions(plain, g)).norm() / plain.norm()
+    assert error < (1e-4 if g % 2 == 0 else 0.15)
     assert not torch.allclose(turned, plain, rtol=0.05)
 
 
