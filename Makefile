@@ -1,5 +1,6 @@
 # make demo: from an empty machine to a trained visuotactile policy and its report. make test: the whole test suite.
 # make data: the paper's number of demonstrations of every task, hours of work; it goes on where it was stopped.
+# make benchmark-smoke: the whole benchmark, with two tasks and tiny networks.
 # All install what is missing first, and do again only what is out of date.
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
@@ -11,7 +12,7 @@ TASK_ARGS := {"fit": "loose", "randomization": {"socket_xy": 0.01, "start_xy": 0
 READY := .venv/.ready
 WORKERS := $(shell nproc)
 
-.PHONY: setup demo data test lint types
+.PHONY: setup demo data benchmark-smoke test lint types
 setup: $(READY)
 
 $(READY): pyproject.toml scripts/setup.sh
@@ -39,6 +40,10 @@ $(RUN)/report.html: $(RUN)/evaluation.json
 
 data: $(READY)
 	$(PYTHON) -m manifeel_ms3.demonstrations.dataset --workers $(WORKERS) --out data/demos
+
+benchmark-smoke: $(READY)
+	$(PYTHON) -m manifeel_ms3.evaluation.matrix configs/smoke.yaml --root runs/smoke
+	$(PYTHON) -m manifeel_ms3.evaluation.results --results runs/smoke --out runs/smoke/results.md
 
 test: $(READY)
 	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile

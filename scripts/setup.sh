@@ -20,6 +20,8 @@ say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
 has_library() { ldconfig -p | grep -q "$1"; } # packages have other names from release to release
 
+has_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
+
 as_root() {
   if [ "$(id -u)" = 0 ]; then "$@"; elif sudo -n true 2>/dev/null; then sudo "$@"; else return 1; fi
 }
@@ -69,6 +71,8 @@ install_system_packages() {
     has_library "${pair%%:*}" || missing+=("${pair##*:}")
   done
   python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
+  # the leaderboard's page is tried in a browser; Ubuntu's package is a snap, which containers do not run
+  has_browser || ! grep -q '^ID=debian' /etc/os-release || missing+=(chromium)
   local mesa=true
   has_gpu || new_enough_mesa || mesa=false
   [ ${#missing[@]} = 0 ] && $mesa && return
@@ -98,7 +102,7 @@ install_python_packages() {
       say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead"
   fi
   say "Installing the package and its extras"
-  "${pip[@]}" -e ".[train,report,lerobot,audit,dev]"
+  "${pip[@]}" -e ".[train,report,lerobot,audit,matrix,dev]"
   # without libGL the opencv that mani-skill brings does not import; the headless one does
   .venv/bin/python -c 'import cv2' 2>/dev/null || "${pip[@]}" --force-reinstall --no-deps opencv-python-headless
 }

@@ -2,6 +2,7 @@
 
 import math
 import random
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -12,6 +13,7 @@ from diffusers.optimization import get_scheduler
 from diffusers.training_utils import EMAModel
 
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.progress import progress_bar
 
 from .agent import KIND, spec_of
@@ -97,7 +99,7 @@ class TrainArgs:
 
 FREE_ON_RESUME = {
     *("demos", "tacrgb_weights", "run_dir", "resume", "device", "compile", "log_every", "wandb_project"),
-    *("steps", "step", "save_every", "keep", "inference_steps"),
+    *("steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
     *("eval_episodes", "eval_workers", "eval_env_kwargs"),
 }
 
@@ -140,6 +142,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     optimizer = torch.optim.AdamW(policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay, fused=True)
     order_generator = torch.Generator().manual_seed(args.seed)
     start, order = 0, torch.empty(0, dtype=torch.long)  # samples left of this epoch
+    begin = time.time()
     if args.resume:
         saved = checkpoint_config(last)
         require_same_config(saved, config, FREE_ON_RESUME, last)
@@ -148,6 +151,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         order_generator.set_state(training.pop("order_random"))
         unpack(training, optimizer, policy, last)
         start = saved["step"]
+        begin -= saved["training_seconds"]
     if not processes.first:
         torch.manual_seed(args.seed + 1_000_003 * processes.rank + start)  # noise of its own
     schedule = get_scheduler("cosine", optimizer, num_warmup_steps=args.warmup_steps, num_training_steps=total_steps)
@@ -167,7 +171,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         weights |= {name: s for (name, _), s in zip(policy.named_parameters(), ema.shadow_params, strict=True)}
         state = pack(optimizer, policy) | dict(order=order, order_random=order_generator.get_state())
         folder = args.run_dir / f"checkpoints/{step:08d}"
-        save_checkpoint(folder, config | dict(step=step), weights, state)
+        cost = dict(trained_on=machine(), training_seconds=round(time.time() - begin, 1))
+        save_checkpoint(folder, config | cost | dict(step=step), weights, state)
         make_last(folder)
         return folder
 

@@ -13,17 +13,15 @@ from typing import Literal
 
 import tyro
 
+from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
 from .protocol import Estimate, Runs, Setup, collect, difference
-from .result import ResultError
+from .result import results_in
 
 log = logging.getLogger(__name__)
 Verdict = Literal["holds", "does not hold", "undecided"]
 MARGIN = 0.05  # of success: a gain that is smaller counts for none, where a claim says that there is none
 FORCE_TASKS = ("PegInsertion", "USBInsertion", "PowerPlugInsertion", "GearAssembly", "NutBoltAssembly", "BulbInstallation")
 EXPLORATION = ("PegReorientation", "ObjectSearch", "BallSortingDim")
-DP, EQUIDP, FM = "DiffusionPolicy", "EquivariantDiffusionPolicy", "FlowMatchingPolicy"
-ENCODERS = ("resnet18", "unit", "t3", "anytouch")
-VISION, TACRGB, TACFF = "rgb", "rgb+tacrgb", "rgb+tacff"
 
 
 @dataclass(frozen=True)
@@ -44,59 +42,57 @@ class Answer:
     verdict: Verdict
 
 
-def _setup(task: str, mode: str, policy: str = DP, camera: str | None = None, num_demos: int | None = None) -> Setup:
-    camera = camera or ("front" if task in ("PegReorientation", "ObjectSearch", "BallSorting", "BallSortingDim") else "wrist")
-    encoder = "resnet18" if mode == TACRGB else ""
-    return Setup(f"ManiFeel-{task}-v1", mode, policy, encoder, (camera,), num_demos)
-
-
 def comparisons() -> Iterator[Comparison]:
     """The paper's claims. `num_demos` is left open where a claim does not speak of it."""
     for task in FORCE_TASKS:
-        yield Comparison("1. TacFF beats vision where parts fit", _setup(task, TACFF), _setup(task, VISION))
+        yield Comparison("1. TacFF beats vision where parts fit", setup(task, TACFF), setup(task, VISION))
     for task in EXPLORATION:
-        yield Comparison("2. TacRGB beats vision where it explores", _setup(task, TACRGB), _setup(task, VISION))
+        yield Comparison("2. TacRGB beats vision where it explores", setup(task, TACRGB), setup(task, VISION))
     for task in ("GearAssembly", "NutBoltAssembly", "BulbInstallation"):
         claim = "3. TacRGB does not beat vision on gear, nut and bulb"
-        yield Comparison(claim, _setup(task, TACRGB), _setup(task, VISION), gain=False)
+        yield Comparison(claim, setup(task, TACRGB), setup(task, VISION), gain=False)
     for task in ("GearAssembly", "BulbInstallation", "ObjectSearch", "BallSorting"):
         for mode in (VISION, TACRGB, TACFF):
-            yield Comparison("4. Flow Matching is below Diffusion Policy", _setup(task, mode), _setup(task, mode, FM))
+            yield Comparison("4. Flow Matching is below Diffusion Policy", setup(task, mode), setup(task, mode, FM))
     for task in ("GearAssembly", "BulbInstallation"):
         for mode in (VISION, TACRGB, TACFF):
             claim = "5. The equivariant policy is above on gear and bulb"
-            yield Comparison(claim, _setup(task, mode, EQUIDP), _setup(task, mode))
+            yield Comparison(claim, setup(task, mode, EQUIDP), setup(task, mode))
     for task in ("ObjectSearch", "BallSorting"):
         for mode in (VISION, TACRGB, TACFF):
             claim = "5. The equivariant policy is below on search and sorting"
-            yield Comparison(claim, _setup(task, mode), _setup(task, mode, EQUIDP))
+            yield Comparison(claim, setup(task, mode), setup(task, mode, EQUIDP))
     for task in ("GearAssembly", "ObjectSearch", "BallSorting"):
-        for one, other in permutations(ENCODERS, 2):
-            first, second = (replace(_setup(task, TACRGB), encoder=name) for name in (one, other))
+        for one, other in permutations(ENCODERS[task], 2):
+            first, second = (setup(task, TACRGB, encoder=name) for name in (one, other))
             yield Comparison("6. Tactile encoders differ by task", first, second)
-    gear = {count: _setup("GearAssembly", TACFF, num_demos=count) for count in (40, 80, 100)}
+    gear = {count: setup("GearAssembly", TACFF, num_demos=count) for count in (40, 80, 100)}
     yield Comparison("7. Success grows up to about 80 demonstrations", gear[80], gear[40])
     yield Comparison("7. Success saturates near 80 demonstrations", gear[100], gear[80], gain=False)
     for mode in (VISION, TACRGB):
-        wrist, front = (_setup("ObjectSearch", mode, camera=camera) for camera in ("wrist", "front"))
+        wrist, front = (setup("ObjectSearch", mode, camera=camera) for camera in ("wrist", "front"))
         yield Comparison("8. The wrist camera is above the front camera in object search", wrist, front)
     for camera in ("wrist", "front"):
-        with_touch, without = (_setup("ObjectSearch", mode, camera=camera) for mode in (TACRGB, VISION))
+        with_touch, without = (setup("ObjectSearch", mode, camera=camera) for mode in (TACRGB, VISION))
         yield Comparison("8. TacRGB helps from both viewpoints", with_touch, without)
 
 
 def answer(comparison: Comparison, found: dict[Setup, Runs]) -> Answer | None:
     """What was run says; None where it was not."""
-    first, second = (_find(setup, found) for setup in (comparison.first, comparison.second))
+    first, second = (find(side, found) for side in (comparison.first, comparison.second))
     if first is None or second is None:
         return None
     gap, p_value = difference(first, second)
     return Answer(comparison, gap, p_value, _verdict(comparison, gap))
 
 
-def _find(setup: Setup, found: dict[Setup, Runs]) -> Runs | None:
+def answers_of(found: dict[Setup, Runs]) -> dict[Comparison, Answer | None]:
+    return {comparison: answer(comparison, found) for comparison in comparisons()}
+
+
+def find(wanted: Setup, found: dict[Setup, Runs]) -> Runs | None:
     """The runs of a set-up; where it leaves the number of demonstrations open, those with the most."""
-    alike = [other for other in found if setup == (other if setup.num_demos else replace(other, num_demos=None))]
+    alike = [other for other in found if wanted == (other if wanted.num_demos else replace(other, num_demos=None))]
     return found[max(alike, key=lambda other: other.num_demos or 0)] if alike else None
 
 
@@ -110,12 +106,11 @@ def table(answers: dict[Comparison, Answer | None]) -> str:
     """Markdown: a row a comparison; those not run say so."""
     lines = ["| claim | task | compared | difference | p | verdict |", "|---|---|---|---|---|---|"]
     for comparison, found in answers.items():
-        task = comparison.first.env_id.removeprefix("ManiFeel-").removesuffix("-v1")
         cells = "| | not run"
         if found:
             gap = found.difference
             cells = f"{gap.value:+.0%} [{gap.low:+.0%}, {gap.high:+.0%}] | {found.p_value:.3f} | {found.verdict}"
-        lines.append(f"| {comparison.claim} | {task} | {_named(comparison)} | {cells} |")
+        lines.append(f"| {comparison.claim} | {comparison.first.task} | {_named(comparison)} | {cells} |")
     return "\n".join(lines) + "\n"
 
 
@@ -143,11 +138,7 @@ def main(args: Args) -> dict[Comparison, Answer | None]:
     Raises:
         ResultError: there is no result, or one is broken.
     """
-    files = [path for folder in args.results for path in sorted(folder.rglob("evaluations/*.json"))]
-    if not files:
-        raise ResultError(f"{[str(f) for f in args.results]} hold no evaluations/*.json; train with --eval-episodes 50")
-    found = collect(files)
-    answers = {comparison: answer(comparison, found) for comparison in comparisons()}
+    answers = answers_of(collect(results_in(*args.results)))
     log.info("%s", table(answers))
     if args.out:
         args.out.write_text(table(answers))

@@ -4,19 +4,20 @@ What is compared is a `Setup`; what was run of it, its `Runs`, is collected from
 taken start by start, since both are evaluated on the same ones.
 """
 
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
-from .result import ResultError, read_result
+from .result import ResultError
 
 LAST = 10  # checkpoints
 RESAMPLES = 4000
 CONFIDENCE = 0.95
+SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend")  # arguments that do not change the task
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,17 @@ class Setup:
     """of TacRGB"""
     cameras: tuple[str, ...] = ()
     num_demos: int | None = None
+    variant: str = ""
+    """arguments of the task other than its defaults, as json"""
+
+    @property
+    def task(self) -> str:
+        """The task's short name."""
+        return self.env_id.removeprefix("ManiFeel-").removesuffix("-v1")
+
+    @property
+    def sensing(self) -> str:
+        return " ".join((self.obs_mode, *self.cameras))
 
 
 @dataclass(frozen=True)
@@ -41,6 +53,9 @@ class Estimate:
     low: float
     high: float
 
+    def __str__(self) -> str:
+        return f"{self.value:.0%} [{self.low:.0%}, {self.high:.0%}]"
+
 
 @dataclass
 class Runs:
@@ -50,24 +65,29 @@ class Runs:
     starts: list[int]
     """their seeds"""
 
+    @property
+    def size(self) -> str:
+        return " x ".join(map(str, self.success.shape))
+
 
 def setup_of(result: dict[str, Any]) -> Setup:
     config = result["config"]
     encoder = config.get("policy", {}).get("encoder", {}).get("tacrgb", "") if "tacrgb" in result["obs_mode"] else ""
     cameras = tuple(result["env_kwargs"].get("cameras", ())) if "rgb" in result["obs_mode"].split("+") else ()
     policy = result["policy"].rpartition(":")[2]
-    return Setup(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"))
+    other = {name: value for name, value in result["env_kwargs"].items() if name not in SENSING}
+    variant = json.dumps(other, sort_keys=True) if other else ""
+    return Setup(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant)
 
 
-def collect(files: Iterable[Path], last: int = LAST) -> dict[Setup, Runs]:
-    """Result files, one a checkpoint, by set-up.
+def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Setup, Runs]:
+    """Results, one a checkpoint, by set-up.
 
     Raises:
-        ResultError: a file is not a result, or those of a set-up were evaluated on different starts.
+        ResultError: those of a set-up were evaluated on different starts.
     """
     found: dict[Setup, dict[int | None, dict[int, dict[int, bool]]]] = {}
-    for path in files:
-        result = read_result(path)
+    for result in results:
         outcomes = {episode["seed"]: episode["success_once"] for episode in result["episodes"]}
         runs = found.setdefault(setup_of(result), {})
         runs.setdefault(result["training_seed"], {})[result["config"].get("step", 0)] = outcomes

@@ -12,6 +12,7 @@ import numpy as np
 
 from manifeel_ms3.paths import data_dir
 
+from .provenance import machine, task_hash
 from .rollout import EpisodeOutcome
 from .statistics import wilson_interval
 
@@ -41,6 +42,8 @@ def result_of(
         config=config,
         versions={name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")},
         git_commit=_git_commit(),
+        task_hash=task_hash(env_id),
+        machine=machine(),
         **rates,
         mean_length=float(np.mean([outcome.length for outcome in outcomes])),
         episodes=[asdict(outcome) for outcome in outcomes],
@@ -67,6 +70,21 @@ def read_result(path: Path) -> dict[str, Any]:
         raise ResultError(f"{path} cannot be read as a result ({error}); give one that evaluation.run wrote") from error
     check_result(result, path)
     return result
+
+
+def results_in(*folders: Path) -> list[dict[str, Any]]:
+    """Every checkpoint's result under some folders: files named by its gradient step, as 00002000.json.
+
+    Raises:
+        ResultError: there is none, or one is broken.
+    """
+    found = [path for folder in folders for path in sorted(folder.rglob("*.json")) if path.stem.isdigit()]
+    if not found:
+        raise ResultError(
+            f"{[str(folder) for folder in folders]} hold no results; train with --eval-episodes 50, or run "
+            "`python -m manifeel_ms3.evaluation.matrix`"
+        )
+    return [read_result(path) for path in found]
 
 
 def check_result(result: Any, source: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.evaluation.protocol import Runs, Setup, collect, difference, success
-from manifeel_ms3.evaluation.result import ResultError, result_of
+from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
 
@@ -31,7 +31,7 @@ def test_runs_are_collected_by_setup_and_the_last_checkpoints_count(tmp_path):
     for seed in (0, 1):
         for step in (10, 20, 30):
             write(tmp_path, seed, step, [step == 30, step >= 20, seed == 1])
-    collected = collect(tmp_path.rglob("*.json"), last=2)
+    collected = collect(results_in(tmp_path), last=2)
     (setup,) = collected
     assert setup == Setup(PEG, "rgb+tacrgb", "DiffusionPolicy", "t3", ("wrist",), 50)
     assert collected[setup].starts == [100, 101, 102]
@@ -43,7 +43,7 @@ def test_results_of_different_starts_are_not_mixed(tmp_path):
     write(tmp_path, 0, 10, [True, False])
     write(tmp_path, 1, 10, [True])
     with pytest.raises(ResultError, match="different starts"):
-        collect(tmp_path.rglob("*.json"))
+        collect(results_in(tmp_path))
     with pytest.raises(ResultError, match="different starts"):
         difference(runs(0.5, starts=10), runs(0.5, starts=12))
 

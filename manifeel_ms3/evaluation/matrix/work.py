@@ -1,0 +1,102 @@
+"""What a stage does, in a process of its own. All of it goes on where it was stopped."""
+
+import importlib
+import json
+import os
+import socket
+import time
+import traceback
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from manifeel_ms3.demonstrations import record
+from manifeel_ms3.demonstrations.trajectory_file import read_header, write_json
+
+from .. import run
+from ..provenance import machine
+from .study import Stage
+
+DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
+
+
+def is_done(stage: Stage, root: Path) -> bool:
+    return (stage.folder(root) / DONE).is_file()
+
+
+def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
+    """Do a stage's work, unless it is done, and note what it cost.
+
+    Args:
+        workers: processes that simulate.
+        _needed: what other stages returned: Ray waits for them.
+
+    Raises:
+        Exception: whatever went wrong; failed.json has it, too.
+    """
+    if is_done(stage, root):
+        return
+    folder = stage.folder(root)
+    folder.mkdir(parents=True, exist_ok=True)
+    before = _note(folder / STARTED)
+    attempts = before.get("attempts", 0) + 1
+    started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=stage.title, settings=stage.settings)
+    write_json(folder / STARTED, started)
+    (folder / FAILED).unlink(missing_ok=True)
+    begin = time.time()
+    try:
+        units = WORK[stage.kind](stage, root, workers)
+    except Exception as error:
+        write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
+        raise
+    cost = dict(seconds=round(time.time() - begin, 1), units=units, workers=workers, machine=machine())
+    write_json(folder / DONE, started | cost)
+
+
+def _record(stage: Stage, root: Path, workers: int) -> int:
+    """Demonstrations with everything that any policy sees; returns how many."""
+    settings = stage.settings
+    path = stage.folder(root) / "trajectory.h5"
+    sensing = dict(obs_mode="rgb+tacrgb+tacff", cameras=(settings["camera"],), tactile_sensors=("right",))
+    record.main(
+        record.Args(settings["env_id"], settings["num"], workers, env_kwargs=settings["env_kwargs"], out=path, **sensing),
+        on_episode=lambda: None,
+    )
+    return len(read_header(path)["episodes"])
+
+
+def _train(stage: Stage, root: Path, _workers: int) -> int:
+    """A policy; returns its gradient steps."""
+    settings, (demos,) = stage.settings, stage.needs
+    script = importlib.import_module(f"baselines.{settings['policy']}.train")
+    folder = stage.folder(root)
+    flags = [settings["preset"], "--demos", str(demos.folder(root) / "trajectory.h5"), "--run-dir", str(folder)]
+    for name, value in settings["flags"].items():
+        values = value if isinstance(value, list) else [value]
+        flags += [f"--{name}", *map(str, values)]
+    if (folder / "checkpoints/last").exists():
+        flags.append("--resume")
+    args = tyro.extras.overridable_config_cli(script.PRESETS, args=flags)
+    last = script.main(args)
+    return json.loads((last / "config.json").read_text())["step"]
+
+
+def _evaluate(stage: Stage, root: Path, workers: int) -> int:
+    """A result file a checkpoint; returns how many episodes."""
+    settings, (train,) = stage.settings, stage.needs
+    checkpoints = sorted(path for path in (train.folder(root) / "checkpoints").iterdir() if path.name.isdigit())
+    chosen = checkpoints[-settings["checkpoints"] :]
+    wanted = {name: settings[name] for name in ("episodes", "env_kwargs")}
+    for checkpoint in chosen:
+        out = stage.folder(root) / f"{checkpoint.name}.json"
+        if not out.is_file():
+            run.main(run.Args(checkpoint, out=out, workers=workers, **wanted))
+    return len(chosen) * settings["episodes"]
+
+
+WORK = dict(record=_record, train=_train, evaluate=_evaluate)
+
+
+def _note(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text()) if path.is_file() else {}
