@@ -15,11 +15,12 @@ import ray
 import tyro
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import track
 from rich.table import Table
 
 from . import cost
 from .study import KINDS, Stage, Study, StudyError, read_study, stages_of
-from .work import FAILED, STARTED, is_done, perform
+from .work import FAILED, STARTED, is_done, is_running, perform, read_note
 
 log = logging.getLogger(__name__)
 RETRIES = 3
@@ -103,22 +104,23 @@ def _require_resources(study: Study) -> None:
 
 def _reason(stage: Stage, root: Path) -> str:
     if (folder := stage.folder(root) / FAILED).is_file():
-        return f"{cost.read(folder)['error']} ({folder} has it all)"
+        return f"{read_note(folder)['error']} ({folder} has it all)"
     return "its worker died" if (stage.folder(root) / STARTED).is_file() else "what it needs is not done"
 
 
 def progress(study: Study, stages: list[Stage], root: Path) -> Group:
     """A table of what is done, and one of what is running."""
     counts = Table("stage", "done", "running", "failed", "all", "CPU hours left")
-    running = [stage for stage in stages if not is_done(stage, root) and cost.is_running(stage.folder(root))]
+    running = [stage for stage in stages if not is_done(stage, root) and is_running(stage, root)]
     for kind in KINDS:
         alike = [stage for stage in stages if stage.kind == kind]
         done = [stage for stage in alike if is_done(stage, root)]
         failed = [stage for stage in alike if (stage.folder(root) / FAILED).is_file()]
         now = [stage for stage in running if stage.kind == kind]
         needs = study.resources[kind]
-        hours = sum(cost.estimate(stage, root, needs.workers).seconds for stage in alike if stage not in done) / 3600
-        counts.add_row(kind, *map(str, (len(done), len(now), len(failed), len(alike))), f"{hours * needs.cpus:.2f}")
+        costs = [cost.estimate(stage, root, needs.workers, try_out=False) for stage in alike if stage not in done]
+        left = "?" if None in costs else f"{sum(one.seconds for one in costs if one) / 3600 * needs.cpus:.2f}"
+        counts.add_row(kind, *map(str, (len(done), len(now), len(failed), len(alike))), left)
     names = Table("running", "for, min")
     for stage in running[:SHOWN]:
         since = time.time() - (stage.folder(root) / STARTED).stat().st_mtime
@@ -133,12 +135,12 @@ def plan(study: Study, stages: list[Stage], root: Path) -> Table:
     for stage in stages:
         alike.setdefault((stage.kind, stage.title.partition(", seed")[0]), []).append(stage)
     cpu = gpu = 0.0
-    for (kind, title), group in alike.items():
+    for (kind, title), group in track(alike.items(), "measuring", transient=True):
         needs = study.resources[kind]
         costs = [cost.estimate(stage, root, needs.workers) for stage in group if not is_done(stage, root)]
-        hours = sum(expected.seconds for expected in costs) / 3600
+        hours = sum(one.seconds for one in costs if one) / 3600
         cpu, gpu = cpu + hours * needs.cpus, gpu + hours * needs.gpus
-        source = costs[0].source if costs else "done"
+        source = costs[0].source if costs and costs[0] else "done"
         table.add_row(
             kind, title, f"{len(costs)} of {len(group)}", f"{hours * needs.cpus:.2f}", f"{hours * needs.gpus:.2f}", source
         )

@@ -178,6 +178,6 @@ def _evaluations(grid: Grid) -> list[Stage]:
         made = dict(policy=policy, preset=grid.preset, flags=flags, code=code_hash(f"baselines.{policy}.train"))
         train = Stage("train", title, made, (record,))
         code = code_hash("manifeel_ms3.evaluation.rollout")
-        wanted = dict(episodes=grid.episodes, checkpoints=grid.checkpoints, env_kwargs=env_kwargs, code=code)
+        wanted = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, env_kwargs=env_kwargs, code=code)
         setups.append(Stage("evaluate", train.title, wanted, (train,)))
     return setups

@@ -6,9 +6,11 @@ import os
 import socket
 import time
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import tyro
 
 from manifeel_ms3.demonstrations import record
@@ -25,6 +27,15 @@ def is_done(stage: Stage, root: Path) -> bool:
     return (stage.folder(root) / DONE).is_file()
 
 
+def is_running(stage: Stage, root: Path) -> bool:
+    """Whether a worker has begun and not ended; one of this machine must be alive."""
+    folder = stage.folder(root)
+    started = read_note(folder / STARTED)
+    if not started or is_done(stage, root) or (folder / FAILED).is_file():
+        return False
+    return started["host"] != socket.gethostname() or psutil.pid_exists(started["pid"])
+
+
 def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
     """Do a stage's work, unless it is done, and note what it cost.
 
@@ -39,7 +50,7 @@ def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
         return
     folder = stage.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
-    before = _note(folder / STARTED)
+    before = read_note(folder / STARTED)
     attempts = before.get("attempts", 0) + 1
     started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=stage.title, settings=stage.settings)
     write_json(folder / STARTED, started)
@@ -50,7 +61,8 @@ def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
     except Exception as error:
         write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
-    cost = dict(seconds=round(time.time() - begin, 1), units=units, workers=workers, machine=machine())
+    parallel = 1 if stage.kind == "train" else workers
+    cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
 
 
@@ -69,15 +81,14 @@ def _record(stage: Stage, root: Path, workers: int) -> int:
 def _train(stage: Stage, root: Path, _workers: int) -> int:
     """A policy; returns its gradient steps."""
     settings, (demos,) = stage.settings, stage.needs
-    script = importlib.import_module(f"baselines.{settings['policy']}.train")
     folder = stage.folder(root)
-    flags = [settings["preset"], "--demos", str(demos.folder(root) / "trajectory.h5"), "--run-dir", str(folder)]
-    for name, value in settings["flags"].items():
-        values = value if isinstance(value, list) else [value]
-        flags += [f"--{name}", *map(str, values)]
-    if (folder / "checkpoints/last").exists():
-        flags.append("--resume")
-    args = tyro.extras.overridable_config_cli(script.PRESETS, args=flags)
+    script = importlib.import_module(f"baselines.{settings['policy']}.train")
+    args = replace(
+        training_args(stage),
+        demos=(demos.folder(root) / "trajectory.h5",),
+        run_dir=folder,
+        resume=(folder / "checkpoints/last").exists(),
+    )
     last = script.main(args)
     return json.loads((last / "config.json").read_text())["step"]
 
@@ -98,5 +109,16 @@ def _evaluate(stage: Stage, root: Path, workers: int) -> int:
 WORK = dict(record=_record, train=_train, evaluate=_evaluate)
 
 
-def _note(path: Path) -> dict[str, Any]:
+def training_args(stage: Stage) -> Any:
+    """What train.py is given, but for where its data and its run are."""
+    settings = stage.settings
+    flags = [settings["preset"], "--demos", "-"]
+    for name, value in settings["flags"].items():
+        flags += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    presets = importlib.import_module(f"baselines.{settings['policy']}.train").PRESETS
+    return tyro.extras.overridable_config_cli(presets, args=flags)
+
+
+def read_note(path: Path) -> dict[str, Any]:
+    """A note that was left; {} if there is none."""
     return json.loads(path.read_text()) if path.is_file() else {}
