@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, read_header
-from manifeel_ms3.demonstrations.lerobot import count_episodes, is_lerobot, read_lerobot
+from manifeel_ms3.demonstrations import DemonstrationError, lerobot, paper_zarr, read_demonstrations, read_header
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -16,16 +15,17 @@ Episode = dict[str, np.ndarray]
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
-    """Episodes of a task, of trajectory files or LeRobot datasets: what a policy sees (T + 1, ...), and "actions" (T, A).
+    """Episodes of a task: what a policy sees (T + 1, ...), and "actions" (T, A).
 
     Args:
+        files: trajectory files, LeRobot datasets, zarr stores of the paper's layout.
         num_demos: how many to take, over all files; None: all.
 
     Raises:
         DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
     """
     files, episodes = list(files), []
-    held = [count_episodes(file) if is_lerobot(file) else len(read_header(file)["episodes"]) for file in files]
+    held = [_count(file) for file in files]
     wanted = sum(held) if num_demos is None else num_demos
     if not 0 < wanted <= sum(held):
         raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
@@ -35,13 +35,21 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
             if left == 0:
                 break
             track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
-            if is_lerobot(file):  # which does not say of what task it is
-                read = read_lerobot(file, spec.keys, left, track)
+            if lerobot.is_lerobot(file):  # these two do not say of what task they are
+                read = lerobot.read_lerobot(file, spec.keys, left, track)
+            elif paper_zarr.is_zarr(file):
+                read = paper_zarr.read_zarr(file, spec.keys, left, track)
             else:
                 read = read_demonstrations(file, spec.keys, env_id, left, track)
             for episode in read:
                 episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
     return episodes
+
+
+def _count(file: Path) -> int:
+    if lerobot.is_lerobot(file):
+        return lerobot.count_episodes(file)
+    return paper_zarr.count_episodes(file) if paper_zarr.is_zarr(file) else len(read_header(file)["episodes"])
 
 
 class SequenceDataset:

@@ -48,7 +48,7 @@ class TrainArgs:
     """What all policies' scripts take; the defaults are the paper's."""
 
     demos: tuple[Path, ...]
-    """trajectory files with observations, or folders of LeRobot datasets"""
+    """trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout"""
     env_id: str = "ManiFeel-PegInsertion-v1"
     """task; the files must be of it"""
     obs_mode: str = "rgb+tacff"

@@ -1,4 +1,4 @@
-"""Read LeRobot datasets (format 3.0) as demonstrations.
+"""LeRobot datasets (format 3.0): read as demonstrations, and written.
 
 Features are named after what they hold: `observation.images.wrist`, `observation.images.tactile_right` (TacRGB),
 `observation.force_field.tactile_right` (N per taxel), `observation.state` (the tool's pose in the base frame: m and wxyz), and
@@ -13,9 +13,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .trajectory_file import DemonstrationError
+from .trajectory_file import DemonstrationError, each_demonstration, observed, read_header, write_json
 
 INFO = "meta/info.json"
+DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+FPS = 10
 
 
 def is_lerobot(path: Path) -> bool:
@@ -79,11 +81,7 @@ def read_lerobot(folder: Path, keys: list[str], num: int, progress: Callable = i
 
 
 def _table(folder: Path, part: str) -> Any:
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{error}; LeRobot datasets need `pip install manifeel_ms3[lerobot]`") from error
+    pa, pq = _pyarrow()
     files = sorted((Path(folder) / part).glob("chunk-*/file-*.parquet"))
     try:
         return pa.concat_tables([pq.read_table(file) for file in files])
@@ -125,3 +123,118 @@ def _video(folder: Path, info: dict, name: str, meta: dict) -> np.ndarray:
         return np.stack(frames)
     except (OSError, ValueError) as error:
         raise DemonstrationError(f"{path} cannot be read as a video ({error}); export the dataset again") from error
+
+
+# -------------------------------------------------------------------- writing
+
+COUNTED = ("frame_index", "episode_index", "index", "task_index")
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+PER_CHUNK = 1000  # files
+
+
+def write_lerobot(path: Path, folder: Path, progress: Callable = iter) -> None:
+    """Write a trajectory file as a LeRobot dataset: pictures losslessly, a data file an episode.
+
+    Raises:
+        DemonstrationError: the file is broken, or holds no observations.
+        ModuleNotFoundError: the extra is not installed.
+    """
+    pa, pq = _pyarrow()
+    task = read_header(path)["env_info"]["env_id"].rpartition(":")[2]
+    keys, start, features, index = observed(path), 0, {}, []
+    for e, episode in enumerate(each_demonstration(path, keys, progress)):
+        length = len(episode["actions"])
+        frames = {feature_name(key): episode[key][:length] for key in keys} | dict(action=episode["actions"])
+        frame = np.arange(length)
+        frames["timestamp"] = (frame / FPS).astype(np.float32)
+        frames |= zip(COUNTED, (frame, np.full(length, e), start + frame, np.zeros(length, int)), strict=True)
+        features = features or {name: _described(values) for name, values in frames.items()}
+        place = dict(zip(("chunk_index", "file_index"), divmod(e, PER_CHUNK), strict=True))
+        file = folder / DATA.format(**place)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(pa.table({name: _column(values) for name, values in frames.items()}), file)
+        index.append(
+            dict(episode_index=e, tasks=[task], length=length)
+            | {f"data/{name}": value for name, value in place.items()}
+            | dict(dataset_from_index=start, dataset_to_index=start + length)
+            | {f"stats/{name}/{what}": value for name, values in frames.items() for what, value in _statistics(values).items()}
+            | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        )
+        start += length
+    meta = folder / "meta"
+    (meta / "episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(index), meta / "episodes/chunk-000/file-000.parquet")
+    pq.write_table(_tasks(task), meta / "tasks.parquet")
+    write_json(meta / "stats.json", {name: _joined(name, index) for name in features})
+    info = dict(codebase_version="v3.0", robot_type="panda_gelsight", total_episodes=len(index), total_frames=start)
+    info |= dict(total_tasks=1, chunks_size=PER_CHUNK, data_files_size_in_mb=100, video_files_size_in_mb=200, fps=FPS)
+    info |= dict(splits=dict(train=f"0:{len(index)}"), data_path=DATA, video_path=None, features=features)
+    write_json(folder / INFO, info)  # last: a folder without it is no dataset
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"{error}; LeRobot datasets need `pip install manifeel_ms3[lerobot]`") from error
+    return pyarrow, pyarrow.parquet
+
+
+def _is_picture(values: np.ndarray) -> bool:
+    return values.dtype == np.uint8
+
+
+def _described(values: np.ndarray) -> dict[str, Any]:
+    """A feature's entry in info.json."""
+    if _is_picture(values):
+        return dict(dtype="image", shape=list(values.shape[1:]), names=["height", "width", "channels"])
+    return dict(dtype=str(values.dtype), shape=list(values.shape[1:] or (1,)), names=None)
+
+
+def _column(values: np.ndarray) -> Any:
+    pa, _ = _pyarrow()
+    if _is_picture(values):
+        pictures = [dict(bytes=cv2.imencode(".png", picture[..., ::-1])[1].tobytes(), path=None) for picture in values]
+        return pa.array(pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
+    kind = pa.from_numpy_dtype(values.dtype)
+    if values.ndim == 2:
+        kind = pa.list_(kind, values.shape[1])
+    for _ in range(values.ndim - 1 if values.ndim > 2 else 0):
+        kind = pa.list_(kind)
+    return pa.array(values.tolist(), kind)
+
+
+def _statistics(values: np.ndarray) -> dict[str, list]:
+    """As lerobot has them: of pictures by channel in [0, 1], (3, 1, 1); of arrays by their last axis."""
+    count = [len(values)]
+    flat = values.reshape(-1, values.shape[-1] if values.ndim > 1 else 1).astype(float) / (255 if _is_picture(values) else 1)
+    found = dict(min=flat.min(0), max=flat.max(0), mean=flat.mean(0), std=flat.std(0))
+    found |= {name: np.quantile(flat, q, axis=0) for name, q in QUANTILES.items()}
+    shape = (-1, 1, 1) if _is_picture(values) else (-1,)
+    return {name: value.reshape(shape).tolist() for name, value in found.items()} | dict(count=count)
+
+
+def _joined(name: str, index: list[dict[str, Any]]) -> dict[str, list]:
+    """Statistics of all episodes from those of each; quantiles as their weighted means, as lerobot does."""
+    of = {what: np.array([row[f"stats/{name}/{what}"] for row in index]) for what in ("min", "max", "mean", "std", *QUANTILES)}
+    weight = np.array([row["length"] for row in index], float)
+    weight /= weight.sum()
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.tensordot(weight, values, 1)
+
+    found = dict(min=of["min"].min(0), max=of["max"].max(0), mean=mean(of["mean"]))
+    found["std"] = np.sqrt(np.maximum(mean(of["std"] ** 2 + of["mean"] ** 2) - found["mean"] ** 2, 0))
+    found |= {what: mean(of[what]) for what in QUANTILES}
+    return {what: value.tolist() for what, value in found.items()} | dict(count=[sum(row["length"] for row in index)])
+
+
+def _tasks(task: str) -> Any:
+    """meta/tasks.parquet: a pandas table whose index is the task's name."""
+    pa, _ = _pyarrow()
+    column = dict(name="task_index", field_name="task_index", pandas_type="int64", numpy_type="int64", metadata=None)
+    name = "__index_level_0__"
+    index = dict(name=None, field_name=name, pandas_type="unicode", numpy_type="object", metadata=None)
+    described = dict(index_columns=[name], column_indexes=[], columns=[column, index], pandas_version="2.0.0")
+    return pa.table({"task_index": [0], name: [task]}).replace_schema_metadata({"pandas": json.dumps(described)})

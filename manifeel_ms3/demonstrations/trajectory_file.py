@@ -7,6 +7,7 @@ links into them, replaced as a whole after each episode. It opens at any time li
 
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -181,6 +182,32 @@ def read_demonstrations(
         )
     with open_trajectories(path) as file:
         return [_read_episode(file, i, keys, path, header) for i in progress(range(count))]
+
+
+def each_demonstration(path: Path, keys: list[str], progress=iter) -> Iterator[dict[str, np.ndarray]]:
+    """What `read_demonstrations` reads, an episode at a time."""
+    header = read_header(path)
+    with open_trajectories(path) as file:
+        for i in progress(range(len(header["episodes"]))):
+            yield _read_episode(file, i, keys, path, header)
+
+
+def observed(path: Path) -> list[str]:
+    """What a file's episodes hold that policies see: pictures, force fields, the tool's pose.
+
+    Raises:
+        DemonstrationError: nothing of it.
+    """
+    with open_trajectories(path) as file:
+        sensors: Any = file.get("traj_0/obs/sensor_data", {})
+        keys = [
+            f"sensor_data/{sensor}/{what}" for sensor in sensors for what in ("rgb", "force_field") if what in sensors[sensor]
+        ]
+        if "traj_0/obs/extra/tcp_pose" not in file:
+            raise DemonstrationError(
+                f"{path} holds states and actions alone; `python -m manifeel_ms3.demonstrations.materialize` adds observations"
+            )
+    return [*keys, "extra/tcp_pose"]
 
 
 def _read_episode(file: h5py.File, i: int, keys: list[str], path: Path, header: dict) -> dict[str, np.ndarray]:

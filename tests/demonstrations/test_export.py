@@ -1,0 +1,118 @@
+"""What is exported reads back as what was recorded."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines.common.dataset import read_episodes
+from baselines.common.observation import observation_spec
+from manifeel_ms3.demonstrations import DemonstrationError, export, lerobot, paper_zarr, read_demonstrations
+from manifeel_ms3.demonstrations.trajectory_file import observed
+from manifeel_ms3.paths import data_dir
+from tests.conftest import PEG
+
+SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
+
+
+def exported(kind: export.Format, folder: Path) -> Path:
+    if kind != "npz":
+        pytest.importorskip("pyarrow" if kind == "lerobot" else "zarr")
+    return export.main(export.Args(SAMPLE, kind, folder / kind))
+
+
+def require_same(read: list[dict[str, np.ndarray]], last_is_repeated: bool) -> None:
+    recorded = read_demonstrations(SAMPLE, KEYS)
+    assert len(read) == len(recorded)
+    for episode, original in zip(read, recorded, strict=True):
+        assert np.array_equal(episode["actions"], original["actions"])
+        for key in KEYS:
+            expected = original[key].copy()
+            if last_is_repeated:  # the format holds no observation after the last action
+                expected[-1] = expected[-2]
+            assert episode[key].dtype == expected.dtype
+            assert np.array_equal(episode[key], expected), key
+
+
+def test_what_can_be_exported_is_found():
+    assert sorted(observed(SAMPLE)) == sorted(KEYS)
+    with pytest.raises(DemonstrationError, match="states and actions alone"):
+        observed(SAMPLE.with_name("states.h5"))
+
+
+def test_lerobot(tmp_path):
+    folder = exported("lerobot", tmp_path)
+    require_same(lerobot.read_lerobot(folder, KEYS, 2), last_is_repeated=True)
+    stats = json.loads((folder / "meta/stats.json").read_text())
+    poses = np.concatenate([episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS)])
+    assert np.allclose(stats["observation.state"]["mean"], poses.mean(0), atol=1e-6)
+    assert np.allclose(stats["observation.state"]["std"], poses.std(0), atol=1e-6)
+    pictures = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
+    assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), pictures.mean((0, 1, 2)), atol=1e-6)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("lerobot") is None, reason="lerobot is not installed")
+def test_lerobots_own_reader_takes_it(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("local/peg", root=exported("lerobot", tmp_path))
+    recorded = read_demonstrations(SAMPLE, KEYS)
+    assert dataset.num_episodes == 2
+    assert len(dataset) == sum(len(episode["actions"]) for episode in recorded)
+    frame = dataset[7]
+    assert np.allclose(frame["action"], recorded[0]["actions"][7])
+    assert np.allclose(frame["observation.images.wrist"].permute(1, 2, 0) * 255, recorded[0][KEYS[0]][7], atol=1e-3)
+    assert np.allclose(frame["observation.force_field.tactile_right"], recorded[0][KEYS[1]][7])
+
+
+def test_zarr_of_the_papers_layout(tmp_path):
+    folder = exported("zarr", tmp_path)
+    assert paper_zarr.is_zarr(folder)
+    assert (folder / "data/wrist/.zarray").is_file()  # format 2, which the paper's code reads
+    assert {path.name for path in (folder / "data").iterdir() if path.is_dir()} == {
+        *("wrist", "tactile_force_field_right", "state", "action")
+    }
+    require_same(paper_zarr.read_zarr(folder, KEYS, 2), last_is_repeated=True)
+
+
+def test_pictures_of_touch_lie_as_in_the_papers_data():
+    key = "sensor_data/tactile_right/rgb"
+    assert paper_zarr.array_name(key) == "right_tactile_camera_taxim"
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), np.uint8)
+    theirs = paper_zarr._theirs(key, pictures)
+    assert theirs.shape == (3, 320, 240, 3)
+    assert theirs.dtype == np.float32
+    assert theirs.max() <= 1
+    assert np.array_equal(paper_zarr._ours(key, theirs), pictures)
+
+
+def test_npz(tmp_path):
+    folder = exported("npz", tmp_path)
+    read = [{k.replace(".", "/"): v for k, v in np.load(file).items()} for file in sorted(folder.iterdir())]
+    require_same(read, last_is_repeated=False)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "zarr"])
+def test_baselines_train_on_it(kind, tmp_path):
+    folder = exported(kind, tmp_path)
+    spec = observation_spec("rgb+tacff", ("wrist",), ("right",), 32)
+    (episode,) = read_episodes([folder], PEG, spec, 1)
+    (original,) = read_episodes([SAMPLE], PEG, spec, 1)
+    assert all(np.array_equal(episode[key][:-1], original[key][:-1]) for key in spec.keys)
+
+
+def test_what_is_there_or_broken_is_said(tmp_path):
+    folder = exported("zarr", tmp_path)
+    with pytest.raises(DemonstrationError, match="is there already"):
+        export.main(export.Args(SAMPLE, "zarr", folder))
+    with pytest.raises(DemonstrationError, match=r"lacks \['front'\]; it holds \['action'"):
+        paper_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1)
+    for file in (folder / "meta").rglob("*"):
+        if file.is_file():
+            file.unlink()
+    with pytest.raises(DemonstrationError, match="is no store of the paper's layout"):
+        paper_zarr.count_episodes(folder)
+    assert not list(tmp_path.glob("*.partial"))
