@@ -1,0 +1,107 @@
+"""What a trajectory file holds, in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import tyro
+from rich.console import Console, Group
+from rich.table import Table
+
+from .trajectory_file import open_trajectories, read_header
+
+BARS = " ▁▂▃▄▅▆▇█"
+WIDTH = 28  # characters of a sparkline
+SHOWN = 12  # episodes
+FORCE_EDGES = (0, 0.5, 1, 2, 5, 10, 20, 40, 60, np.inf)  # N
+
+
+@dataclass
+class Args:
+    file: tyro.conf.Positional[Path]
+    episodes: int = SHOWN
+    """listed one by one"""
+
+
+def sparkline(values: np.ndarray, top: float) -> str:
+    """Values (T,) as a row of bars, the highest at `top`; the largest of each stretch counts."""
+    if len(values) == 0:
+        return ""
+    stretches = np.array_split(values, min(WIDTH, len(values)))
+    levels = [round(min(max(stretch.max() / max(top, 1e-9), 0), 1) * (len(BARS) - 1)) for stretch in stretches]
+    return "".join(BARS[level] for level in levels)
+
+
+def main(args: Args) -> None:
+    """Print the summary.
+
+    Raises:
+        DemonstrationError: the file is missing or broken.
+    """
+    Console().print(summary(args.file, args.episodes))
+
+
+def summary(path: Path, shown: int = SHOWN) -> Group:
+    """Tables of the file, of its contact forces, and of some episodes."""
+    header = read_header(path)
+    episodes = header["episodes"]
+    with open_trajectories(path) as file:
+        forces = [file[f"traj_{episode['episode_id']}/contact_force"][()] for episode in episodes]
+        sizes: dict[str, int] = {}
+
+        def count(name: str, item: h5py.HLObject) -> None:
+            if isinstance(item, h5py.Dataset):
+                part = name.partition("/")[2]
+                sizes[part] = sizes.get(part, 0) + item.id.get_storage_size()
+
+        file.visititems(count)
+    return Group(_whole(path, header), _histogram(forces), _listed(episodes[:shown], forces), _parts(sizes, len(episodes)))
+
+
+def _whole(path: Path, header: dict) -> Table:
+    episodes, env = header["episodes"], header["env_info"]
+    lengths = np.array([episode["elapsed_steps"] for episode in episodes] or [0])
+    won = sum(bool(episode["success"]) for episode in episodes)
+    table = Table(title=str(path), show_header=False)
+    table.add_row("task", env["env_id"].rpartition(":")[2])
+    table.add_row("observations", str(env["env_kwargs"].get("obs_mode")))
+    table.add_row("source", str(header.get("source_type")))
+    table.add_row("episodes", f"{len(episodes)}, {won} successes, {len(header.get('failed_seeds', []))} seeds that failed")
+    table.add_row("steps", f"{lengths.mean():.0f} on average, {lengths.min()} to {lengths.max()}, {lengths.sum()} in all")
+    table.add_row(
+        "size", f"{path.stat().st_size / 1e6:.2f} MB, {path.stat().st_size / 1e6 / max(len(episodes), 1):.2f} an episode"
+    )
+    return table
+
+
+def _histogram(forces: list[np.ndarray]) -> Table:
+    """Steps by the contact force of the held part on the world."""
+    table = Table("contact force, N", "steps", "", title="contact forces")
+    everything = np.concatenate(forces) if forces else np.zeros(0)
+    counts, _ = np.histogram(everything, FORCE_EDGES)
+    for low, high, number in zip(FORCE_EDGES, FORCE_EDGES[1:], counts, strict=False):
+        bar = "█" * round(WIDTH * number / max(counts.max(), 1))
+        table.add_row(f"{low:g} to {high:g}" if np.isfinite(high) else f"over {low:g}", str(number), bar)
+    return table
+
+
+def _listed(episodes: list[dict], forces: list[np.ndarray]) -> Table:
+    table = Table("episode", "seed", "steps", "success", "peak, N", "contact force over time", title="episodes")
+    top = max((force.max(initial=0) for force in forces), default=0.0)
+    for episode, force in zip(episodes, forces, strict=False):
+        cells = (episode["episode_id"], episode["episode_seed"], episode["elapsed_steps"])
+        won = "yes" if episode["success"] else "no"
+        table.add_row(*map(str, cells), won, f"{force.max(initial=0):.1f}", sparkline(force, top))
+    return table
+
+
+def _parts(sizes: dict[str, int], episodes: int) -> Table:
+    table = Table("array", "MB", "kB an episode", title="where the room goes")
+    for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:SHOWN]:
+        table.add_row(name, f"{size / 1e6:.2f}", f"{size / 1e3 / max(episodes, 1):.1f}")
+    return table
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

@@ -1,0 +1,45 @@
+"""What the summary of a file says is what the file holds."""
+
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from manifeel_ms3.demonstrations import DemonstrationError, read_header
+from manifeel_ms3.demonstrations.summary import sparkline, summary
+from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
+from manifeel_ms3.paths import data_dir
+from tests.conftest import PEG
+
+SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+
+
+def test_it_counts_what_is_there():
+    page = io.StringIO()
+    Console(width=160, file=page).print(summary(SAMPLE))
+    told = page.getvalue()
+    episodes = read_header(SAMPLE)["episodes"]
+    with open_trajectories(SAMPLE) as file:
+        forces = [file[f"traj_{i}/contact_force"][()] for i in range(len(episodes))]
+    assert f"{len(episodes)}, {len(episodes)} successes, 0 seeds that failed" in told
+    assert f"{sum(episode['elapsed_steps'] for episode in episodes)} in all" in told
+    assert all(f"{force.max():.1f}" in told for force in forces)
+    between = sum(((force >= 10) & (force < 20)).sum() for force in forces)
+    assert f"│ 10 to 20         │ {between} " in told
+    assert "obs/sensor_data/wrist/rgb" in told
+
+
+def test_a_sparkline_shows_where_it_is_high():
+    line = sparkline(np.r_[np.zeros(70), 5.0, np.zeros(9), np.full(80, 10.0)], top=10.0)
+    assert len(line) == 28
+    assert line[-14:] == "█" * 14
+    assert line[:12] == " " * 12
+    assert line[12] == "▄"
+    assert sparkline(np.zeros(0), 1.0) == ""
+    assert sparkline(np.zeros(3), 0.0) == "   "
+
+
+def test_a_file_that_is_not_there_is_said(tmp_path):
+    with pytest.raises(DemonstrationError, match="does not exist"):
+        summary(tmp_path / "none.h5")
