@@ -34,7 +34,9 @@ PAPER_COUNTS = {
     "ManiFeel-BallSorting-v1": 80,
     "ManiFeel-BallSortingDim-v1": 80,
 }
-BYTES_A_DEMO = 12e6  # observed with everything, at most about
+BYTES_A_DEMO = 13e6  # observed with everything, at most about
+BYTES_A_LONG_DEMO = 70e6
+LONG = ("ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1")  # 400 steps
 
 
 @dataclass
@@ -69,7 +71,7 @@ def main(args: Args) -> Path:
         raise ValueError(f"tasks {sorted(unknown)} are unknown; choose from {list(PAPER_COUNTS)}")
     observed = args.obs_mode != "none"
     args.out.mkdir(parents=True, exist_ok=True)
-    _check_room(args, sum(counts.values()) if observed else 0)
+    _check_room(args, counts if observed else {})
     files = {task: (args.out / task / "states.h5", args.out / task / "trajectory.h5") for task in counts}
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
@@ -91,13 +93,14 @@ def main(args: Args) -> Path:
     return args.out / "manifest.json"
 
 
-def _check_room(args: Args, episodes: int) -> None:
+def _check_room(args: Args, counts: dict[str, int]) -> None:
     free = shutil.disk_usage(args.out).free
     pixels = ((args.picture_size or 256) / 256) ** 2
-    if (needed := episodes * BYTES_A_DEMO * max(pixels, 0.2)) > free:
+    whole = sum(count * (BYTES_A_LONG_DEMO if task in LONG else BYTES_A_DEMO) for task, count in counts.items())
+    if (needed := whole * max(pixels, 0.2)) > free:
         raise OSError(
-            f"{args.out} has {free / 1e9:.1f} GB free, {episodes} episodes take up to {needed / 1e9:.1f}; give another --out, "
-            "fewer --tasks or cameras, or --obs-mode none (what is there already is kept)"
+            f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} episodes take up to {needed / 1e9:.1f}; give "
+            "another --out, fewer --tasks or cameras, or --obs-mode none (what is there already is kept)"
         )
 
 

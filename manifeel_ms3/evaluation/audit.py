@@ -7,6 +7,7 @@ policy that has that modality alone will hardly know. Answers are cross-validate
 
 import json
 import logging
+import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -310,7 +311,7 @@ def figure(answers: list[Answer], path: Path) -> None:
         if not group[0].unit:
             ax.set_ylim(0, 105)
         task = group[0].env_id.removeprefix("ManiFeel-").removesuffix("-v1")
-        ax.set_title(f"{task}\n{group[0].question}", fontsize=7, wrap=True)
+        ax.set_title(f"{task}\n{textwrap.fill(group[0].question, 28)}", fontsize=7)
     fig.savefig(path, dpi=130)
     plt.close(fig)
 
