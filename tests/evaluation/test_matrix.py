@@ -115,6 +115,7 @@ def test_what_a_machine_does_not_have_is_said(study, tmp_path):
     study.write_text(TINY.replace("train: {cpus: 1}", "train: {cpus: 1, gpus: 99}"))
     with pytest.raises(StudyError, match="train needs 99 GPUs"):
         matrix.main(matrix.Args(study, tmp_path))
+    assert subprocess.run([sys.executable, "-c", "raise SystemExit(3)"], check=False).returncode == 3  # Ray has hidden nothing
 
 
 # -------------------------------------------------------------------- running

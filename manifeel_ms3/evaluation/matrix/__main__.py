@@ -20,7 +20,7 @@ from rich.table import Table
 
 from . import cost
 from .study import KINDS, Stage, Study, StudyError, read_study, stages_of
-from .work import FAILED, STARTED, is_done, is_running, perform, read_note
+from .work import FAILED, STARTED, is_done, is_running, listen_to_children, perform, read_note
 
 log = logging.getLogger(__name__)
 RETRIES = 3
@@ -74,6 +74,7 @@ def _run(study: Study, stages: list[Stage], root: Path, address: str | None, con
     for name, value in RAY_SETTINGS.items():
         os.environ.setdefault(name, value)
     ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False)
+    listen_to_children()
     try:
         worker = ray.remote(max_calls=1, max_retries=RETRIES)(perform)  # a process of its own for each
         _require_resources(study)

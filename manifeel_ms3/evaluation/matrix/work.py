@@ -3,6 +3,7 @@
 import importlib
 import json
 import os
+import signal
 import socket
 import time
 import traceback
@@ -46,6 +47,7 @@ def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
     Raises:
         Exception: whatever went wrong; failed.json has it, too.
     """
+    listen_to_children()
     if is_done(stage, root):
         return
     folder = stage.folder(root)
@@ -64,6 +66,11 @@ def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
     parallel = 1 if stage.kind == "train" else workers
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
+
+
+def listen_to_children() -> None:
+    """Ray lets the system reap a process's children unheard: their exit codes, which say whether one died, would be lost."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
 def _record(stage: Stage, root: Path, workers: int) -> int:
