@@ -13,6 +13,7 @@ from typing import Literal
 
 import tyro
 
+from .markdown import markdown_table
 from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
 from .protocol import Estimate, Runs, Setup, collect, difference
 from .result import results_in
@@ -104,14 +105,14 @@ def _verdict(comparison: Comparison, gap: Estimate) -> Verdict:
 
 def table(answers: dict[Comparison, Answer | None]) -> str:
     """Markdown: a row a comparison; those not run say so."""
-    lines = ["| claim | task | compared | difference | p | verdict |", "|---|---|---|---|---|---|"]
+    rows = []
     for comparison, found in answers.items():
-        cells = "| | not run"
+        said = (None, None, "not run")
         if found:
             gap = found.difference
-            cells = f"{gap.value:+.0%} [{gap.low:+.0%}, {gap.high:+.0%}] | {found.p_value:.3f} | {found.verdict}"
-        lines.append(f"| {comparison.claim} | {comparison.first.task} | {_named(comparison)} | {cells} |")
-    return "\n".join(lines) + "\n"
+            said = (f"{gap.value:+.0%} [{gap.low:+.0%}, {gap.high:+.0%}]", f"{found.p_value:.3f}", found.verdict)
+        rows.append((comparison.claim, comparison.first.task, _named(comparison), *said))
+    return markdown_table(("claim", "task", "compared", "difference", "p", "verdict"), rows)
 
 
 def _named(comparison: Comparison) -> str:

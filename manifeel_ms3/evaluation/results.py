@@ -10,6 +10,7 @@ import tyro
 
 from .claims import answers_of, find
 from .claims import table as claim_table
+from .markdown import markdown_table
 from .paper import reported
 from .protocol import LAST, collect, setup_of, success
 from .result import results_in
@@ -48,29 +49,24 @@ def page(results: list[dict[str, Any]]) -> Iterator[str]:
     found = collect(results)
     yield HEAD.format(last=LAST)
     yield "\n## What was run\n\n"
-    yield _head("task", "sensing", "policy", "encoder", "demonstrations", "success", "of", "cost", "on")
+    rows = []
     for setup, runs in sorted(found.items(), key=lambda item: tuple(map(str, vars(item[0]).values()))):
         cost, place = _cost([result for result in results if setup_of(result) == setup])
         task = f"{setup.task} `{setup.variant}`" if setup.variant else setup.task
-        run = (success(runs), runs.size, cost, place)
-        yield _row(task, setup.sensing, setup.policy, setup.encoder, setup.num_demos or "", *run)
+        what = (task, setup.sensing, setup.policy, setup.encoder, setup.num_demos)
+        rows.append((*what, success(runs), runs.size, cost, place))
+    names = ("task", "sensing", "policy", "encoder", "demonstrations", "success", "of", "cost", "on")
+    yield markdown_table(names, rows)
     yield "\n## The paper's tables\n\n"
-    yield _head("table", "task", "sensing", "policy", "encoder", "paper", "here", "of")
+    rows = []
     for name, setup, rate in reported():
         runs = find(setup, found)
-        here = (success(runs), runs.size) if runs else ("not run", "")
-        yield _row(name, setup.task, setup.obs_mode, setup.policy, setup.encoder, f"{rate:.0%}", *here)
+        here = (success(runs), runs.size) if runs else ("not run", None)
+        rows.append((name, setup.task, setup.obs_mode, setup.policy, setup.encoder, f"{rate:.0%}", *here))
+    yield markdown_table(("table", "task", "sensing", "policy", "encoder", "paper", "here", "of"), rows)
     yield "\n## The paper's claims\n\nEach a difference of two set-ups on the same starts, with its interval of 95 % "
     yield "([how](evaluation.md)).\n\n"
     yield claim_table(answers_of(found))
-
-
-def _row(*cells: Any) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |\n"
-
-
-def _head(*names: str) -> str:
-    return _row(*names) + "|---" * len(names) + "|\n"
 
 
 def _cost(results: list[dict[str, Any]]) -> tuple[str, str]:

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from manifeel_ms3.evaluation import claims
+from manifeel_ms3.evaluation import claims, results
 from manifeel_ms3.evaluation.protocol import Estimate
 from manifeel_ms3.evaluation.result import ResultError, result_of
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
@@ -37,6 +37,15 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     page = (tmp_path / "claims.md").read_text()
     assert "| PegInsertion | rgb+tacff over rgb (DiffusionPolicy rgb+tacff) | +3" in page
     assert page.count("not run") == len(answers) - 1
+
+
+def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
+    write_run(tmp_path, "rgb", 0.2, 0)
+    page = results.main(results.Args((tmp_path,), tmp_path / "results.md")).read_text()
+    ran, reported = (line for line in page.splitlines() if "1 x 10 x 50" in line)
+    assert ran.startswith("| PegInsertion | rgb wrist | DiffusionPolicy |")
+    assert reported.startswith("| I | PegInsertion | rgb | DiffusionPolicy |  | 14% |")
+    assert "| I | USBInsertion | rgb | DiffusionPolicy |  | 49% | not run |" in page
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,8 @@
     python -m manifeel_ms3.evaluation.leaderboard build
 
 A submission is a folder with submission.json ({"name", "authors", "link"}), the result files of a policy, one a checkpoint and
-training seed, in any folders, and, if wanted, a `log.jsonl` of training and `videos/*.mp4` beside them. `submit` checks it and
-puts it into the leaderboard's folder; `build` makes index.html and README.md of all that is there.
+training seed, in any folders, and, if wanted, `videos/*.mp4`. `submit` checks it and puts it into the leaderboard's folder;
+`build` makes index.html and README.md of all that is there.
 """
 
 import logging

@@ -10,6 +10,7 @@ import jinja2
 import numpy as np
 import plotly.offline
 
+from ..markdown import markdown_table
 from ..protocol import LAST, Estimate, Runs, Setup, collect, setup_of, success
 from .submission import Submission
 
@@ -58,21 +59,19 @@ def ranked(submissions: list[Submission]) -> list[Row]:
 
 def table(rows: list[Row]) -> str:
     """Markdown."""
-    lines = [
-        "# Leaderboard",
-        "",
-        f"`{PAGE}` is the same with filters, curves and films. Success is the mean over {FULL[0]} training seeds, the last "
-        f'{FULL[1]} checkpoints and {FULL[2]} starts, with its interval of 95 %; what has fewer says so under "of".',
-        "",
-        "| task | sensing | policy | encoder | demonstrations | success | of | submission |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    head = (
+        f"# Leaderboard\n\n`{PAGE}` is the same with filters, curves and films. Success is the mean over {FULL[0]} training "
+        f"seeds, the last {FULL[1]} checkpoints and {FULL[2]} starts, with its interval of 95 %; what has fewer says so "
+        'under "of".\n\n'
+    )
+    cells = []
     for row in rows:
         about, setup = row.submission.about, row.setup
         name = f"[{about.name}]({about.link})" if about.link else about.name
-        cells = (f"{setup.task} {setup.variant}".strip(), setup.sensing, setup.policy, setup.encoder, setup.num_demos or "")
-        lines.append("| " + " | ".join(map(str, (*cells, row.success, row.runs.size, name))) + " |")
-    return "\n".join(lines) + "\n"
+        what = (f"{setup.task} {setup.variant}".strip(), setup.sensing, setup.policy, setup.encoder, setup.num_demos)
+        cells.append((*what, row.success, row.runs.size, name))
+    names = ("task", "sensing", "policy", "encoder", "demonstrations", "success", "of", "submission")
+    return head + markdown_table(names, cells)
 
 
 def write(submissions: list[Submission], board: Path) -> Path:
