@@ -1,6 +1,7 @@
 """Demonstrations in memory, and sequences of them by index arithmetic."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,31 +26,29 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
         DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
     """
     files, episodes = list(files), []
-    held = [_count(file) for file in files]
+    formats = [_format(file, env_id) for file in files]
+    held = [count(file) for file, (count, _) in zip(files, formats, strict=True)]
     wanted = sum(held) if num_demos is None else num_demos
     if not 0 < wanted <= sum(held):
         raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
     with progress_bar() as bar:
-        for file, count in zip(files, held, strict=True):
+        for file, count, (_, read) in zip(files, held, formats, strict=True):
             left = min(count, wanted - len(episodes))
             if left == 0:
                 break
-            track = lambda indices, name=file.name: bar.track(indices, description=f"reading {name}")  # noqa: E731
-            if lerobot.is_lerobot(file):  # these two do not say of what task they are
-                read = lerobot.read_lerobot(file, spec.keys, left, track)
-            elif paper_zarr.is_zarr(file):
-                read = paper_zarr.read_zarr(file, spec.keys, left, track)
-            else:
-                read = read_demonstrations(file, spec.keys, env_id, left, track)
-            for episode in read:
+            track = partial(bar.track, description=f"reading {file.name}")
+            for episode in read(file, spec.keys, num=left, progress=track):
                 episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
     return episodes
 
 
-def _count(file: Path) -> int:
-    if lerobot.is_lerobot(file):
-        return lerobot.count_episodes(file)
-    return paper_zarr.count_episodes(file) if paper_zarr.is_zarr(file) else len(read_header(file)["episodes"])
+def _format(file: Path, env_id: str) -> tuple[Callable[[Path], int], Callable[..., list[Episode]]]:
+    """How episodes of a file are counted, and read."""
+    if lerobot.is_lerobot(file):  # these two do not say of what task they are
+        return lerobot.count_episodes, lerobot.read_lerobot
+    if paper_zarr.is_zarr(file):
+        return paper_zarr.count_episodes, paper_zarr.read_zarr
+    return lambda file: len(read_header(file)["episodes"]), partial(read_demonstrations, env_id=env_id)
 
 
 class SequenceDataset:

@@ -5,7 +5,7 @@ interval is above zero, does not where all of it is below, and is undecided othe
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
@@ -15,7 +15,7 @@ import tyro
 
 from .markdown import markdown_table
 from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
-from .protocol import Estimate, Runs, Setup, collect, difference
+from .protocol import PAPER_NETWORK, Estimate, Runs, Setup, collect, difference
 from .result import results_in
 
 log = logging.getLogger(__name__)
@@ -41,6 +41,7 @@ class Answer:
     difference: Estimate
     p_value: float
     verdict: Verdict
+    network: str
 
 
 def comparisons() -> Iterator[Comparison]:
@@ -79,12 +80,18 @@ def comparisons() -> Iterator[Comparison]:
 
 
 def answer(comparison: Comparison, found: dict[Setup, Runs]) -> Answer | None:
-    """What was run says; None where it was not."""
-    first, second = (find(side, found) for side in (comparison.first, comparison.second))
-    if first is None or second is None:
-        return None
-    gap, p_value = difference(first, second)
-    return Answer(comparison, gap, p_value, _verdict(comparison, gap))
+    """What was run says, with the paper's networks or else with others, the same on both sides; None where it was not."""
+    for network in networks(found):
+        first, second = (find(replace(side, network=network), found) for side in (comparison.first, comparison.second))
+        if first and second:
+            gap, p_value = difference(first, second)
+            return Answer(comparison, gap, p_value, _verdict(comparison, gap), network)
+    return None
+
+
+def networks(found: Iterable[Setup]) -> list[str]:
+    """Of what was run, the paper's first."""
+    return sorted({setup.network for setup in found}, key=lambda network: (network != PAPER_NETWORK, network))
 
 
 def answers_of(found: dict[Setup, Runs]) -> dict[Comparison, Answer | None]:
@@ -107,12 +114,11 @@ def table(answers: dict[Comparison, Answer | None]) -> str:
     """Markdown: a row a comparison; those not run say so."""
     rows = []
     for comparison, found in answers.items():
-        said = (None, None, "not run")
+        said = (None, None, "not run", None)
         if found:
-            gap = found.difference
-            said = (f"{gap.value:+.0%} [{gap.low:+.0%}, {gap.high:+.0%}]", f"{found.p_value:.3f}", found.verdict)
+            said = (found.difference.signed, f"{found.p_value:.3f}", found.verdict, found.network)
         rows.append((comparison.claim, comparison.first.task, _named(comparison), *said))
-    return markdown_table(("claim", "task", "compared", "difference", "p", "verdict"), rows)
+    return markdown_table(("claim", "task", "compared", "difference", "p", "verdict", "network"), rows)
 
 
 def _named(comparison: Comparison) -> str:

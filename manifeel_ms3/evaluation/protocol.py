@@ -15,6 +15,7 @@ from scipy import stats
 from .result import ResultError
 
 LAST = 10  # checkpoints
+PAPER_NETWORK = "resnet18"
 RESAMPLES = 4000
 CONFIDENCE = 0.95
 SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend")  # arguments that do not change the task
@@ -34,6 +35,8 @@ class Setup:
     num_demos: int | None = None
     variant: str = ""
     """arguments of the task other than its defaults, as json"""
+    network: str = PAPER_NETWORK
+    """encoder of cameras, which tells the paper's networks from smaller ones; "" for a policy that is no baseline"""
 
     @property
     def task(self) -> str:
@@ -56,6 +59,11 @@ class Estimate:
     def __str__(self) -> str:
         return f"{self.value:.0%} [{self.low:.0%}, {self.high:.0%}]"
 
+    @property
+    def signed(self) -> str:
+        """As a difference is told."""
+        return f"{self.value:+.0%} [{self.low:+.0%}, {self.high:+.0%}]"
+
 
 @dataclass
 class Runs:
@@ -72,12 +80,14 @@ class Runs:
 
 def setup_of(result: dict[str, Any]) -> Setup:
     config = result["config"]
-    encoder = config.get("policy", {}).get("encoder", {}).get("tacrgb", "") if "tacrgb" in result["obs_mode"] else ""
+    encoders = config.get("policy", {}).get("encoder", {})
+    encoder = encoders.get("tacrgb", "") if "tacrgb" in result["obs_mode"] else ""
     cameras = tuple(result["env_kwargs"].get("cameras", ())) if "rgb" in result["obs_mode"].split("+") else ()
     policy = result["policy"].rpartition(":")[2]
     other = {name: value for name, value in result["env_kwargs"].items() if name not in SENSING}
     variant = json.dumps(other, sort_keys=True) if other else ""
-    return Setup(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant)
+    network = encoders.get("image", "")
+    return Setup(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant, network)
 
 
 def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Setup, Runs]:

@@ -1,21 +1,25 @@
 """What was run, beside what the paper reports: `python -m manifeel_ms3.evaluation.results --results runs/matrix`."""
 
+import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import tyro
 
-from .claims import answers_of, find
+from .checkpoint_config import checkpoint_config
+from .claims import answers_of, find, networks
 from .claims import table as claim_table
 from .markdown import markdown_table
 from .paper import reported
-from .protocol import LAST, collect, setup_of, success
+from .protocol import LAST, Runs, Setup, collect, difference, setup_of, success
 from .result import results_in
 
 log = logging.getLogger(__name__)
+REFERENCES = ("MeanAction", "Untrained")  # of baselines.common.references
 HEAD = """# Results
 
 *Made from result files by `python -m manifeel_ms3.evaluation.results`; nothing here is typed by hand.*
@@ -39,34 +43,87 @@ def main(args: Args) -> Path:
         ResultError: there is no result, or one is broken.
     """
     results = results_in(*args.results)
-    args.out.write_text("".join(page(results)))
+    picture = args.out.parent / f"images/{args.out.stem}.png"
+    curves = training_curves(args.results, picture)
+    args.out.write_text("".join(page(results, picture.relative_to(args.out.parent) if curves else None)))
     log.info("%s", args.out)
     return args.out
 
 
-def page(results: list[dict[str, Any]]) -> Iterator[str]:
-    """Markdown, part by part."""
+def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
+    """Draw the loss of every training run under some folders, a panel a task; False if there is none."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    runs: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
+    for path in sorted(path for folder in folders for path in folder.rglob("log.jsonl")):
+        config = checkpoint_config(path.parent / "checkpoints/last")
+        entries = [entry for line in path.read_text().splitlines() if "loss" in (entry := json.loads(line))]
+        name = f"{config['policy_class'].rpartition(':')[2]}, {config['obs_mode']}, seed {config['seed']}"
+        runs.setdefault(config["env_id"], []).append((name, entries))
+    if not runs:
+        return False
+    fig, axes = plt.subplots(1, len(runs), figsize=(5 * len(runs), 3.4), layout="constrained", squeeze=False)
+    for ax, (task, curves) in zip(axes[0], runs.items(), strict=True):
+        for name, entries in curves:
+            ax.plot([entry["step"] for entry in entries], [entry["loss"] for entry in entries], label=name, lw=1)
+        ax.set(title=task, xlabel="gradient step", ylabel="loss", yscale="log")
+        ax.legend(fontsize=7)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(out, dpi=130)
+    plt.close(fig)
+    return True
+
+
+def page(results: list[dict[str, Any]], curves: Path | None = None) -> Iterator[str]:
+    """Markdown, part by part; `curves`: the picture of training, relative to the page."""
     found = collect(results)
     yield HEAD.format(last=LAST)
     yield "\n## What was run\n\n"
     rows = []
-    for setup, runs in sorted(found.items(), key=lambda item: tuple(map(str, vars(item[0]).values()))):
+    for setup, runs in _sorted(found):
         cost, place = _cost([result for result in results if setup_of(result) == setup])
-        task = f"{setup.task} `{setup.variant}`" if setup.variant else setup.task
-        what = (task, setup.sensing, setup.policy, setup.encoder, setup.num_demos)
+        what = (_task(setup), setup.sensing, setup.policy, setup.network, setup.encoder, setup.num_demos)
         rows.append((*what, success(runs), runs.size, cost, place))
-    names = ("task", "sensing", "policy", "encoder", "demonstrations", "success", "of", "cost", "on")
+    names = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations", "success", "of", "cost", "on")
     yield markdown_table(names, rows)
-    yield "\n## The paper's tables\n\n"
+    if curves:
+        yield f"\n![losses in training]({curves})\n"
+    if rows := list(_gains_over_references(found)):
+        yield "\n## What learning gained\n\nOver policies that learnt nothing, on the same starts: the network before "
+        yield "training, and the mean action of the demonstrations (`baselines/common/references.py`).\n\n"
+        yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
+    yield "\n## The paper's tables\n\nThe paper's networks are ResNet-18; where another was run here, \"network\" names it.\n\n"
     rows = []
     for name, setup, rate in reported():
-        runs = find(setup, found)
-        here = (success(runs), runs.size) if runs else ("not run", None)
+        here = ("not run", None, None)
+        for network in networks(found):
+            if runs := find(replace(setup, network=network), found):
+                here = (success(runs), runs.size, network)
+                break
         rows.append((name, setup.task, setup.obs_mode, setup.policy, setup.encoder, f"{rate:.0%}", *here))
-    yield markdown_table(("table", "task", "sensing", "policy", "encoder", "paper", "here", "of"), rows)
+    yield markdown_table(("table", "task", "sensing", "policy", "TacRGB encoder", "paper", "here", "of", "network"), rows)
     yield "\n## The paper's claims\n\nEach a difference of two set-ups on the same starts, with its interval of 95 % "
     yield "([how](evaluation.md)).\n\n"
     yield claim_table(answers_of(found))
+
+
+def _sorted(found: dict[Setup, Runs]) -> list[tuple[Setup, Runs]]:
+    return sorted(found.items(), key=lambda item: tuple(map(str, vars(item[0]).values())))
+
+
+def _task(setup: Setup) -> str:
+    return f"{setup.task} `{setup.variant}`" if setup.variant else setup.task
+
+
+def _gains_over_references(found: dict[Setup, Runs]) -> Iterator[tuple]:
+    for (setup, runs), (other, learnt_nothing) in product(_sorted(found), repeat=2):
+        same_task = (setup.env_id, setup.variant) == (other.env_id, other.variant)
+        if same_task and other.policy in REFERENCES and setup.policy not in REFERENCES:
+            gain, p_value = difference(runs, learnt_nothing)
+            yield _task(setup), setup.sensing, setup.policy, other.policy, gain.signed, f"{p_value:.1g}"
 
 
 def _cost(results: list[dict[str, Any]]) -> tuple[str, str]:

@@ -16,10 +16,12 @@ from baselines.common.agent import PolicyAgent
 from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.encoders import EncoderConfig
+from baselines.common.references import MeanAction, Untrained
 from baselines.common.training import TrainArgs, TrainingError
 from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
+from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from tests.conftest import PEG
 
@@ -167,6 +169,21 @@ def test_agent_acts_and_repeats_itself_after_reset(make_env, checkpoint):
     assert all(a.shape == (6,) and (a == b).all() for a, b in zip(first, second, strict=True))
     few = PolicyAgent(checkpoint, inference_steps=4)
     assert few.act(obs).shape == (6,)
+
+
+def test_the_untrained_self_is_what_training_began_with(run, checkpoint, tmp_path):
+    begun = run.again(run_dir=tmp_path, steps=1, lr=0.0)  # a step that changes nothing
+    untrained, trained = Untrained(str(checkpoint)).policy.state_dict(), read_tensors(checkpoint / "model.safetensors")
+    for name, first in read_tensors(begun / "model.safetensors").items():
+        assert torch.equal(untrained[name], first), name
+    assert not all(torch.equal(untrained[name], trained[name]) for name in trained)
+
+
+def test_mean_action_is_that_of_all_steps(demos):
+    episodes = read_demonstrations(demos, [])
+    steps = sum(len(episode["actions"]) for episode in episodes)
+    policy = MeanAction(str(demos))
+    assert policy.act({}) == pytest.approx(sum(episode["actions"].sum(0) for episode in episodes) / steps, rel=1e-4)
 
 
 def test_checkpoint_of_another_architecture_is_refused(checkpoint, tmp_path):

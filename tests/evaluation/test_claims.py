@@ -1,25 +1,27 @@
 """Claims are answered from result files, and only where both sides were run."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from manifeel_ms3.evaluation import claims, results
-from manifeel_ms3.evaluation.protocol import Estimate
-from manifeel_ms3.evaluation.result import ResultError, result_of
+from manifeel_ms3.evaluation.protocol import Estimate, collect
+from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
 
 
-def write_run(folder, mode: str, rate: float, seed: int) -> None:
-    """Ten checkpoints of a Diffusion Policy on PegInsertion."""
+def write_run(folder, mode: str, rate: float, seed: int, policy="DiffusionPolicy", network="resnet18") -> None:
+    """Ten checkpoints of a policy on PegInsertion."""
     rng = np.random.default_rng([seed, len(mode)])
     for step in range(10):
-        config = dict(kind="m:DiffusionPolicy", obs_mode=mode, seed=seed, step=step, num_demos=50)
+        config = dict(kind=f"m:{policy}", obs_mode=mode, seed=seed, step=step, num_demos=50)
+        config |= dict(policy=dict(encoder=dict(image=network)))
         won = rng.random(50) < rate
         outcomes = [EpisodeOutcome(k, bool(win), bool(win), 9, 1.0, 1.0) for k, win in enumerate(won)]
-        path = folder / mode / str(seed) / f"evaluations/{step:08d}.json"
+        path = folder / policy / network / mode / str(seed) / f"evaluations/{step:08d}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(result_of(PEG, dict(cameras=["wrist"]), config, outcomes)))
 
@@ -46,6 +48,24 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     assert ran.startswith("| PegInsertion | rgb wrist | DiffusionPolicy |")
     assert reported.startswith("| I | PegInsertion | rgb | DiffusionPolicy |  | 14% |")
     assert "| I | USBInsertion | rgb | DiffusionPolicy |  | 49% | not run |" in page
+    assert "learnt nothing" not in page
+
+
+def test_gains_over_policies_that_learnt_nothing_are_told(tmp_path):
+    write_run(tmp_path, "rgb", 0.6, 0)
+    write_run(tmp_path, "none", 0.0, 0, policy="MeanAction", network="")
+    page = results.main(results.Args((tmp_path,), tmp_path / "results.md")).read_text()
+    assert "| PegInsertion | rgb wrist | DiffusionPolicy | MeanAction | +6" in page
+
+
+def test_small_networks_are_named_and_never_compared_with_the_papers(tmp_path):
+    write_run(tmp_path, "rgb", 0.2, 0)
+    write_run(tmp_path, "rgb+tacff", 0.5, 0, network="small_cnn")
+    assert not any(claims.answers_of(collect(results_in(tmp_path))).values())
+    write_run(tmp_path, "rgb", 0.2, 0, network="small_cnn")
+    page = results.main(results.Args((tmp_path,), tmp_path / "results.md")).read_text()
+    assert re.search(r"\| I \| PegInsertion \| rgb\+tacff .* 40% .* small_cnn \|", page)
+    assert re.search(r"rgb\+tacff over rgb .* holds \| small_cnn \|", page)
 
 
 @pytest.mark.parametrize(

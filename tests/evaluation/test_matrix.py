@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from manifeel_ms3.evaluation import results as page_of_results
 from manifeel_ms3.evaluation.matrix import __main__ as matrix
 from manifeel_ms3.evaluation.matrix import cost
 from manifeel_ms3.evaluation.matrix.study import StudyError, read_study, stages_of
@@ -150,6 +151,9 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
     assert [result["config"]["step"] for result in results] == [6, 12]
     assert all(result["config"]["training_seconds"] > 0 for result in results)
     assert cost.estimate(train, root, 1).source == "runs here"
+    page = page_of_results.main(page_of_results.Args((root,), tmp_path / "page.md")).read_text()
+    assert "| PegInsertion" in page
+    assert (tmp_path / "images/page.png").stat().st_size > 1000  # the curve of training
 
     before = {path: path.stat().st_mtime for path in root.rglob("*.json")}
     matrix.main(matrix.Args(study, root))  # all is done: Ray is not even started

@@ -19,7 +19,7 @@ def runs(rate: float, seeds: int = 3, starts: int = 50) -> Runs:
 
 def write(folder, seed: int, step: int, won: list[bool], **changes) -> None:
     config = dict(kind="m:DiffusionPolicy", obs_mode="rgb+tacrgb", seed=seed, step=step, num_demos=50)
-    config |= dict(policy=dict(encoder=dict(tacrgb="t3")))
+    config |= dict(policy=dict(encoder=dict(image="resnet18", tacrgb="t3")))
     outcomes = [EpisodeOutcome(100 + k, win, win, 9, 1.0, 1.0) for k, win in enumerate(won)]
     result = result_of(PEG, dict(cameras=["wrist"]), config, outcomes) | changes
     path = folder / f"{seed}/{step:08d}.json"

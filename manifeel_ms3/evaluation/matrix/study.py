@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from itertools import product
@@ -145,39 +146,43 @@ def stages_of(study: Study) -> list[Stage]:
     return sorted(stages.values(), key=lambda stage: KINDS.index(stage.kind))
 
 
-def _evaluations(grid: Grid) -> list[Stage]:
+def _evaluations(grid: Grid) -> Iterator[Stage]:
     """One a trained policy."""
-    setups = []
     choices = (grid.tasks, grid.policies, grid.obs_modes, grid.encoders, grid.cameras, grid.num_demos, grid.seeds)
     for task, policy, mode, encoder, camera, num_demos, seed in product(*choices):
         if encoder and "tacrgb" not in mode.split("+"):
             continue
         camera = REGISTERED_ENVS[task].cls.policy_cameras[0] if camera == "policy" else camera
-        trained_on = max((count for count in grid.num_demos if count), default=0)
-        count = grid.demos or max(PAPER_COUNTS[task], trained_on)
-        env_kwargs = json.dumps(grid.task_args, sort_keys=True)
-        short = task.removeprefix("ManiFeel-").removesuffix("-v1")
-        record = Stage(
-            "record",
-            f"{short}, {count} demonstrations, {camera}",
-            dict(
-                env_id=task,
-                num=count,
-                camera=camera,
-                env_kwargs=env_kwargs,
-                code=[task_hash(task), code_hash(EXPERTS[task].__module__)],
-            ),
-        )
-        flags = {"env-id": task, "obs-mode": mode, "cameras": camera, "seed": seed, "keep": grid.checkpoints} | grid.train
-        if num_demos is not None:
-            flags["num-demos"] = num_demos
-        if encoder:
-            flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
-        told = [short, policy, mode, encoder, camera, f"{num_demos} demonstrations" if num_demos else "", f"seed {seed}"]
-        title = ", ".join(part for part in told if part)
-        made = dict(policy=policy, preset=grid.preset, flags=flags, code=code_hash(f"baselines.{policy}.train"))
-        train = Stage("train", title, made, (record,))
-        code = code_hash("manifeel_ms3.evaluation.rollout")
-        wanted = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, env_kwargs=env_kwargs, code=code)
-        setups.append(Stage("evaluate", train.title, wanted, (train,)))
-    return setups
+        train = _training(grid, _recording(grid, task, camera), policy, mode, encoder, num_demos, seed)
+        wanted = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
+        wanted |= dict(env_kwargs=_env_kwargs(grid), code=code_hash("manifeel_ms3.evaluation.rollout"))
+        yield Stage("evaluate", train.title, wanted, (train,))
+
+
+def _recording(grid: Grid, task: str, camera: str) -> Stage:
+    trained_on = max((count for count in grid.num_demos if count), default=0)
+    count = grid.demos or max(PAPER_COUNTS[task], trained_on)
+    settings = dict(env_id=task, num=count, camera=camera, env_kwargs=_env_kwargs(grid))
+    settings |= dict(code=[task_hash(task), code_hash(EXPERTS[task].__module__)])
+    return Stage("record", f"{_short(task)}, {count} demonstrations, {camera}", settings)
+
+
+def _training(grid: Grid, record: Stage, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Stage:
+    task, camera = record.settings["env_id"], record.settings["camera"]
+    flags = {"env-id": task, "obs-mode": mode, "cameras": camera, "seed": seed, "keep": grid.checkpoints} | grid.train
+    if num_demos is not None:
+        flags["num-demos"] = num_demos
+    if encoder:
+        flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
+    demonstrations = f"{num_demos} demonstrations" if num_demos else ""
+    title = ", ".join(filter(None, (_short(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
+    settings = dict(policy=policy, preset=grid.preset, flags=flags, code=code_hash(f"baselines.{policy}.train"))
+    return Stage("train", title, settings, (record,))
+
+
+def _short(task: str) -> str:
+    return task.removeprefix("ManiFeel-").removesuffix("-v1")
+
+
+def _env_kwargs(grid: Grid) -> str:
+    return json.dumps(grid.task_args, sort_keys=True)
