@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
+import tyro
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
@@ -157,7 +158,12 @@ def table(findings: list[Finding]) -> Table:
     return out
 
 
-def main() -> int:
+@dataclass
+class Args:
+    """It takes none."""
+
+
+def main(_args: Args) -> int:
     """Print all findings; returns how many are wrong."""
     findings = examine()
     Console().print(table(findings))
@@ -165,4 +171,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(), 1))
+    sys.exit(min(main(tyro.cli(Args)), 1))

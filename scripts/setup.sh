@@ -95,7 +95,8 @@ install_system_packages() {
 
 install_python_packages() {
   [ -x .venv/bin/python ] || python3 -m venv .venv
-  local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet)
+  # nothing is compiled ahead: what is imported is compiled then, and most of it never is
+  local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
   if ! has_gpu && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
     say "Installing torch for the CPU"
     "${pip[@]}" "torch==$TORCH_CPU_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" torch ||

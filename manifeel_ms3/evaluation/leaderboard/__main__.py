@@ -11,6 +11,7 @@ training seed, in any folders, and, if wanted, `videos/*.mp4`. `submit` checks i
 import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -45,6 +46,9 @@ class Build:
     board: Path = Path("leaderboard")
 
 
+Args = Annotated[Submit, tyro.conf.subcommand("submit")] | Annotated[Build, tyro.conf.subcommand("build")]
+
+
 def main(args: Submit | Build) -> Path:
     """Returns what was written.
 
@@ -66,4 +70,4 @@ def main(args: Submit | Build) -> Path:
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.extras.subcommand_cli_from_dict(dict(submit=Submit, build=Build)))
+    main(tyro.cli(Args))
