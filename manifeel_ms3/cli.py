@@ -28,6 +28,7 @@ COMMANDS = {
     "replay": ("manifeel_ms3.demonstrations.replay", "run recorded actions again"),
     "materialize": ("manifeel_ms3.demonstrations.materialize", "add observations to recorded states"),
     "validate": ("manifeel_ms3.demonstrations.validate", "check recorded files"),
+    "view": ("manifeel_ms3.demonstrations.view", "look at a recorded episode"),
     "summary": ("manifeel_ms3.demonstrations.summary", "what a recorded file holds"),
     "export": ("manifeel_ms3.demonstrations.export", "write LeRobot, the paper's zarr, or npz"),
     TRAIN: ("baselines", "train a policy"),
