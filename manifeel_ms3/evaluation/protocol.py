@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from .result import ResultError
+from .statistics import wilson_interval
 
 LAST = 10  # checkpoints
 PAPER_NETWORK = "resnet18"
@@ -116,7 +117,10 @@ def _runs(setup: Setup, by_seed: dict[int | None, dict[int, dict[int, bool]]], l
 
 def success(*tasks: Runs) -> Estimate:
     """Mean success over tasks, each weighing the same; interval from a bootstrap over training seeds within each task
-    (stratified, as in Agarwal et al. 2021), or over starts where one was trained only."""
+    (stratified, as in Agarwal et al. 2021), or over starts where one was trained only. That of one checkpoint is Wilson's."""
+    if len(tasks) == 1 and tasks[0].success.shape[:2] == (1, 1):
+        won, starts = int(tasks[0].success.sum()), len(tasks[0].starts)
+        return Estimate(won / starts, *wilson_interval(won, starts))
     samples = [runs.success.mean((1, 2)) if len(runs.success) > 1 else runs.success.mean((0, 1)) for runs in tasks]
 
     def mean(*samples, axis=-1):

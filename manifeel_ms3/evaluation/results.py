@@ -126,8 +126,8 @@ def _gains_over_references(found: dict[Setup, Runs]) -> Iterator[tuple]:
             yield _task(setup), setup.sensing, setup.policy, other.policy, gain.signed, f"{p_value:.1g}"
 
 
-def _cost(results: list[dict[str, Any]]) -> tuple[str, str]:
-    """Hours of training, and on what machines."""
+def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
+    """Hours of training, and on what machines; None for what was not trained."""
     longest: dict[Any, float] = {}
     machines = set()
     for result in results:
@@ -136,7 +136,8 @@ def _cost(results: list[dict[str, Any]]) -> tuple[str, str]:
         longest[seed] = max(longest.get(seed, 0.0), config.get("training_seconds", 0.0))
         if trained_on := config.get("trained_on"):
             machines.add(trained_on["gpu"] or f"{trained_on['cores']} cores of an {trained_on['cpu']}")
-    return f"{sum(longest.values()) / 3600:.2f} h", ", ".join(sorted(machines)) or "unknown"
+    hours = sum(longest.values()) / 3600
+    return f"{hours:.2f} h" if hours else None, ", ".join(sorted(machines)) or None
 
 
 if __name__ == "__main__":

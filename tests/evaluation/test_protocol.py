@@ -48,6 +48,12 @@ def test_results_of_different_starts_are_not_mixed(tmp_path):
         difference(runs(0.5, starts=10), runs(0.5, starts=12))
 
 
+def test_one_checkpoint_has_wilsons_interval():
+    never = Runs(np.zeros((1, 1, 50)), list(range(50)))
+    assert success(never).low == 0.0
+    assert success(never).high == pytest.approx(1.96**2 / (50 + 1.96**2), rel=1e-3)  # Wilson (1927), at no success
+
+
 def test_interval_is_that_of_the_mean_over_seeds():
     """Against the standard error of the seeds' means: with many seeds, the percentile bootstrap comes near the normal one."""
     many = runs(0.4, seeds=200)
