@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,9 +18,6 @@ import tyro
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .trajectory_file import DemonstrationError, open_trajectories, read_header
-
-if TYPE_CHECKING:
-    import rerun as rr
 
 log = logging.getLogger(__name__)
 STEP = "step"
@@ -51,7 +48,7 @@ def main(args: Args) -> None:
         recording.save(args.save)
         log.info("%s; `rerun %s` opens it", args.save, args.save)
     elif args.web:
-        import rerun as rr
+        import rerun as rr  # pyright: ignore[reportMissingImports]
 
         rr.serve_web_viewer(connect_to=recording.serve_grpc())
         log.info("Ctrl-C ends it")
@@ -61,11 +58,11 @@ def main(args: Args) -> None:
         recording.spawn()
 
 
-def recording_of(file: Path, episode: int) -> "rr.RecordingStream":
-    """Everything that a file holds of an episode, and how it is laid out."""
+def recording_of(file: Path, episode: int) -> Any:
+    """Rerun's stream of everything that a file holds of an episode, and how it is laid out."""
     try:
-        import rerun as rr
-        import rerun.blueprint as rrb
+        import rerun as rr  # pyright: ignore[reportMissingImports]
+        import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError("the viewer is Rerun: pip install 'manifeel-ms3[view]'") from error
     header = read_header(file)

@@ -5,7 +5,7 @@ interval is above zero, does not where all of it is below, and is undecided othe
 """
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
@@ -80,18 +80,12 @@ def comparisons() -> Iterator[Comparison]:
 
 
 def answer(comparison: Comparison, found: dict[Setup, Runs]) -> Answer | None:
-    """What was run says, with the paper's networks or else with others, the same on both sides; None where it was not."""
-    for network in networks(found):
-        first, second = (find(replace(side, network=network), found) for side in (comparison.first, comparison.second))
-        if first and second:
-            gap, p_value = difference(first, second)
-            return Answer(comparison, gap, p_value, _verdict(comparison, gap), network)
-    return None
-
-
-def networks(found: Iterable[Setup]) -> list[str]:
-    """Of what was run, the paper's first."""
-    return sorted({setup.network for setup in found}, key=lambda network: (network != PAPER_NETWORK, network))
+    """What was run says; None where it was not."""
+    runs, network = find_alike([comparison.first, comparison.second], found)
+    if not runs:
+        return None
+    gap, p_value = difference(*runs)
+    return Answer(comparison, gap, p_value, _verdict(comparison, gap), network)
 
 
 def answers_of(found: dict[Setup, Runs]) -> dict[Comparison, Answer | None]:
@@ -102,6 +96,16 @@ def find(wanted: Setup, found: dict[Setup, Runs]) -> Runs | None:
     """The runs of a set-up; where it leaves the number of demonstrations open, those with the most."""
     alike = [other for other in found if wanted == (other if wanted.num_demos else replace(other, num_demos=None))]
     return found[max(alike, key=lambda other: other.num_demos or 0)] if alike else None
+
+
+def find_alike(wanted: list[Setup], found: dict[Setup, Runs]) -> tuple[list[Runs], str]:
+    """The runs of set-ups with one network, and which: the paper's, or else another that all of them were run with; none if
+    there is no such."""
+    for network in sorted({other.network for other in found}, key=lambda network: (network != PAPER_NETWORK, network)):
+        runs = [find(replace(side, network=network), found) for side in wanted]
+        if None not in runs:
+            return runs, network
+    return [], ""
 
 
 def _verdict(comparison: Comparison, gap: Estimate) -> Verdict:

@@ -3,7 +3,7 @@
 import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from .checkpoint_config import checkpoint_config
-from .claims import answers_of, find, networks
+from .claims import answers_of, find_alike
 from .claims import table as claim_table
 from .markdown import markdown_table
 from .paper import reported
@@ -59,6 +59,8 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
 
     runs: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
     for path in sorted(path for folder in folders for path in folder.rglob("log.jsonl")):
+        if not (path.parent / "checkpoints/last").exists():  # it has only begun
+            continue
         config = checkpoint_config(path.parent / "checkpoints/last")
         entries = [entry for line in path.read_text().splitlines() if "loss" in (entry := json.loads(line))]
         name = f"{config['policy_class'].rpartition(':')[2]}, {config['obs_mode']}, seed {config['seed']}"
@@ -98,11 +100,8 @@ def page(results: list[dict[str, Any]], curves: Path | None = None) -> Iterator[
     yield "\n## The paper's tables\n\nThe paper's networks are ResNet-18; where another was run here, \"network\" names it.\n\n"
     rows = []
     for name, setup, rate in reported():
-        here = ("not run", None, None)
-        for network in networks(found):
-            if runs := find(replace(setup, network=network), found):
-                here = (success(runs), runs.size, network)
-                break
+        runs, network = find_alike([setup], found)
+        here = (success(*runs), runs[0].size, network) if runs else ("not run", None, None)
         rows.append((name, setup.task, setup.obs_mode, setup.policy, setup.encoder, f"{rate:.0%}", *here))
     yield markdown_table(("table", "task", "sensing", "policy", "TacRGB encoder", "paper", "here", "of", "network"), rows)
     yield "\n## The paper's claims\n\nEach a difference of two set-ups on the same starts, with its interval of 95 % "
@@ -120,8 +119,8 @@ def _task(setup: Setup) -> str:
 
 def _gains_over_references(found: dict[Setup, Runs]) -> Iterator[tuple]:
     for (setup, runs), (other, learnt_nothing) in product(_sorted(found), repeat=2):
-        same_task = (setup.env_id, setup.variant) == (other.env_id, other.variant)
-        if same_task and other.policy in REFERENCES and setup.policy not in REFERENCES:
+        alike = (setup.env_id, setup.variant) == (other.env_id, other.variant) and other.obs_mode in ("none", setup.obs_mode)
+        if alike and other.policy in REFERENCES and setup.policy not in REFERENCES:
             gain, p_value = difference(runs, learnt_nothing)
             yield _task(setup), setup.sensing, setup.policy, other.policy, gain.signed, f"{p_value:.1g}"
 

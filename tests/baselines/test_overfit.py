@@ -1,6 +1,7 @@
 """Every policy, in every sensing set-up, learns one demonstration by heart and does it again in the simulator."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import pytest
@@ -15,12 +16,14 @@ from tests.conftest import PEG, needs_renderer
 
 pytestmark = [pytest.mark.slow, needs_renderer]
 SEED = 0
+LOOSE = dict(fit="loose")  # the tight one takes this seed a search of 100 steps, which no copy of its motions repeats
 
 
 @pytest.fixture(scope="module")
 def demonstration(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("demo") / "trajectory.h5"
-    return record.main(record.Args(PEG, 1, 1, SEED, path, "rgb+tacrgb+tacff", ("wrist",), ("right",)))
+    sensing = dict(obs_mode="rgb+tacrgb+tacff", cameras=("wrist",), tactile_sensors=("right",), env_kwargs=json.dumps(LOOSE))
+    return record.main(record.Args(PEG, 1, 1, SEED, path, **sensing))
 
 
 @pytest.mark.parametrize("mode", ["rgb", "rgb+tacrgb", "rgb+tacff"])
@@ -33,6 +36,6 @@ def test_one_demonstration_is_learnt_by_heart(make_env, demonstration, tmp_path,
         cpu, demos=(demonstration,), obs_mode=mode, policy=policy, batch_size=32, steps=800, run_dir=tmp_path
     )
     checkpoint = script.main(args)
-    env = make_env(PEG, obs_mode=mode, cameras=("wrist",), tactile_sensors=("right",))
+    env = make_env(PEG, obs_mode=mode, cameras=("wrist",), tactile_sensors=("right",), **LOOSE)
     outcome = evaluate_episode(env, PolicyAgent(checkpoint), SEED)
     assert outcome.success_once
