@@ -171,6 +171,7 @@ def test_agent_acts_and_repeats_itself_after_reset(make_env, checkpoint):
     assert few.act(obs).shape == (6,)
 
 
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
 def test_the_untrained_self_is_what_training_began_with(run, checkpoint, tmp_path):
     begun = run.again(run_dir=tmp_path, steps=1, lr=0.0)  # a step that changes nothing
     untrained, trained = Untrained(str(checkpoint)).policy.state_dict(), read_tensors(checkpoint / "model.safetensors")
@@ -216,7 +217,8 @@ def test_truncated_weights_are_refused(checkpoint, tmp_path):
 def evaluation(tmp_path, checkpoint):
     for step in (1, 2):
         shutil.copytree(checkpoint, tmp_path / f"checkpoints/{step:08d}")
-    return BackgroundEvaluation(tmp_path / "evaluations", episodes=1, workers=1, env_kwargs='{"render_backend": "none"}')
+    kwargs = json.dumps(dict(render_backend="none", max_episode_steps=20))
+    return BackgroundEvaluation(tmp_path / "evaluations", episodes=1, workers=1, env_kwargs=kwargs)
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
