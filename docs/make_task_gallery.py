@@ -12,6 +12,7 @@ from rich.progress import track
 
 from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
+from manifeel_ms3.tasks.names import short_name
 
 IMAGES = Path(__file__).parent / "images"
 VIEWS = ("front", "side", "wrist", "tactile_left", "tactile_right")
@@ -47,7 +48,7 @@ if __name__ == "__main__":
     rows = []
     for name in track(EXPERTS, "tasks"):
         row = moment(name)
-        label = name.removeprefix("ManiFeel-").removesuffix("-v1")
+        label = short_name(name)
         cv2.rectangle(row, (0, 0), (180, 24), (20, 20, 20), cv2.FILLED)
         cv2.putText(row, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
         rows.append(row)

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.names import short_name
 from manifeel_ms3.tasks.object_search import CONTAINER_XY
 
 log = logging.getLogger(__name__)
@@ -272,7 +273,7 @@ def table(answers: list[Answer]) -> str:
         cells = {answer.modality: _cell(answer) for answer in rows}
         first = rows[0]
         chance = f"{first.chance:.1f}°" if first.unit else f"{first.chance:.0%}"
-        task = first.env_id.removeprefix("ManiFeel-").removesuffix("-v1")
+        task = short_name(first.env_id)
         scores = f"{cells['camera']} ({first.sensor}) | {cells['tacrgb']} | {cells['tacff']}"
         lines.append(f"| {task} | {first.question} | {chance} | {scores} |")
     return "\n".join(lines) + "\n"
@@ -291,13 +292,11 @@ def _by_question(answers: list[Answer]) -> list[list[Answer]]:
 
 def figure(answers: list[Answer], path: Path) -> None:
     """Bars of every question's scores, with their intervals, and chance."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     rows = _by_question(answers)
-    fig, axes = plt.subplots(1, len(rows), figsize=(2.1 * len(rows), 3.4), layout="constrained")
+    fig = Figure(figsize=(2.1 * len(rows), 3.4), layout="constrained")
+    axes = fig.subplots(1, len(rows))
     for ax, group in zip(np.atleast_1d(axes), rows, strict=True):
         factor = 1 if group[0].unit else 100
         score = np.array([answer.score for answer in group]) * factor
@@ -310,10 +309,9 @@ def figure(answers: list[Answer], path: Path) -> None:
         ax.tick_params(axis="y", labelsize=7)
         if not group[0].unit:
             ax.set_ylim(0, 105)
-        task = group[0].env_id.removeprefix("ManiFeel-").removesuffix("-v1")
+        task = short_name(group[0].env_id)
         ax.set_title(f"{task}\n{textwrap.fill(group[0].question, 28)}", fontsize=7)
     fig.savefig(path, dpi=130)
-    plt.close(fig)
 
 
 @dataclass

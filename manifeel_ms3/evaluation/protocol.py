@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from manifeel_ms3.tasks.names import short_name
+
 from .result import ResultError
 from .statistics import wilson_interval
 
@@ -42,7 +44,7 @@ class Setup:
     @property
     def task(self) -> str:
         """The task's short name."""
-        return self.env_id.removeprefix("ManiFeel-").removesuffix("-v1")
+        return short_name(self.env_id)
 
     @property
     def sensing(self) -> str:

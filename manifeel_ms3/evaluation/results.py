@@ -52,10 +52,7 @@ def main(args: Args) -> Path:
 
 def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
     """Draw the loss of every training run under some folders, a panel a task; False if there is none."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     runs: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
     for path in sorted(path for folder in folders for path in folder.rglob("log.jsonl")):
@@ -67,15 +64,15 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
         runs.setdefault(config["env_id"], []).append((name, entries))
     if not runs:
         return False
-    fig, axes = plt.subplots(1, len(runs), figsize=(5 * len(runs), 3.4), layout="constrained", squeeze=False)
-    for ax, (task, curves) in zip(axes[0], runs.items(), strict=True):
+    fig = Figure(figsize=(5 * len(runs), 3.4), layout="constrained")
+    axes = fig.subplots(1, len(runs), squeeze=False)[0]
+    for ax, (task, curves) in zip(axes, runs.items(), strict=True):
         for name, entries in curves:
             ax.plot([entry["step"] for entry in entries], [entry["loss"] for entry in entries], label=name, lw=1)
         ax.set(title=task, xlabel="gradient step", ylabel="loss", yscale="log")
         ax.legend(fontsize=7)
     out.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(out, dpi=130)
-    plt.close(fig)
     return True
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
 
-PREFIX, SUFFIX = "ManiFeel-", "-v1"
+from .names import PREFIX, SUFFIX, short_name
 
 
 @dataclass
@@ -27,7 +27,7 @@ def main(args: Args) -> None:
         ValueError: there is no such task.
     """
     tasks = {name: spec.cls for name, spec in REGISTERED_ENVS.items() if name.startswith(PREFIX)}
-    short = {name.removeprefix(PREFIX).removesuffix(SUFFIX): name for name in tasks}
+    short = {short_name(name): name for name in tasks}
     if args.task is None:
         table = Table("task", "steps", "camera", "what is to be done", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
         for task, name in short.items():

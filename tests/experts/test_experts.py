@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
+from manifeel_ms3.demonstrations.dataset import LONG
 from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import EXPERTS, make_expert
 from manifeel_ms3.experts.ball_sorting import ROUGH
 from manifeel_ms3.sensors.surfaces import RELIEF
 from tests.conftest import PEG
-
-LONG = ("ManiFeel-BulbInstallation-v1", "ManiFeel-NutBoltAssembly-v1")  # 400 steps an episode
 
 
 def gentle_success(env, task: str, seed: int) -> np.ndarray:

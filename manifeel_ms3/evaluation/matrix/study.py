@@ -15,6 +15,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.demonstrations.dataset import PAPER_COUNTS
 from manifeel_ms3.experts import EXPERTS
+from manifeel_ms3.tasks.names import short_name
 
 from ..provenance import code_hash, task_hash
 
@@ -164,7 +165,7 @@ def _recording(grid: Grid, task: str, camera: str) -> Stage:
     count = grid.demos or max(PAPER_COUNTS[task], trained_on)
     settings = dict(env_id=task, num=count, camera=camera, env_kwargs=_env_kwargs(grid))
     settings |= dict(code=[task_hash(task), code_hash(EXPERTS[task].__module__)])
-    return Stage("record", f"{_short(task)}, {count} demonstrations, {camera}", settings)
+    return Stage("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
 
 
 def _training(grid: Grid, record: Stage, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Stage:
@@ -175,13 +176,9 @@ def _training(grid: Grid, record: Stage, policy: str, mode: str, encoder: str, n
     if encoder:
         flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
     demonstrations = f"{num_demos} demonstrations" if num_demos else ""
-    title = ", ".join(filter(None, (_short(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
+    title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
     settings = dict(policy=policy, preset=grid.preset, flags=flags, code=code_hash(f"baselines.{policy}.train"))
     return Stage("train", title, settings, (record,))
-
-
-def _short(task: str) -> str:
-    return task.removeprefix("ManiFeel-").removesuffix("-v1")
 
 
 def _env_kwargs(grid: Grid) -> str:
