@@ -24,6 +24,7 @@ COMMANDS = {
     "tasks": ("manifeel_ms3.tasks.__main__", "list the tasks, or say what one is"),
     "doctor": ("manifeel_ms3.doctor", "what this machine can do, and how to mend what it cannot"),
     "record": ("manifeel_ms3.demonstrations.record", "record a demonstrator"),
+    "teleop": ("manifeel_ms3.teleop.__main__", "record by hand, in a browser"),
     "dataset": ("manifeel_ms3.demonstrations.dataset", "record the paper's number of demonstrations of every task"),
     "replay": ("manifeel_ms3.demonstrations.replay", "run recorded actions again"),
     "materialize": ("manifeel_ms3.demonstrations.materialize", "add observations to recorded states"),

@@ -24,6 +24,12 @@ GEL_STIFFNESS = (
 )
 GEL_FRICTION = 1.0
 HOLD_STIFFNESS = 1.0e4  # N/m: a push of 10 N shifts a held object by 0.5 mm between the two fingers
+_TURNS = ("roll", "pitch", "yaw")
+ACTION_AXES = {  # of a controller's actions, in their order; about the base's axes
+    "pd_ee_delta_pose": ("x", "y", "z", *_TURNS, "gripper"),
+    "pd_ee_delta_pose_fixed_gripper": ("x", "y", "z", *_TURNS),
+    "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
+}
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
 WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
 

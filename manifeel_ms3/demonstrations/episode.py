@@ -17,15 +17,26 @@ def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
     return run_episode(env, seed, lambda: make_expert(env_id, env.unwrapped, seed).actions())
 
 
-def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarray]]) -> Episode:
-    """Reset with a seed, take the actions (asked for after the reset), and keep observations, states and outcome."""
+def run_episode(
+    env: gym.Env,
+    seed: int,
+    actions: Callable[[], Iterable[np.ndarray]],
+    on_step: Callable[[dict[str, Any], dict[str, Any]], None] = lambda _obs, _info: None,
+) -> Episode:
+    """Reset with a seed, take the actions (asked for after the reset), and keep observations, states and outcome.
+
+    Args:
+        on_step: sees every observation and `info`, those of the reset too.
+    """
     base = env.unwrapped
-    obs, _ = env.reset(seed=seed)
+    obs, info = env.reset(seed=seed)
+    on_step(obs, info)
     observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
     steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[], contact_force=[])
     for action in actions():
         action = action.astype(np.float32)
         obs, _, terminated, truncated, info = env.step(action)
+        on_step(obs, info)
         observations.append(common.to_numpy(obs))
         states.append(common.to_numpy(base.get_state_dict()))
         flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
@@ -42,8 +53,8 @@ def run_episode(env: gym.Env, seed: int, actions: Callable[[], Iterable[np.ndarr
         reset_kwargs=dict(seed=seed, options={}),
         control_mode=base.control_mode,
         elapsed_steps=len(steps["actions"]),
-        success=steps["success"][-1],
-        fail=steps["fail"][-1],
+        success=bool(steps["success"] and steps["success"][-1]),
+        fail=bool(steps["fail"] and steps["fail"][-1]),
         peak_contact_force=round(float(max(steps["contact_force"], default=0.0)), 3),
     )
     return Episode(seed, arrays, info)

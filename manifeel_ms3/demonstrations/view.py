@@ -15,14 +15,13 @@ import numpy as np
 import torch
 import tyro
 
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .trajectory_file import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 STEP = "step"
-TURNS = ("roll", "pitch", "yaw")
-ACTIONS = {5: ("x", "y", "z", "yaw", "gripper"), 6: ("x", "y", "z", *TURNS), 7: ("x", "y", "z", *TURNS, "gripper")}
 FORCES = ("normal, N", "shear down the pad, N", "shear across the pad, N")  # of a whole pad
 
 
@@ -74,7 +73,7 @@ def recording_of(file: Path, episode: int) -> Any:
     with open_trajectories(file) as opened:
         group = opened[f"traj_{about['episode_id']}"]
         pictures = dict(_pictures(group))
-        series = dict(_series(group))
+        series = dict(_series(group, ACTION_AXES[about["control_mode"]]))
     for place, frames in pictures.items():
         for step, frame in enumerate(frames):
             recording.set_time(STEP, sequence=step)
@@ -98,14 +97,13 @@ def _pictures(group: h5py.Group) -> Iterator[tuple[str, np.ndarray]]:
             yield f"pictures/{sensor}_forces", force_field_images(torch.from_numpy(data["force_field"][()])).numpy()
 
 
-def _series(group: h5py.Group) -> Iterator[tuple[str, tuple[Any, np.ndarray]]]:
+def _series(group: h5py.Group, axes: tuple[str, ...]) -> Iterator[tuple[str, tuple[Any, np.ndarray]]]:
     """By name: names of its lines, and values (T, lines)."""
     yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "force_field" in data:
             yield f"{sensor}_force", (list(FORCES), data["force_field"][()].sum((1, 2)))
-    actions = group["actions"][()]
-    yield "actions", (list(ACTIONS[actions.shape[1]]), actions)
+    yield "actions", (list(axes), group["actions"][()])
     yield "success", (["success"], group["success"][()][:, None].astype(float))
 
 

@@ -1,0 +1,78 @@
+"""The page, in a real browser: it loads and steers, another one watches, and a page that is lost stops the robot."""
+
+import signal
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.demonstrations.replay import replay
+from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
+from tests.conftest import PEG, needs_renderer
+from tests.teleop.browser import Browser, browser_program, wait_until
+
+pytest.importorskip("viser")
+pytestmark = [needs_renderer, pytest.mark.skipif(browser_program() is None, reason="no browser on this machine")]
+SPACE, ENTER, DOWN, AHEAD = (" ", "Space", 32), ("Enter", "Enter", 13), ("f", "KeyF", 70), ("w", "KeyW", 87)
+
+
+@pytest.fixture
+def address(tmp_path):
+    """Of a page that `python -m manifeel_ms3.teleop` serves."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, "--out", str(tmp_path / "human.h5"), "--port", str(port)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    yield f"http://localhost:{port}"
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 0, said
+    assert "what was saved" in said
+
+
+def listening_addresses(port: int) -> set[str]:
+    """Where something listens on a port, as the kernel tells it (hex)."""
+    lines = [line.split() for table in ("tcp", "tcp6") for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]]
+    local = [line[1].split(":") for line in lines if line[3] == "0A"]
+    return {host for host, number in local if int(number, 16) == port}
+
+
+def test_a_person_records_an_episode(address, tmp_path):
+    path, port = tmp_path / "human.h5", int(address.rpartition(":")[2])
+    wait_until(lambda: listening_addresses(port), 120)
+    assert listening_addresses(port) <= {"0100007F", "00000000000000000000000001000000"}  # localhost, of IPv4 and IPv6
+
+    first = Browser(address, tmp_path / "first")
+    wait_until(lambda: "you steer" in first.text and "ready" in first.text)
+    with Browser(address, tmp_path / "second") as second:
+        wait_until(lambda: "you watch" in second.text and "discard" in second.text)
+        first.press(*SPACE)
+        wait_until(lambda: "recording" in second.text)
+        first.press(*DOWN, times=10)
+        second.press(*AHEAD, times=5)  # not heeded
+        second.press(*SPACE)
+        wait_until(lambda: "recording" in second.text)
+        first.close()
+        wait_until(lambda: "paused" in second.text)
+        second.press(*SPACE)  # not heeded either, before it has taken over
+        second.click("take over")
+        wait_until(lambda: "you steer" in second.text)
+        assert "paused" in second.text
+        second.press(*SPACE)
+        wait_until(lambda: "recording" in second.text)
+        second.press(*DOWN, times=5)
+        second.press(*ENTER)
+        wait_until(lambda: "1 saved" in second.text)
+
+    with open_trajectories(path) as file:
+        actions = np.asarray(file["traj_0/actions"])
+        height = np.asarray(file["traj_0/obs/extra/tcp_pose"])[:, 2]
+        assert file["traj_0/obs/sensor_data/tactile_right/rgb"].shape[0] == len(actions) + 1
+    assert (actions[:, 2] < 0).sum() >= 5
+    assert np.all(actions[:, :2] == 0)
+    assert height[-1] < height[0] - 0.005  # the arm went where the key said
+    assert [one.deviation for one in replay(path)] == [0.0]

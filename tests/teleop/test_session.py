@@ -1,0 +1,198 @@
+"""A person's wishes become episodes: on the real simulator, without a page."""
+
+import json
+import threading
+import time
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.demonstrations.replay import replay
+from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.teleop import session as module
+from manifeel_ms3.teleop.devices import Reading, follow
+from manifeel_ms3.teleop.operator import HOLD, Mode, Operator, Wish
+from manifeel_ms3.teleop.session import Session
+from tests.conftest import PEG
+from tests.teleop.browser import wait_until
+
+KWARGS = dict(obs_mode="tacff", render_backend="none", sim_backend="physx_cpu", cameras=[], tactile_sensors=["right"])
+AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+
+
+class Notes:
+    """What a person would have seen."""
+
+    def __init__(self):
+        self.steps, self.lines = 0, []
+
+    def show(self, obs, info):
+        assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (1, 10, 14, 3)
+        self.steps += 1
+
+    def tell(self, text):
+        self.lines.append(text)
+
+    def was_told(self, word: str) -> bool:
+        return any(word in line for line in self.lines)
+
+
+class Desk:
+    """A session that runs in a thread, and what belongs to it."""
+
+    def __init__(self, out: Path, **kwargs):
+        self.kwargs = KWARGS | kwargs
+        self.env = gym.make(PEG, **self.kwargs)
+        self.operator, self.screen = Operator(ACTION_AXES[self.env.unwrapped.control_mode]), Notes()
+        self.session = Session(self.env, PEG, self.kwargs, out, 0, self.operator)
+        self.thread = threading.Thread(target=self.session.run, args=(self.screen,))
+        self.thread.start()
+        wait_until(lambda: self.screen.steps > 0)
+
+    def move(self, axis: str, direction: float, steps: int = 3) -> None:
+        """Hold a key for so many steps."""
+        self.operator.start()
+        until = self.screen.steps + steps
+        while self.screen.steps < until:
+            self.operator.push(axis, direction)
+            time.sleep(0.02)
+
+    def wish(self, wish: Wish, word: str) -> None:
+        """Say it, and wait for what is told then."""
+        self.screen.lines.clear()
+        self.operator.wish(wish)
+        wait_until(lambda: self.screen.was_told(word))
+
+    def close(self) -> None:
+        self.operator.close()
+        self.thread.join()
+        self.session.finish()
+        self.env.close()
+
+
+@pytest.fixture
+def desk(tmp_path):
+    desks = []
+
+    def make(**kwargs) -> Desk:
+        desks.append(Desk(tmp_path / "human.h5", **kwargs))
+        return desks[-1]
+
+    yield make
+    for each in desks:
+        if each.thread.is_alive():
+            each.close()
+
+
+def test_episodes_are_saved_discarded_and_tried_again(desk, tmp_path):
+    first = desk()
+    first.move("z", -1.0)
+    first.wish(Wish.SAVE, "seed 1, 1 saved")
+    first.move("x", 1.0)
+    first.wish(Wish.RETRY, "seed 1, 1 saved")
+    first.move("y", 1.0)
+    first.wish(Wish.DISCARD, "seed 2, 1 saved")
+    first.wish(Wish.SAVE, "seed 2, 1 saved")  # nothing was recorded
+    first.wish(Wish.DISCARD, "seed 3, 1 saved")
+    first.close()
+
+    second = desk()  # another day: what is there stays
+    second.move("yaw", -1.0)
+    second.wish(Wish.STOP, "save or discard")
+    second.wish(Wish.SAVE, "2 saved")
+    second.close()
+
+    path = tmp_path / "human.h5"
+    header = read_header(path)
+    assert header["source_type"] == "human"
+    assert [episode["episode_seed"] for episode in header["episodes"]] == [0, 1]
+    with open_trajectories(path) as file:
+        down, turned = (np.asarray(file[f"traj_{k}/actions"]) for k in range(2))
+    assert (down[:, 2] < 0).sum() >= 2  # a key pressed just before a step, or just after
+    assert np.all(down[:, [0, 1, 3, 4, 5]] == 0)
+    assert (turned[:, 5] < 0).sum() >= 2
+    assert [one.deviation for one in replay(path)] == [0.0, 0.0]
+
+
+def test_a_full_disk_loses_nothing(desk, tmp_path, monkeypatch):
+    full = desk()
+    full.move("z", 1.0)
+    write = module.write_episode
+
+    def no_room(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module, "write_episode", no_room)
+    full.wish(Wish.SAVE, "No space left on device")
+    monkeypatch.setattr(module, "write_episode", write)
+    full.wish(Wish.SAVE, "1 saved")
+    full.close()
+    assert len(read_header(tmp_path / "human.h5")["episodes"]) == 1
+
+
+def test_nothing_moves_before_start_nor_while_paused(desk):
+    still = desk()
+    still.operator.push("z", -1.0)
+    time.sleep(1.0)
+    assert still.screen.steps == 1  # what the reset shows
+    still.move("z", -1.0)
+    still.operator.pause()
+    time.sleep(0.5)
+    steps = still.screen.steps
+    time.sleep(1.0)
+    assert still.screen.steps == steps
+
+
+def test_a_file_of_another_task_stays(desk, tmp_path):
+    first = desk()
+    first.move("z", -1.0)
+    first.wish(Wish.SAVE, "1 saved")
+    first.close()
+    before = (tmp_path / "human.h5").read_bytes()
+    other = KWARGS | dict(fit="loose")
+    env = gym.make(PEG, **other)
+    with pytest.raises(DemonstrationError, match="fit"):
+        Session(env, PEG, other, tmp_path / "human.h5", 0, Operator(AXES))
+    env.close()
+    assert (tmp_path / "human.h5").read_bytes() == before
+    assert json.loads((tmp_path / "human.json").read_text())["source_type"] == "human"
+
+
+# -------------------------------------------------------------------- the operator
+
+
+def test_a_push_lasts_a_moment_and_the_gripper_stays():
+    now = [0.0]
+    operator = Operator(AXES, clock=lambda: now[0])
+    operator.speed = 0.4
+    operator.push("y", -1.0)
+    operator.push("roll", 5.0)
+    operator.toggle_gripper()
+    assert operator.action() == pytest.approx([0, -0.4, 0, 1.0, 0, 0, -1.0])  # no action leaves [-1, 1]
+    now[0] = HOLD
+    assert operator.action() == pytest.approx([0, 0, 0, 0, 0, 0, -1.0])
+
+
+def test_modes_follow_each_other():
+    operator = Operator(AXES)
+    operator.pause()
+    assert operator.mode is Mode.READY  # nothing to pause
+    operator.start()
+    operator.pause()
+    operator.start()
+    assert operator.mode is Mode.RUNNING
+    operator.close()
+    operator.begin()
+    operator.start()
+    assert operator.mode is Mode.CLOSED
+
+
+def test_a_device_pushes_beyond_its_dead_zone():
+    operator = Operator(AXES)
+    rest = Reading(dict(x=0.01, z=0.0), gripper=False)
+    readings = [rest, Reading(dict(x=0.5, z=0.05), gripper=True), Reading(dict(x=0.5, z=0.05), gripper=True)]
+    follow(iter(readings), operator).join()
+    assert operator.action() == pytest.approx([0.5 * operator.speed, 0, 0, 0, 0, 0, -1.0])
