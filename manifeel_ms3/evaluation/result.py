@@ -17,6 +17,7 @@ from .rollout import EpisodeOutcome
 from .statistics import wilson_interval
 
 SCHEMA = "manifeel-evaluation-1"
+PATHS = ("demos", "run_dir", "tacrgb_weights")  # a config's, on the machine it was trained on
 
 
 class ResultError(ValueError):
@@ -26,7 +27,8 @@ class ResultError(ValueError):
 def result_of(
     env_id: str, env_kwargs: dict[str, Any], config: dict[str, Any], outcomes: list[EpisodeOutcome]
 ) -> dict[str, Any]:
-    """The content of a result file; `config`: the policy's."""
+    """The content of a result file; `config`: the policy's, of whose paths the last part is kept: results are published."""
+    config = {name: _last_part(value) if name in PATHS else value for name, value in config.items()}
     rates = {}
     for name in ("success_once", "success_at_end"):
         won = sum(getattr(outcome, name) for outcome in outcomes)
@@ -100,6 +102,12 @@ def check_result(result: Any, source: Path) -> None:
     for error in jsonschema.Draft202012Validator(schema).iter_errors(result):
         place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
         raise ResultError(f"{source} is not a result: {place}: {error.message[:300]}")
+
+
+def _last_part(path: Any) -> Any:
+    if isinstance(path, (list, tuple)):
+        return [_last_part(one) for one in path]
+    return Path(path).name if path else path
 
 
 def _git_commit() -> str | None:

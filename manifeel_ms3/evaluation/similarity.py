@@ -115,10 +115,10 @@ def main(args: Args) -> Similarity:
 def fid(sim: np.ndarray, real: np.ndarray) -> float:
     """Fréchet distance of normal distributions with the means and covariances of features (N, D) and (M, D)."""
     gap = sim.mean(0) - real.mean(0)
-    first, second = (np.atleast_2d(np.cov(side, rowvar=False)) for side in (sim, real))
-    # the trace of the root of a product: of its eigenvalues, real and at least 0
-    roots = np.sqrt(np.clip(linalg.eigvals(first @ second).real, 0, None))
-    return float(gap @ gap + np.trace(first) + np.trace(second) - 2 * roots.sum())
+    # R of a side's deviations is a root of its covariance, R'R; tr (R'R S'S)^1/2 is the sum of the singular values of R S'
+    roots = [np.linalg.qr((side - side.mean(0)) / np.sqrt(len(side) - 1), mode="r") for side in (sim, real)]
+    spread = sum((root**2).sum() for root in roots)
+    return float(gap @ gap + spread - 2 * linalg.svdvals(roots[0] @ roots[1].T).sum())
 
 
 def kid(sim: np.ndarray, real: np.ndarray) -> float:

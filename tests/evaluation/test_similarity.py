@@ -6,6 +6,7 @@ from math import comb
 import cv2
 import numpy as np
 import pytest
+import torch
 from transformers import ConvNextImageProcessor, ResNetConfig, ResNetModel
 
 from manifeel_ms3.evaluation import similarity
@@ -95,6 +96,22 @@ def test_a_resnet_from_a_folder(folders):
         Args(folders / "sim", folders / "real", features=str(folders / "resnet"), resamples=5, out=folders / "out")
     )
     assert result.dimensions == 16
+    assert result.fid.value > 0
+
+
+def test_inception_with_weights_at_hand(folders, monkeypatch):
+    """They lie where torch keeps downloads; here they are random."""
+    module = pytest.importorskip("torch_fidelity.feature_extractor_inceptionv3")
+    monkeypatch.setenv("TORCH_HOME", str(folders))
+    weights = folders / "hub/checkpoints" / module.URL_INCEPTION_V3.rpartition("/")[2]
+    weights.parent.mkdir(parents=True)
+    with monkeypatch.context() as patched:  # the network itself, which cannot be made without weights
+        patched.setattr(module, "load_state_dict_from_url", lambda *_, **__: None)
+        patched.setattr(module.FeatureExtractorInceptionV3, "load_state_dict", lambda *_: None)
+        network = module.FeatureExtractorInceptionV3("inception", ["2048"])
+    torch.save(network.state_dict(), weights)
+    result = similarity.main(Args(folders / "sim", folders / "real", "inception", resamples=2, out=folders / "out"))
+    assert (result.features, result.dimensions) == ("inception", 2048)
     assert result.fid.value > 0
 
 

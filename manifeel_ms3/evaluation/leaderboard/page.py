@@ -68,9 +68,10 @@ def table(rows: list[Row]) -> str:
     for row in rows:
         about, setup = row.submission.about, row.setup
         name = f"[{about.name}]({about.link})" if about.link else about.name
-        what = (f"{setup.task} {setup.variant}".strip(), setup.sensing, setup.policy, setup.encoder, setup.num_demos)
-        cells.append((*what, row.success, row.runs.size, name))
-    names = ("task", "sensing", "policy", "encoder", "demonstrations", "success", "of", "submission")
+        task = f"{setup.task} {setup.variant}".strip()
+        what = (setup.sensing, setup.policy, setup.network, setup.encoder, setup.num_demos)
+        cells.append((task, *what, row.success, row.runs.size, name))
+    names = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations", "success", "of", "submission")
     return head + markdown_table(names, cells)
 
 
@@ -95,6 +96,7 @@ def _for_page(row: Row) -> dict[str, Any]:
         sensing=row.setup.obs_mode,
         cameras=", ".join(row.setup.cameras),
         policy=row.setup.policy,
+        network=row.setup.network,
         encoder=row.setup.encoder,
         demos=row.setup.num_demos or "",
         success=row.success,

@@ -184,9 +184,7 @@ def _is_of(result: dict[str, Any], source: PolicySource) -> bool:
     if source.checkpoint is None:
         return result["policy"] == source.policy
     config = checkpoint_config(source.checkpoint)
-    return all(
-        result["config"].get(name) == config.get(name) for name in ("step", "seed", "policy_class", "env_id", "obs_mode")
-    )
+    return all(result["config"].get(name) == config.get(name) for name in NAMED_BY)
 
 
 def take(submission: Submission, board: Path) -> Path:
