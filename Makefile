@@ -46,7 +46,7 @@ benchmark-smoke: $(READY)
 	$(PYTHON) -m manifeel_ms3.evaluation.results --results runs/smoke --out runs/smoke/results.md
 
 test: $(READY)
-	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile --durations 12
+	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 12
 
 lint: $(READY)
 	.venv/bin/ruff check . && .venv/bin/ruff format --check .

@@ -26,7 +26,7 @@ STATE = (
 )
 PICTURE = "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='rgb+tacrgb')"
 STEP = "; env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
-RENDERER = "from manifeel_ms3.tasks.rendering import available_render_backend as found; print(found())"
+RENDERER = "; from manifeel_ms3.tasks.rendering import available_render_backend as found; print(found())"
 CUDA = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else 'none')"
 
 
@@ -42,7 +42,7 @@ class Finding:
 
 def examine() -> list[Finding]:
     """All checks."""
-    return [_python(), *_packages(), _gpu(), _renderer(), _simulation(), _pictures(), _disk(), _cache(), _threads()]
+    return [_python(), *_packages(), _gpu(), _simulation(), _pictures(), _disk(), _cache(), _threads()]
 
 
 def _python() -> Finding:
@@ -80,17 +80,6 @@ def _gpu() -> Finding:
     return Finding("GPU", False, "there is one, torch does not see it", "install a torch for CUDA: https://pytorch.org")
 
 
-def _renderer() -> Finding:
-    found = _run(RENDERER)
-    if found.out in ("gpu", "cpu"):
-        return Finding("renderer", True, f"Vulkan on the {found.out.upper()}")
-    remedy = (
-        "without a GPU: Mesa 24.3 or newer, libvulkan1, libegl1, libgl1 (scripts/setup.sh installs them); with one: its driver "
-        "and libvulkan1. Until then: obs_mode='state' or 'tacff' with render_backend='none'"
-    )
-    return Finding("renderer", False, found.out or found.reason, remedy)
-
-
 def _simulation() -> Finding:
     found = _run(STATE + STEP)
     return Finding(
@@ -99,9 +88,14 @@ def _simulation() -> Finding:
 
 
 def _pictures() -> Finding:
-    found = _run(PICTURE + STEP)
-    remedy = "" if found.worked else "mend the renderer"
-    return Finding("a step with pictures", found.worked, "works" if found.worked else found.reason, remedy)
+    found = _run(PICTURE + STEP + RENDERER)
+    if found.worked:
+        return Finding("a step with pictures", True, f"works, with Vulkan on the {found.out.upper()}")
+    remedy = (
+        "without a GPU: Mesa 24.3 or newer, libvulkan1, libegl1, libgl1 (scripts/setup.sh installs them); with one: its driver "
+        "and libvulkan1. Until then: obs_mode='state' or 'tacff' with render_backend='none'"
+    )
+    return Finding("a step with pictures", False, found.reason, remedy)
 
 
 def _disk() -> Finding:
