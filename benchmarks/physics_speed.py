@@ -27,13 +27,21 @@ class Args:
 
 
 def real_time_factors(task: str) -> tuple[float, float]:
-    """Simulated seconds a second: of the engine alone, of whole steps."""
+    """Simulated seconds a second: of the engine alone, of whole steps; all sample demonstrations together."""
     path = data_dir() / "sample" / task / "states.h5"
-    episode = read_header(path)["episodes"][0]
-    with open_trajectories(path) as file:
-        actions = np.asarray(file[f"traj_{episode['episode_id']}/actions"])
+    seconds = np.zeros(3)
+    for episode in read_header(path)["episodes"]:
+        with open_trajectories(path) as file:
+            actions = np.asarray(file[f"traj_{episode['episode_id']}/actions"])
+        seconds += seconds_of(task, episode["episode_seed"], actions)
+    simulated, engine, whole = seconds
+    return simulated / engine, simulated / whole
+
+
+def seconds_of(task: str, seed: int, actions: np.ndarray) -> tuple[float, float, float]:
+    """What an episode simulates, and what it takes: the engine alone, whole steps."""
     env = gym.make(task, obs_mode="none", reward_mode="none", render_backend="none")
-    env.reset(seed=episode["episode_seed"])
+    env.reset(seed=seed)
     scene, spent = env.unwrapped.scene, [0.0]
     step = scene.step
 
@@ -49,7 +57,7 @@ def real_time_factors(task: str) -> tuple[float, float]:
     whole = time.perf_counter() - start
     simulated = len(actions) / env.unwrapped.control_freq
     env.close()
-    return simulated / spent[0], simulated / whole
+    return simulated, spent[0], whole
 
 
 def main(args: Args) -> None:

@@ -14,7 +14,13 @@ from tests.conftest import needs_renderer
 @needs_renderer
 def test_a_machine_that_is_in_order():
     findings = doctor.examine()
-    assert {finding.what for finding in findings} >= {"Python", "packages", "a step with pictures", "a step with touch", "disk, here"}
+    assert {finding.what for finding in findings} >= {
+        "Python",
+        "packages",
+        "a step with pictures",
+        "a step with touch",
+        "disk, here",
+    }
     assert [finding for finding in findings if finding.ok is False and finding.what != "disk, here"] == []
 
 

@@ -95,7 +95,7 @@ class Operator:
     def may_move(self, patience: float) -> bool:
         """Wait until the robot may move; False after so many s, so that the one who waits can look around."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._mode is Mode.RUNNING or self._over, patience) and not self._over
+            return self._changed.wait_for(lambda: self._mode is Mode.RUNNING or self.is_over, patience) and not self.is_over
 
     def take_wish(self, patience: float) -> Wish | None:
         """A wish that was told, once; None if none came within so many s."""
@@ -105,11 +105,8 @@ class Operator:
             return wish
 
     @property
-    def wants_to_end(self) -> bool:
-        return self._over
-
-    @property
-    def _over(self) -> bool:
+    def is_over(self) -> bool:
+        """Whether the episode is to end."""
         return self._wish is not None or self._mode is Mode.CLOSED
 
     def _move(self, to: Mode, *of: Mode) -> None:

@@ -55,8 +55,6 @@ class Session:
         self._infos, self._failed = already_there(out, self._header)
         self._seed = max([seed, *(saved + 1 for saved in self._infos)])
         self._period = 1.0 / env.unwrapped.control_freq
-        self.rate = 0.0
-        """Hz, of control, over the last second or so"""
         out.parent.mkdir(parents=True, exist_ok=True)
         if out.is_file() and not episode_folder(out).is_dir():
             split(out)
@@ -81,7 +79,7 @@ class Session:
     def _actions(self) -> Iterator[np.ndarray]:
         """At the environment's control rate, while the operator lets the robot move."""
         due = time.monotonic()
-        while not self.operator.wants_to_end:
+        while not self.operator.is_over:
             if not self.operator.may_move(PATIENCE):
                 continue
             now = time.monotonic()
@@ -89,10 +87,7 @@ class Session:
                 due = now
             time.sleep(max(due - now, 0.0))
             due += self._period
-            began = time.monotonic()
             yield self.operator.action()
-            took = max(time.monotonic() - began, self._period)
-            self.rate += 0.1 * (1.0 / took - self.rate)
 
     def _decision(self, screen: Screen, episode: Episode) -> Wish | None:
         """What is to become of an episode that is over; it is kept until that is done."""
