@@ -128,7 +128,7 @@ def success(*tasks: Runs) -> Estimate:
     def mean(*samples, axis=-1):
         return np.mean([sample.mean(axis) for sample in samples], axis=0)
 
-    return _estimate(samples, mean, paired=False)
+    return _estimate(samples, mean, tasks, paired=False)
 
 
 def difference(better: Runs, worse: Runs) -> tuple[Estimate, float]:
@@ -148,13 +148,14 @@ def difference(better: Runs, worse: Runs) -> tuple[Estimate, float]:
     test = stats.permutation_test(
         samples, gap, permutation_type="samples", vectorized=True, n_resamples=RESAMPLES, rng=np.random.default_rng(0)
     )
-    return _estimate(samples, gap, paired=True), float(test.pvalue)
+    return _estimate(samples, gap, (better, worse), paired=True), float(test.pvalue)
 
 
-def _estimate(samples: list[np.ndarray], statistic, paired: bool) -> Estimate:
+def _estimate(samples: list[np.ndarray], statistic, of: tuple[Runs, ...], paired: bool) -> Estimate:
     value = float(statistic(*samples))
     if all(np.ptp(sample) == 0 for sample in samples):  # nothing varies: the bootstrap has nothing to draw from
-        return Estimate(value, value, value)
+        unseen = wilson_interval(0, min(len(runs.starts) for runs in of))[1]  # what none of so many starts has shown
+        return Estimate(value, max(value - unseen, -1.0 if paired else 0.0), min(value + unseen, 1.0))
     drawn = stats.bootstrap(
         samples,
         statistic,

@@ -89,7 +89,16 @@ def test_starts_are_compared_one_by_one():
     assert p < 0.01
 
 
-def test_nothing_varies():
-    always = Runs(np.ones((3, 10, 50)), list(range(50)))
-    assert success(always) == success(always, always)
-    assert (success(always).low, success(always).high) == (1.0, 1.0)
+def test_what_never_varied_in_a_few_starts_may_yet():
+    """Nothing of n starts bounds what is unseen by Wilson's upper limit at no success, z^2 / (n + z^2)."""
+
+    def always(starts: int, won: int = 1) -> Runs:
+        return Runs(np.full((3, 10, starts), float(won)), list(range(starts)))
+
+    unseen = 1.96**2 / (50 + 1.96**2)
+    assert success(always(50)) == success(always(50), always(50))
+    assert (success(always(50)).low, success(always(50)).high) == (pytest.approx(1 - unseen, rel=1e-3), 1.0)
+    same, p = difference(always(50, 0), always(50, 0))
+    assert (same.value, same.low, same.high) == (0.0, pytest.approx(-unseen, rel=1e-3), pytest.approx(unseen, rel=1e-3))
+    assert p == 1.0
+    assert success(always(2, 0)).high > 0.6
