@@ -95,7 +95,7 @@ def _pictures() -> Finding:
         "without a GPU: Mesa 24.3 or newer, libvulkan1, libegl1, libgl1 (scripts/setup.sh installs them); with one: its driver "
         "and libvulkan1. Until then: obs_mode='state' or 'tacff' with render_backend='none'"
     )
-    return Finding("a step with pictures", False, found.reason, remedy)
+    return Finding("a step with pictures", False, found.reason.partition(". ")[0], remedy)
 
 
 def _disk() -> Finding:
