@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from .operator import Operator
 
 log = logging.getLogger(__name__)
-RATE = 30.0  # Hz
+RATE = 200.0  # Hz: a SpaceMouse queues its readings, and what is read too seldom lags
 DEAD_ZONE = 0.08  # of full deflection
 NO_DEVICE = "no {name} was found: plug one in, or leave out --device; the page's keys and buttons work without"
 
@@ -29,17 +29,15 @@ class Reading:
 def spacemouse() -> Iterator[Reading]:
     """Readings of a 3Dconnexion SpaceMouse."""
     try:
-        import pyspacemouse
+        import pyspacemouse  # pyright: ignore
     except ModuleNotFoundError as error:
         raise DeviceError("a SpaceMouse needs pip install 'manifeel-ms3[spacemouse]', and libhidapi") from error
     try:
         mouse = pyspacemouse.open()
     except Exception as error:  # the library raises what hidapi does
         raise DeviceError(NO_DEVICE.format(name="SpaceMouse") + f" ({error})") from error
-    if not mouse:
-        raise DeviceError(NO_DEVICE.format(name="SpaceMouse"))
     while True:
-        state = pyspacemouse.read()
+        state = mouse.read()
         turn = dict(roll=state.roll, pitch=state.pitch, yaw=-state.yaw)
         yield Reading(dict(x=state.y, y=-state.x, z=state.z) | turn, bool(any(state.buttons)))
 
@@ -47,7 +45,7 @@ def spacemouse() -> Iterator[Reading]:
 def gamepad() -> Iterator[Reading]:
     """Readings of the first gamepad: left stick x, y; right stick yaw, z; shoulders roll; first button the gripper."""
     try:
-        import pygame
+        import pygame  # pyright: ignore
     except ModuleNotFoundError as error:
         raise DeviceError("a gamepad needs pip install 'manifeel-ms3[gamepad]'") from error
     pygame.init()
