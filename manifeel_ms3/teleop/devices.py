@@ -1,6 +1,7 @@
 """SpaceMouse and gamepad, where one is plugged in: each pushes the operator's axes in a thread of its own."""
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -48,7 +49,9 @@ def gamepad() -> Iterator[Reading]:
         import pygame  # pyright: ignore
     except ModuleNotFoundError as error:
         raise DeviceError("a gamepad needs pip install 'manifeel-ms3[gamepad]'") from error
-    pygame.init()
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, and the page is in the browser
+    pygame.display.init()
+    pygame.joystick.init()
     if pygame.joystick.get_count() == 0:
         raise DeviceError(NO_DEVICE.format(name="gamepad"))
     pad = pygame.joystick.Joystick(0)
