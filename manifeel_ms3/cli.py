@@ -8,7 +8,6 @@ Each is a module that can be run by itself (`python -m`), with an `Args` and a `
 for is imported; a shell's completion, though, knows the flags of all.
 """
 
-import logging
 import sys
 from dataclasses import dataclass
 from functools import reduce
@@ -18,6 +17,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+
+from manifeel_ms3.command_line import run
 
 TRAIN = "train"
 COMMANDS = {
@@ -55,7 +56,6 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: default: those of the process.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments and arguments[0] in COMMANDS:
         args = tyro.cli(form(arguments[0]), prog=f"manifeel {arguments[0]}", args=arguments[1:])
@@ -63,8 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
         wanted = any("-completion" in argument for argument in arguments)
         forms = [_subcommand(name, form(name) if wanted else _NotImported, about) for name, (_, about) in COMMANDS.items()]
         args = tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)
-    answer = import_module(type(args).__module__).main(args)
-    return min(answer, 1) if isinstance(answer, int) else 0
+    return run(import_module(type(args).__module__).main, args)
 
 
 def form(command: str) -> Any:

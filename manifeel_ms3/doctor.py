@@ -17,6 +17,8 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
+from manifeel_ms3.command_line import run
+
 PACKAGE = "manifeel-ms3"
 PYTHONS = ((3, 10), (3, 12))  # tested: the first and the last
 ROOM = 10.0  # GB: what the paper's demonstrations take, with observations
@@ -165,4 +167,4 @@ def main(_args: Args) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(min(main(tyro.cli(Args)), 1))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -14,6 +14,12 @@ def data_dir() -> Path:
     return packaged if packaged.is_dir() else _PACKAGE.parent / "data"
 
 
+def troubleshooting() -> Path:
+    """The page that says what lies behind an error: beside the data in a wheel, in `docs` in a clone."""
+    packaged = _PACKAGE / "data" / "troubleshooting.md"
+    return packaged if packaged.is_file() else _PACKAGE.parent / "docs" / "troubleshooting.md"
+
+
 def cache_dir() -> Path:
     """Folder of derived assets; the environment variable `MANIFEEL_CACHE_DIR` overrides the user cache."""
     return Path(os.environ.get("MANIFEEL_CACHE_DIR") or platformdirs.user_cache_dir("manifeel_ms3"))

@@ -1,8 +1,14 @@
 """One entry point: it lists, parses, completes and runs every command."""
 
+import json
+import re
+from pathlib import Path
+
 import pytest
 
 from manifeel_ms3 import cli
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.command_line import TRACEBACK, run
 from tests.conftest import PEG
 
 
@@ -19,8 +25,44 @@ def test_a_command_runs(capsys):
     assert all(task in said for task in ("PegInsertion", "NutBoltAssembly", "BallSortingDim"))
     assert cli.main(["tasks", "PegInsertion"]) == 0
     assert "Success Conditions" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="no task 'Knitting'; choose from"):
-        cli.main(["tasks", "Knitting"])
+    assert cli.main(["tasks", "Knitting"]) == 1
+    said = capsys.readouterr().err
+    assert "error: there is no task 'Knitting'; choose from" in said
+    page = re.search(r"more: (\S+troubleshooting\.md)", said)
+    assert page
+    assert Path(page[1]).is_file()
+
+
+def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, capsys):
+    def refuse(_):
+        one_of("fit", "huge", ("tight", "loose"))
+
+    assert run(refuse, None) == 1
+    assert "fit='huge' is unknown" in capsys.readouterr().err
+    with pytest.raises(json.JSONDecodeError):  # raised elsewhere: a fault, or at least not ours to explain
+        run(lambda _: json.loads("{"), None)
+    with pytest.raises(KeyError):
+        run(lambda _: {}["a"], None)
+    monkeypatch.setenv(TRACEBACK, "1")
+    with pytest.raises(ValueError, match="fit='huge'"):
+        run(refuse, None)
+
+
+def test_what_a_worker_refuses_is_a_message_too(tmp_path, capsys):
+    arguments = ["record", PEG, "-n", "4", "--obs-mode", "none", "--out", str(tmp_path / "peg.h5"), "--env-kwargs"]
+    assert cli.main([*arguments, '{"fit": "huge"}']) == 1
+    assert "error: fit='huge' is unknown; choose from ['tight', 'loose']" in capsys.readouterr().err
+    assert cli.main([*arguments, "{fit: huge}"]) == 1
+    assert "--env-kwargs '{fit: huge}' is not json" in capsys.readouterr().err
+
+
+def test_answers_that_count_what_is_wrong_are_exit_codes():
+    assert [run(lambda answer: answer, answer) for answer in (0, 7, None, Path("made"))] == [0, 1, 0, 0]
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    assert run(interrupted, None) == 130
 
 
 def test_a_flag_that_is_not_known_is_refused():

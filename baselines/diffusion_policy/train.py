@@ -6,6 +6,7 @@
 `paper` has the paper's hyperparameters, `cpu` a small network that learns on two cores in minutes.
 """
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import tyro
 from baselines.common.presets import for_cpu
 from baselines.common.training import TrainArgs, train
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
+from manifeel_ms3.command_line import run
 
 
 @dataclass
@@ -37,4 +39,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.extras.overridable_config_cli(PRESETS))
+    sys.exit(run(main, tyro.extras.overridable_config_cli(PRESETS)))

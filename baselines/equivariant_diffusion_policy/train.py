@@ -6,6 +6,7 @@
 `paper` has the paper's hyperparameters, `cpu` a small network for two cores.
 """
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from baselines.common.encoders import EncoderConfig
 from baselines.common.presets import for_cpu
 from baselines.common.training import TrainArgs, train
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
+from manifeel_ms3.command_line import run
 
 
 @dataclass
@@ -37,4 +39,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.extras.overridable_config_cli(PRESETS))
+    sys.exit(run(main, tyro.extras.overridable_config_cli(PRESETS)))

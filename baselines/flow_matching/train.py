@@ -8,6 +8,7 @@
 learns on two cores in minutes.
 """
 
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import tyro
 from baselines.common.presets import for_cpu
 from baselines.common.training import TrainArgs, train
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
+from manifeel_ms3.command_line import run
 
 
 @dataclass
@@ -39,4 +41,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    main(tyro.extras.overridable_config_cli(PRESETS))
+    sys.exit(run(main, tyro.extras.overridable_config_cli(PRESETS)))

@@ -7,6 +7,7 @@ UniT as a VQGAN (Esser et al. 2021), the transformers by masked autoencoding; `t
 """
 
 import logging
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import tyro
 from safetensors.torch import save_file
 
 from baselines.common.observation import is_tactile, prepare_images
+from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.trajectory_file import open_trajectories, read_header
 from manifeel_ms3.progress import progress_bar
@@ -156,5 +158,4 @@ def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

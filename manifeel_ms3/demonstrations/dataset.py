@@ -7,8 +7,8 @@ where it stopped when the same command is given again.
 
 import hashlib
 import json
-import logging
 import shutil
+import sys
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -16,12 +16,14 @@ from typing import Any
 
 import tyro
 
+from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import materialize, record
-from .trajectory_file import finished_episodes, read_header, write_json
+from .trajectory_file import DemonstrationError, finished_episodes, read_header, write_json
 
+SCHEMA = "manifeel-demonstrations-1"
 PAPER_COUNTS = {
     "ManiFeel-PegInsertion-v1": 50,
     "ManiFeel-USBInsertion-v1": 50,
@@ -107,7 +109,7 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
 def write_manifest(folder: Path) -> None:
     """Write `manifest.json` for the trajectory files under a folder."""
     files = {path.relative_to(folder).as_posix(): describe(path) for path in sorted(folder.glob("*/*.h5"))}
-    write_json(folder / "manifest.json", dict(schema="manifeel-demonstrations-1", version=version("manifeel-ms3"), files=files))
+    write_json(folder / "manifest.json", dict(schema=SCHEMA, version=version("manifeel-ms3"), files=files))
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -142,13 +144,21 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: there is none.
+        DemonstrationError: it is of another form, or of a newer version.
     """
     path = Path(folder) / "manifest.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
-    return json.loads(path.read_text())
+    try:
+        manifest = json.loads(path.read_text())
+        found = manifest["schema"]
+        _ = manifest["files"].items()
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DemonstrationError(f"{path} is not a manifest ({error!r}); copy or record the folder again") from error
+    if found != SCHEMA:
+        raise DemonstrationError(f"{path} has the schema {found!r}, this version reads {SCHEMA!r}; update manifeel-ms3")
+    return manifest
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

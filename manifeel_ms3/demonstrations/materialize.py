@@ -6,6 +6,7 @@ with. A run that was killed goes on where it stopped.
 """
 
 import logging
+import sys
 from collections.abc import Callable
 from concurrent.futures import as_completed
 from dataclasses import dataclass
@@ -16,11 +17,12 @@ import h5py
 import numpy as np
 import tyro
 
+from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from .episode import run_episode
-from .record import already_there, make_header, worker, worker_pool
+from .record import already_there, make_header, worker, worker_env, worker_pool
 from .trajectory_file import DemonstrationError, consolidate, open_trajectories, read_header, write_episode, write_index
 
 log = logging.getLogger(__name__)
@@ -72,15 +74,11 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         episode_counter(f"observing {env_id}", len(episodes), len(infos), on_episode) as count,
         worker_pool(args.workers, env_id, env_kwargs, args.out) as pool,
     ):
-        try:
-            for future in as_completed([pool.submit(_observe, args.path, episode) for episode in left]):
-                info = future.result()
-                infos[info["episode_seed"]] = info
-                write_index(args.out, header, dict(sorted(infos.items())))
-                count()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
+        for future in as_completed([pool.submit(_observe, args.path, episode) for episode in left]):
+            info = future.result()
+            infos[info["episode_seed"]] = info
+            write_index(args.out, header, dict(sorted(infos.items())))
+            count()
     consolidate(args.out)
     return args.out
 
@@ -88,15 +86,17 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 def _observe(path: Path, recorded: dict[str, Any]) -> dict[str, Any]:
     """In a worker: play an episode again, and write it."""
     seed = recorded["episode_seed"]
+    group = f"traj_{recorded['episode_id']}"
     with open_trajectories(path) as file:
-        group = file[f"traj_{recorded['episode_id']}"]
-        actions = np.asarray(group["actions"])
-        episode = run_episode(worker["env"], seed, lambda: actions)
-        if (place := _first_difference(group["env_states"], episode.arrays["env_states"])) is not None:
-            raise DemonstrationError(
-                f"the episode of seed {seed} in {path} does not come out as it was recorded: {place} differs. The versions it "
-                "was recorded with stand in the json beside it; use those, or record it again here"
-            )
+        actions = file[group]["actions"][()]
+    episode = run_episode(worker_env(), seed, lambda: actions)
+    with open_trajectories(path) as file:
+        place = _first_difference(file[group]["env_states"], episode.arrays["env_states"])
+    if place is not None:
+        raise DemonstrationError(
+            f"the episode of seed {seed} in {path} does not come out as it was recorded: {place} differs. The versions it "
+            "was recorded with stand in the json beside it; use those, or record it again here"
+        )
     write_episode(worker["path"], episode)
     return episode.info | dict(episode_seed=seed)
 
@@ -113,5 +113,4 @@ def _first_difference(recorded: h5py.Group, again: dict[str, Any], name: str = "
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

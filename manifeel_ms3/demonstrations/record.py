@@ -4,11 +4,13 @@ Seeds are tried in order until `num` episodes have succeeded; any number of work
 killed goes on where it stopped when the same command is given again.
 """
 
-import json
 import logging
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -18,6 +20,7 @@ import gymnasium as gym
 import torch
 import tyro
 
+from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.experts import EXPERTS
 from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
@@ -105,14 +108,8 @@ def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[in
 
 
 def _env_kwargs(args: Args) -> dict[str, Any]:
-    try:
-        extra = json.loads(args.env_kwargs)
-    except json.JSONDecodeError as error:
-        raise ValueError(
-            f'--env-kwargs {args.env_kwargs!r} is not json ({error}); quote it like \'{{"fit": "loose"}}\''
-        ) from error
     pictures = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
-    return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | extra
+    return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | json_object("--env-kwargs", args.env_kwargs)
 
 
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -150,28 +147,39 @@ def already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], 
 # -------------------------------------------------------------------- in the workers
 
 worker: dict[str, Any] = {}
-"""In a worker process: its `env`, and the `env_id` and `path` that it was started for."""
+"""In a worker process: the `env_id`, `env_kwargs` and `path` that it was started for."""
 
 
-def worker_pool(workers: int, env_id: str, env_kwargs: dict[str, Any], path: Path) -> ProcessPoolExecutor:
+@contextmanager
+def worker_pool(workers: int, env_id: str, env_kwargs: dict[str, Any], path: Path) -> Iterator[ProcessPoolExecutor]:
     """Processes with one environment each, for episodes that are written beside `path`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_file() and not episode_folder(path).is_dir():
         split(path)
     context = get_context("spawn")  # a forked renderer does not work
-    return ProcessPoolExecutor(workers, context, _start_worker, (env_id, env_kwargs, path))
+    pool = ProcessPoolExecutor(workers, context, _start_worker, (env_id, env_kwargs, path))
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _start_worker(env_id: str, env_kwargs: dict[str, Any], path: Path) -> None:
     torch.set_num_threads(1)  # processes share the cores
     import manifeel_ms3  # noqa: F401
 
-    worker.update(env_id=env_id, path=path, env=gym.make(env_id, **env_kwargs))
+    worker.update(env_id=env_id, env_kwargs=env_kwargs, path=path)
+
+
+@cache
+def worker_env() -> gym.Env:
+    """In a worker process: its environment, made when first asked for, so that the one who asks hears what is wrong with it."""
+    return gym.make(worker["env_id"], **worker["env_kwargs"])
 
 
 def _record_seed(seed: int) -> dict[str, Any] | None:
     """Record one episode; write it if it succeeded, and return its info, else None."""
-    episode = demonstrate(worker["env"], worker["env_id"], seed)
+    episode = demonstrate(worker_env(), worker["env_id"], seed)
     if not episode.info["success"]:
         return None
     write_episode(worker["path"], episode)
@@ -179,5 +187,4 @@ def _record_seed(seed: int) -> dict[str, Any] | None:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -11,6 +11,7 @@ import tyro
 from mani_skill.utils import common
 
 import manifeel_ms3  # noqa: F401
+from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
 
 from .trajectory_file import open_trajectories, read_header
@@ -41,21 +42,27 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     kwargs = header["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
     env = gym.make(header["env_info"]["env_id"], **kwargs)
     results = []
-    with open_trajectories(path) as file, progress_bar() as bar:
-        episodes = header["episodes"][:num]
-        for info in bar.track(episodes, description="replaying"):
-            group = file[f"traj_{info['episode_id']}"]
-            env.reset(**info["reset_kwargs"])
+    with progress_bar() as bar:
+        for info in bar.track(header["episodes"][:num], description="replaying"):
+            actions, ends = _recorded(path, info["episode_id"])
+            env.reset(seed=info["episode_seed"])
             success = False
-            for action in np.asarray(group["actions"]):
+            for action in actions:
                 *_, outcome = env.step(action)
                 success |= bool(outcome["success"])
             actors = common.to_numpy(env.unwrapped.get_state_dict()["actors"])
-            recorded = group["env_states/actors"]
-            deviation = max(float(np.abs(state[0, :7] - recorded[name][-1, :7]).max()) for name, state in actors.items())
+            deviation = max(float(np.abs(state[0, :7] - ends[name]).max()) for name, state in actors.items())
             results.append(Replay(info["episode_seed"], success, deviation))
     env.close()
     return results
+
+
+def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """The actions, and where each object ended."""
+    with open_trajectories(path) as file:
+        group = file[f"traj_{episode}"]
+        actors = group["env_states/actors"]
+        return group["actions"][()], {name: actors[name][-1, :7] for name in actors}
 
 
 def main(args: Args) -> int:
@@ -69,5 +76,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args)))

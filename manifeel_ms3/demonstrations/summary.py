@@ -1,5 +1,6 @@
 """What a trajectory file holds, in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,8 @@ import numpy as np
 import tyro
 from rich.console import Console, Group
 from rich.table import Table
+
+from manifeel_ms3.command_line import run
 
 from .trajectory_file import open_trajectories, read_header
 
@@ -104,4 +107,4 @@ def _parts(sizes: dict[str, int], episodes: int) -> Table:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

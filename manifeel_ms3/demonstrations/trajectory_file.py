@@ -8,14 +8,39 @@ links into them, replaced as a whole after each episode. It opens at any time li
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import h5py
+import jsonschema
 import numpy as np
 
 COMPRESSION_LEVEL = 4  # gzip; lossless
+
+
+HEADER = {  # what is read of a trajectory's json, as a json schema
+    "type": "object",
+    "required": ["env_info", "episodes"],
+    "properties": {
+        "env_info": {
+            "type": "object",
+            "required": ["env_id", "env_kwargs"],
+            "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}},
+        },
+        "episodes": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "required": ["episode_id", "episode_seed", "elapsed_steps", "success"],
+                "properties": {name: {"type": "integer"} for name in ("episode_id", "episode_seed", "elapsed_steps")},
+            },
+        },
+        "failed_seeds": {"type": "array"},
+        "versions": {"type": "object"},
+    },
+}
 
 
 class DemonstrationError(ValueError):
@@ -133,27 +158,29 @@ def read_header(path: Path) -> dict[str, Any]:
             raise DemonstrationError(
                 f"demonstration file {needed} does not exist; record one with `python -m manifeel_ms3.demonstrations.record`"
             )
+    about = path.with_suffix(".json")
     try:
-        header = json.loads(path.with_suffix(".json").read_text())
-        _ = header["env_info"]["env_id"], header["episodes"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise DemonstrationError(
-            f"{path.with_suffix('.json')} is not a trajectory's json ({error}); record it again"
-        ) from error
+        header = json.loads(about.read_text())
+        jsonschema.validate(header, HEADER)
+    except (ValueError, jsonschema.ValidationError) as error:
+        reason = f"{error.json_path}: {error.message[:200]}" if isinstance(error, jsonschema.ValidationError) else error
+        raise DemonstrationError(f"{about} is not a trajectory's json ({reason}); copy or record it again") from error
     return header
 
 
-def open_trajectories(path: Path) -> h5py.File:
-    """Open a trajectory file for reading.
+@contextmanager
+def open_trajectories(path: Path) -> Iterator[h5py.File]:
+    """Open a trajectory file, to read from it within the context.
 
     Raises:
-        DemonstrationError: it is truncated or not HDF5.
+        DemonstrationError: it is truncated, not HDF5, or lacks what is read.
     """
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
+        with h5py.File(path, "r") as file:
+            yield file
+    except (OSError, KeyError) as error:
         raise DemonstrationError(
-            f"{path} cannot be opened as HDF5 ({error}); it is truncated or of another kind: copy or record it again"
+            f"{path} cannot be read as a trajectory ({error}); it is truncated or of another kind: copy or record it again"
         ) from error
 
 
@@ -211,17 +238,12 @@ def observed(path: Path) -> list[str]:
 
 
 def _read_episode(file: h5py.File, i: int, keys: list[str], path: Path, header: dict) -> dict[str, np.ndarray]:
-    try:
-        group = file[f"traj_{i}"]
-        missing = [key for key in keys if f"obs/{key}" not in group]
-        if missing:
-            mode = header["env_info"]["env_kwargs"].get("obs_mode")
-            raise DemonstrationError(
-                f"{path} was recorded with obs_mode={mode!r} and lacks {missing}; record it with an obs_mode, cameras and "
-                "tactile_sensors that include them"
-            )
-        return dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
-    except (KeyError, OSError) as error:
+    group = file[f"traj_{i}"]
+    missing = [key for key in keys if f"obs/{key}" not in group]
+    if missing:
+        mode = header["env_info"]["env_kwargs"].get("obs_mode")
         raise DemonstrationError(
-            f"episode {i} of {path} cannot be read ({error}); the file is truncated: record it again"
-        ) from error
+            f"{path} was recorded with obs_mode={mode!r} and lacks {missing}; record it with an obs_mode, cameras and "
+            "tactile_sensors that include them"
+        )
+    return dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}

@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import tyro
 
+from manifeel_ms3.command_line import run
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.progress import progress_bar
 
@@ -89,5 +90,4 @@ def main(args: Args) -> int:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    sys.exit(main(tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args)))

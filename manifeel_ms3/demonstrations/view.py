@@ -4,6 +4,7 @@ Cameras, touch, forces, actions and success over one time axis. Needs the extra 
 """
 
 import logging
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import torch
 import tyro
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.command_line import run
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .trajectory_file import DemonstrationError, open_trajectories, read_header
@@ -108,5 +110,4 @@ def _series(group: h5py.Group, axes: tuple[str, ...]) -> Iterator[tuple[str, tup
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -7,6 +7,7 @@ policy that has that modality alone will hardly know. Answers are cross-validate
 
 import json
 import logging
+import sys
 import textwrap
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -19,6 +20,7 @@ import tyro
 from mani_skill.utils.registration import REGISTERED_ENVS
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.progress import progress_bar
@@ -354,5 +356,4 @@ def main(args: Args) -> list[Answer]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -21,6 +21,9 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
             f"{checkpoint} is not a checkpoint: it has no config.json; give a folder like runs/<name>/checkpoints/last"
         )
     try:
-        return json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        config = json.loads(path.read_text())
+    except ValueError as error:
         raise CheckpointError(f"{path} is not json ({error}); the checkpoint is broken, use another") from error
+    if not isinstance(config, dict):
+        raise CheckpointError(f"{path} holds {type(config).__name__}, not a config; the checkpoint is broken, use another")
+    return config

@@ -5,6 +5,7 @@ interval is above zero, does not where all of it is below, and is undecided othe
 """
 
 import logging
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 import tyro
+
+from manifeel_ms3.command_line import run
 
 from .markdown import markdown_table
 from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
@@ -157,5 +160,4 @@ def main(args: Args) -> dict[Comparison, Answer | None]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

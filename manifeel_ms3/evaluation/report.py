@@ -7,6 +7,7 @@ file that needs nothing else.
 import base64
 import json
 import logging
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ import plotly.graph_objects as go
 import tyro
 
 import manifeel_ms3  # noqa: F401
+from manifeel_ms3.command_line import run
 
 from .film import Frame, record_episode, video
 from .policy import load_policy
@@ -97,5 +99,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

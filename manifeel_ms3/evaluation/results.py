@@ -2,6 +2,7 @@
 
 import json
 import logging
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+
+from manifeel_ms3.command_line import run
 
 from .checkpoint_config import checkpoint_config
 from .claims import answers_of, find_alike
@@ -137,5 +140,4 @@ def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

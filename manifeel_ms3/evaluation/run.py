@@ -10,6 +10,7 @@ fails that episode, with the reason; the evaluation goes on.
 
 import json
 import logging
+import sys
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -21,6 +22,7 @@ import torch
 import tyro
 from pebble import ProcessExpired, ProcessPool
 
+from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.progress import progress_bar
 
@@ -114,10 +116,11 @@ def what_to_evaluate(args: Args) -> Evaluation:
     """From the checkpoint's config, or from the arguments."""
     if (args.checkpoint is None) == (args.policy is None):
         raise ValueError("give either --checkpoint, or --policy with --env-id and --obs-mode")
-    extra = dict(sim_backend="physx_cpu") | json.loads(args.env_kwargs)
+    extra = dict(sim_backend="physx_cpu") | json_object("--env-kwargs", args.env_kwargs)
+    policy_kwargs = json_object("--policy-kwargs", args.policy_kwargs)
     if args.checkpoint is not None:
         config = checkpoint_config(args.checkpoint)
-        kwargs = json.loads(args.policy_kwargs) | dict(inference_steps=args.inference_steps)
+        kwargs = policy_kwargs | dict(inference_steps=args.inference_steps)
         sensing = {name: config[name] for name in ("obs_mode", "cameras", "tactile_sensors")}
         source = PolicySource(args.checkpoint, kwargs=json.dumps(kwargs))
         return Evaluation(source, config["env_id"], sensing | extra, config)
@@ -125,7 +128,7 @@ def what_to_evaluate(args: Args) -> Evaluation:
         raise ValueError("a --policy of your own needs --env-id and --obs-mode")
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs)
-    config = dict(kind=args.policy, policy_kwargs=json.loads(args.policy_kwargs), obs_mode=args.obs_mode)
+    config = dict(kind=args.policy, policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
     return Evaluation(source, args.env_id, {n: v for n, v in sensing.items() if v is not None} | extra, config)
 
 
@@ -179,5 +182,4 @@ def film(evaluation: Evaluation, seed: int, folder: Path) -> Path:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -9,6 +9,7 @@ cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so 
 
 import json
 import logging
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ import torch
 import tyro
 from scipy import linalg
 
+from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -269,5 +271,4 @@ def _resnet(name: str) -> Features:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

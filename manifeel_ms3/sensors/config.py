@@ -9,6 +9,7 @@ from typing import Any, Literal
 import sapien
 from mani_skill.sensors.base_sensor import BaseSensorConfig
 
+from manifeel_ms3.arguments import by_name, is_number, one_of
 from manifeel_ms3.paths import data_dir
 
 DEPTH_BACKENDS = ("auto", "raycast", "sapien")
@@ -111,10 +112,8 @@ class TactileSensorConfig(BaseSensorConfig):
     def __post_init__(self):
         _require_positive(self)
         _require_in_range(self)
-        if self.units not in UNITS:
-            raise ValueError(f"units={self.units!r} of tactile sensor {self.uid!r} is unknown; use one of {UNITS}")
-        if self.backend not in DEPTH_BACKENDS:
-            raise ValueError(f"backend={self.backend!r} of tactile sensor {self.uid!r} is unknown; use one of {DEPTH_BACKENDS}")
+        one_of("units", self.units, UNITS)
+        one_of("backend", self.backend, DEPTH_BACKENDS)
         for name, shape, pitch in (
             ("taxel_shape x taxel_pitch", self.taxel_shape, self.taxel_pitch),
             ("image_shape x pixel_size", self.image_shape, self.pixel_size),
@@ -170,7 +169,7 @@ def with_options(config: TactileSensorConfig, options: Mapping[str, Any]) -> Tac
     Raises:
         ValueError: a name that is no field, or a value that cannot be.
     """
-    for name, value in options.items():
+    for name, value in by_name("tactile", options, '{"units": "tacsl", "optics.noise": 2.0}').items():
         config = _with(config, name.split("."), value, name)
     return config
 
@@ -179,8 +178,22 @@ def _with(config: Any, path: list[str], value: Any, name: str) -> Any:
     known = [f.name for f in dataclasses.fields(config)] if dataclasses.is_dataclass(config) else []
     if path[0] not in known:
         raise ValueError(f"tactile option {name!r}: {path[0]!r} is not one of {known}")
-    value = value if len(path) == 1 else _with(getattr(config, path[0]), path[1:], value, name)
+    present = getattr(config, path[0])
+    if len(path) > 1:
+        value = _with(present, path[1:], value, name)
+    elif not _alike(value, present):
+        raise ValueError(f"tactile option {name!r}: {value!r} is not of the kind of {present!r}")
     return dataclasses.replace(config, **{path[0]: value})
+
+
+def _alike(value: Any, present: Any) -> bool:
+    """Whether `value` can stand where `present` does."""
+    if isinstance(present, tuple):
+        same_length = isinstance(value, list | tuple) and len(value) == len(present)
+        return same_length and all(_alike(one, other) for one, other in zip(value, present, strict=True))
+    if is_number(present):
+        return is_number(value) and (isinstance(value, int) or isinstance(present, float))
+    return isinstance(value, str | Path if isinstance(present, Path) else type(present))
 
 
 def _mm(extent: tuple[float, ...]) -> str:

@@ -5,12 +5,15 @@ pictures, and `presses.csv`, whose lines say `file,row,col,radius`: the contact 
 """
 
 import csv
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import tyro
+
+from manifeel_ms3.command_line import run
 
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 from .taxim_table import fit_table, read_table
@@ -115,4 +118,4 @@ def main(args: Table | Presses) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Table | Presses))
+    sys.exit(run(main, tyro.cli(Table | Presses)))

@@ -1,6 +1,7 @@
 """The tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
 
 import inspect
+import sys
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,6 +11,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
+
+from manifeel_ms3.command_line import run
 
 from .names import PREFIX, SUFFIX, short_name
 
@@ -48,4 +51,4 @@ def _description(cls: type) -> str:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -8,6 +8,7 @@ from mani_skill.utils.geometry.rotation_conversions import random_quaternions
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
 
@@ -61,9 +62,7 @@ class BallSortingEnv(VisuotactileEnv):
     front_camera_at = (0.80, 0.0, 0.15)
 
     def __init__(self, *args, goal: str = "lift", **kwargs):
-        if goal not in GOALS:
-            raise ValueError(f"goal={goal!r} is unknown; choose from {list(GOALS)}")
-        self.goal = goal
+        self.goal = one_of("goal", goal, GOALS)
         super().__init__(*args, **kwargs)
 
     def _largest_ranges(self):

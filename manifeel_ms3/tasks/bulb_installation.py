@@ -7,6 +7,7 @@ from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quatern
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import bulb_and_holder
 from manifeel_ms3.geometry.screws import BULB_TRAVEL, bulb_yaw
 
@@ -62,9 +63,7 @@ class BulbInstallationEnv(ScrewingEnv):
     )
 
     def __init__(self, *args, start: str = "hand", control_mode: str | None = None, **kwargs):
-        if start not in STARTS:
-            raise ValueError(f"start={start!r} is unknown; choose from {list(STARTS)}")
-        self.start = start
+        self.start = one_of("start", start, STARTS)
         if start == "holder":
             control_mode = control_mode or "pd_ee_delta_yaw"
         super().__init__(*args, control_mode=control_mode, **kwargs)

@@ -18,7 +18,7 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     Raises:
         ValueError: a token that is not known.
     """
-    tokens = obs_mode.split("+")
+    tokens = str(obs_mode).split("+")
     known = (*TACTILE_TOKENS, *ALL_VISUAL_TEXTURES, *STATE_TOKENS, *WHOLE_MODES)
     for token in tokens:
         if token not in known:

@@ -2,6 +2,7 @@
 
 from mani_skill.utils.registration import register_env
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import peg_fit
 from manifeel_ms3.geometry.plugs import PEG_HOLES
 
@@ -30,7 +31,5 @@ class PegInsertionEnv(InsertionEnv):
     max_gap = 1.0e-3
 
     def __init__(self, *args, fit: str = "tight", **kwargs):
-        if fit not in PEG_HOLES:
-            raise ValueError(f"fit={fit!r} is unknown; choose from {list(PEG_HOLES)}")
-        self.fit = peg_fit(fit)
+        self.fit = peg_fit(one_of("fit", fit, PEG_HOLES))
         super().__init__(*args, **kwargs)

@@ -1,6 +1,7 @@
-"""Which renderer this machine has, and what to install where it has none."""
+"""Which renderer this process can use, and what to do where it has none."""
 
 import functools
+import os
 
 import sapien
 import torch
@@ -13,9 +14,38 @@ NO_RENDERER = (
 )
 
 
+FORKED = (
+    "{wanted} needs a renderer, and this process was forked from one that has its own, which does not work on. Start it anew: "
+    "multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no picture works here: "
+    "obs_mode='state' or 'tacff'."
+)
+_IMPORTED_IN = os.getpid()
+_renders_in: int | None = None
+"""the process whose renderer this is; a fork copies the answer, not the renderer"""
+
+
+def available_render_backend(asked: str = "auto") -> str:
+    """The `render_backend` to use: "gpu", "cpu" or "none", which is all that a process has whose parent had the renderer."""
+    global _renders_in
+    if asked == "none" or renderer_lost():
+        return "none"
+    _renders_in = os.getpid()
+    return _first_that_works() if asked == "auto" else asked
+
+
+def renderer_lost() -> bool:
+    """Whether this process was forked from one with a renderer."""
+    return _renders_in not in (None, os.getpid())
+
+
+def mend_threads() -> None:
+    """In a forked process torch would wait for ever for OpenMP's threads, which the fork has not copied: work without."""
+    if os.getpid() != _IMPORTED_IN:
+        torch.set_num_threads(1)
+
+
 @functools.cache
-def available_render_backend() -> str:
-    """The `render_backend` that works here: "gpu", "cpu" or "none"."""
+def _first_that_works() -> str:
     candidates = ["gpu"] * torch.cuda.is_available() + ["cpu"]
     for backend in candidates:
         try:

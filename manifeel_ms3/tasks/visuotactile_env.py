@@ -13,12 +13,13 @@ from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConf
 from mani_skill.utils.visualization.misc import tile_images
 
 from manifeel_ms3.agents import PandaGelSight
+from manifeel_ms3.arguments import by_name, is_number, one_of, several_of
 from manifeel_ms3.geometry import Box, Part
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
 
 from .obs_modes import split_obs_mode
 from .pictures import same_height, same_size
-from .rendering import NO_RENDERER, available_render_backend
+from .rendering import FORKED, NO_RENDERER, available_render_backend, mend_threads, renderer_lost
 from .viewpoints import looking_at, looking_down
 
 CAMERAS = ("front", "side", "wrist")
@@ -97,20 +98,24 @@ class VisuotactileEnv(BaseEnv):
     ):
         own_mode, self._tactile_outputs = split_obs_mode(obs_mode or "state")
         self._full_obs_mode = obs_mode or "state"
-        self._camera_names = _known("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
-        self._sides = _known("tactile_sensors", tactile_sensors, SIDES)
+        self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
+        self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
         self._tactile_configs = {
             f"tactile_{side}": with_options(gelsight_r15(f"tactile_{side}", f"gel_{side}"), tactile or {})
             for side in self._sides
         }
-        (self._lighting,) = _known("lighting", [lighting], tuple(LIGHTING))
+        self._lighting = one_of("lighting", lighting, LIGHTING)
+        one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise ValueError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
         self.occlusion = self.has_occluder if occlusion is None else occlusion
         self.randomization = self._make_randomization(randomization or {})
-        backend = available_render_backend() if render_backend == "auto" else render_backend
+        one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
+        self._check_number(kwargs.get("num_envs", 1))
+        mend_threads()
+        backend = available_render_backend(render_backend)
         if backend == "none" and (wanted := self._wanted_pictures(own_mode, kwargs.get("render_mode"))):
-            raise RuntimeError(NO_RENDERER.format(wanted=wanted))
+            raise RuntimeError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -122,15 +127,25 @@ class VisuotactileEnv(BaseEnv):
 
     def _make_randomization(self, overrides: dict[str, float]):
         known = self.Randomization.__dataclass_fields__
-        for name, value in overrides.items():
+        for name, value in by_name("randomization", overrides, f"dict({next(iter(known))}=0.01)").items():
             if name not in known:
                 raise ValueError(f"randomization[{name!r}] is unknown for {type(self).__name__}; known: {list(known)}")
-            if not (np.isscalar(value) and np.isfinite(value) and value >= 0):
+            if not (is_number(value) and value >= 0):
                 raise ValueError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
             limit, reason = self._largest_ranges().get(name, (np.inf, ""))
             if value > limit:
                 raise ValueError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
         return self.Randomization(**overrides)
+
+    @staticmethod
+    def _check_number(num_envs: Any) -> None:
+        if not is_number(num_envs) or not isinstance(num_envs, int) or num_envs < 1:
+            raise ValueError(f"num_envs={num_envs!r} must be a whole number of at least 1")
+        if num_envs > 1 and not torch.cuda.is_available():
+            raise RuntimeError(
+                f"num_envs={num_envs}: many environments in one process need a CUDA GPU, and torch sees none; use several "
+                "processes (gymnasium's AsyncVectorEnv, --workers of the commands)"
+            )
 
     @staticmethod
     def _wanted_pictures(own_mode: str, render_mode: str | None) -> str:
@@ -232,7 +247,8 @@ class VisuotactileEnv(BaseEnv):
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None):
         """As ManiSkill's. With a seed, on the CPU, the scene is built anew (0.1 s): the engine's solver remembers earlier
         episodes, and only so is an episode a function of its seed alone, bit for bit."""
-        options = dict(options or {})
+        options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
+        self._check_seed(seed)
         if seed is not None and self.num_envs == 1:
             options["reconfigure"] = True
         obs, info = super().reset(seed=seed, options=options)
@@ -243,6 +259,11 @@ class VisuotactileEnv(BaseEnv):
         info = self.get_info() | dict(reconfigure=info["reconfigure"])
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
+
+    def _check_seed(self, seed: Any) -> None:
+        seeds = seed if isinstance(seed, list | tuple | np.ndarray) else [seed]
+        if seed is not None and not all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds):
+            raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one for each environment")
 
     def _settle(self, env_idx: torch.Tensor) -> None:
         """Let the grip take its load before the first observation; environments in mid-episode are put back as they were."""
@@ -284,7 +305,10 @@ class VisuotactileEnv(BaseEnv):
         """The action as a tensor; a wrong shape or a NaN is an error before anything moves."""
         if action is None:
             return None
-        tensor = torch.as_tensor(action, device=self.device)
+        try:
+            tensor = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        except (TypeError, RuntimeError, ValueError) as error:
+            raise ValueError(f"action {action!r} is no array of numbers: {error}") from None
         shape = self.single_action_space.shape
         if tuple(tensor.shape) not in (shape, (self.num_envs, *shape)):
             raise ValueError(
@@ -295,7 +319,7 @@ class VisuotactileEnv(BaseEnv):
             raise ValueError(
                 f"action {tensor.tolist()} holds NaN or infinity; give finite numbers (they are clipped to [-1, 1])"
             )
-        return tensor.float()
+        return tensor
 
     def _after_simulation_step(self):
         self._pad_forces.append(self.agent.pad_joint_forces)
@@ -371,11 +395,3 @@ class VisuotactileEnv(BaseEnv):
 
     def _sensor_pictures(self) -> list[torch.Tensor]:
         return same_size([image for sensor in self.get_sensor_images().values() for image in sensor.values()])
-
-
-def _known(argument: str, given: Iterable[str], allowed: tuple[str, ...]) -> tuple[str, ...]:
-    given = tuple(given)
-    for value in given:
-        if value not in allowed:
-            raise ValueError(f"{argument}: {value!r} is unknown; choose from {list(allowed)}")
-    return given

@@ -1,8 +1,8 @@
 """Record demonstrations by hand, in a browser: `python -m manifeel_ms3.teleop ManiFeel-USBInsertion-v1`. Needs the extra
 `teleop`."""
 
-import json
 import logging
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,6 +12,7 @@ import tyro
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.command_line import json_object, run
 
 from .devices import DEVICES, follow
 from .operator import Operator
@@ -57,7 +58,7 @@ def main(args: Args) -> Path:
     kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))
     if args.cameras is not None:
         kwargs["cameras"] = list(args.cameras)
-    kwargs |= json.loads(args.env_kwargs)
+    kwargs |= json_object("--env-kwargs", args.env_kwargs)
     env = gym.make(args.env_id, **kwargs)
     operator = Operator(ACTION_AXES[env.unwrapped.control_mode])
     if args.device:
@@ -78,5 +79,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

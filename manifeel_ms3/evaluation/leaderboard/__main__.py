@@ -9,11 +9,14 @@ training seed, in any folders, and, if wanted, `videos/*.mp4`. `submit` checks i
 """
 
 import logging
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from manifeel_ms3.command_line import run
 
 from ..policy import PolicySource
 from . import page
@@ -69,5 +72,4 @@ def main(args: Submit | Build) -> Path:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -7,6 +7,7 @@ depends on, and never done twice; a worker that dies is started again; a study t
 
 import logging
 import os
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import track
 from rich.table import Table
+
+from manifeel_ms3.command_line import run
 
 from . import cost
 from .study import KINDS, Stage, Study, StudyError, read_study, stages_of
@@ -151,5 +154,4 @@ def plan(study: Study, stages: list[Stage], root: Path) -> Table:
 
 
 if __name__ == "__main__":
-    logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    main(tyro.cli(Args))
+    sys.exit(run(main, tyro.cli(Args)))

@@ -1,0 +1,61 @@
+"""How a command runs from a shell: what it says while it works, and what it says when it cannot.
+
+An error that this package raises, because of what it was given, is a message and where to read more. Any other is a fault and
+keeps its traceback.
+"""
+
+import json
+import logging
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from .paths import troubleshooting
+
+TRACEBACK = "MANIFEEL_TRACEBACK"
+"""environment variable: anything but "" shows where a refusal was raised"""
+INTERRUPTED = 130
+_FOLDERS = [Path(spec.origin).parent for name in ("manifeel_ms3", "baselines") if (spec := find_spec(name)) and spec.origin]
+
+
+def run(main: Callable[[Any], Any], args: Any) -> int:
+    """Run `main(args)`; returns the exit code: 1 where it was refused, or where it answers how many things are wrong."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    try:
+        answer = main(args)
+    except KeyboardInterrupt:
+        sys.stderr.write("stopped\n")
+        return INTERRUPTED
+    except (ValueError, OSError, ImportError, RuntimeError) as error:
+        if os.environ.get(TRACEBACK) or not _raised_here(error):
+            raise
+        sys.stderr.write(f"error: {error}\nmore: {troubleshooting()}, or {TRACEBACK}=1 for the place where it was raised\n")
+        return 1
+    return min(answer, 1) if isinstance(answer, int) else 0
+
+
+def _raised_here(error: Exception) -> bool:
+    """Whether this package raised it, in this process or in a worker."""
+    in_worker = re.findall(r'File "(.+?)", line', str(error.__cause__)) if error.__cause__ else []
+    file = in_worker[-1] if in_worker else traceback.extract_tb(error.__traceback__)[-1].filename
+    return any(Path(file).is_relative_to(folder) for folder in _FOLDERS)
+
+
+def json_object(flag: str, given: str) -> dict[str, Any]:
+    """A flag's value that is a json object, as keyword arguments.
+
+    Raises:
+        ValueError: it is not one.
+    """
+    try:
+        value = json.loads(given)
+    except json.JSONDecodeError as error:
+        raise ValueError(f'{flag} {given!r} is not json ({error}); quote it like \'{{"fit": "loose"}}\'') from None
+    if not isinstance(value, dict):
+        raise ValueError(f'{flag} {given!r} is not a json object like \'{{"fit": "loose"}}\'')
+    return value
