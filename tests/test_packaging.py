@@ -1,0 +1,62 @@
+"""What is built is whole: the wheel made from the source archive has every asset, and works from any folder."""
+
+import os
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+MAKE = """
+import manifeel_ms3, gymnasium
+gymnasium.make('ManiFeel-PegInsertion-v1', obs_mode='state').reset(seed=0)
+env = gymnasium.make('ManiFeel-PegInsertion-v1', obs_mode='tacrgb', render_backend='none')
+touched = env.reset(seed=0)[0]['sensor_data']['tactile_right']
+"""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory) -> Path:
+    """Built from the source archive alone."""
+    folder = tmp_path_factory.mktemp("dist")
+    _build("sdist", REPOSITORY, folder)
+    with tarfile.open(next(folder.glob("*.tar.gz"))) as archive:
+        archive.extractall(folder / "source", filter="data")
+    (source,) = (folder / "source").iterdir()
+    _build("wheel", source, folder)
+    return next(folder.glob("*.whl"))
+
+
+def _build(target: str, source: Path, out: Path) -> None:
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(out)], cwd=source, check=True)
+
+
+def test_the_wheel_holds_all_that_the_packages_hold(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        inside = set(archive.namelist())
+    packages = [REPOSITORY / name for name in ("manifeel_ms3", "baselines")]
+    files = [path for package in packages for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    missing = {path.relative_to(REPOSITORY).as_posix() for path in files} - inside
+    assert not missing
+    assert {f"manifeel_ms3/data/{path.name}" for path in (REPOSITORY / "data").iterdir() if path.is_file()} <= inside
+
+
+def test_it_works_from_any_folder(wheel, tmp_path):
+    site = tmp_path / "site"
+    subprocess.run([sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target", str(site), str(wheel)], check=True)
+
+    def python(*arguments: str) -> subprocess.CompletedProcess:
+        where = os.environ | dict(PYTHONPATH=str(site))
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=tmp_path, env=where, capture_output=True, text=True, check=False)
+
+    done = python("-c", f"{MAKE}print(manifeel_ms3.__file__, touched['rgb'].shape)")
+    assert str(site) in done.stdout, done.stderr
+    assert "240, 320, 3" in done.stdout
+    refused = python("-m", "manifeel_ms3.cli", "tasks", "Knitting")
+    assert refused.returncode == 1
+    assert (site / "manifeel_ms3/data/troubleshooting.md").is_file()
+    assert str(site) in refused.stderr.partition("more: ")[2]

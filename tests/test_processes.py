@@ -1,0 +1,112 @@
+"""Environments beside each other, after each other, and in processes that were forked or spawned."""
+
+import multiprocessing
+
+import gymnasium as gym
+import numpy as np
+import psutil
+import pytest
+import torch
+
+from tests.conftest import PEG, needs_renderer
+
+EVERYTHING = dict(obs_mode="rgb+tacrgb+tacff", cameras=("front", "side", "wrist"), tactile_sensors=("left", "right"))
+STEPS = 8
+PATIENCE = 120  # s
+OTHER = "ManiFeel-ObjectSearch-v1"
+
+
+def rewards(env: gym.Env, steps: int = STEPS):
+    """Of a short episode, one by one."""
+    env.reset(seed=3)
+    for t in range(steps):
+        action = np.full(env.action_space.shape, 0.2 * (-1) ** t, np.float32)
+        yield env.step(action)[1].item()
+
+
+def test_two_environments_do_not_disturb_each_other(make_env):
+    first, second = (make_env(task, obs_mode="state", render_backend="none") for task in (PEG, OTHER))
+    alone = list(rewards(first)), list(rewards(second))
+    together = tuple(zip(*zip(rewards(first), rewards(second), strict=True), strict=True))
+    assert [list(values) for values in together] == list(alone)
+
+
+def _answer(connection, kwargs: dict) -> None:
+    import manifeel_ms3  # noqa: F401
+
+    try:
+        env = gym.make(PEG, sim_backend="physx_cpu", **kwargs)
+        connection.send(list(rewards(env, 2)))
+        env.close()
+    except RuntimeError as error:
+        connection.send(str(error))
+
+
+def _in_process(how: str, kwargs: dict):
+    context = multiprocessing.get_context(how)
+    here, there = context.Pipe()
+    process = context.Process(target=_answer, args=(there, kwargs))
+    process.start()
+    try:
+        assert here.poll(PATIENCE), "it hangs"
+        return here.recv()
+    finally:
+        process.kill()
+        process.join()
+
+
+@pytest.fixture
+def threads():
+    """Torch with threads that are at work, as it is where nobody sets their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    torch.rand(512, 512) @ torch.rand(512, 512)
+    torch.rand(1 << 20).sin()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+def test_in_another_process_while_there_is_one_here(make_env, how, threads):
+    here = make_env(obs_mode="tacff", render_backend="none")
+    expected = list(rewards(here, 2))
+    assert _in_process(how, dict(obs_mode="tacff", render_backend="none")) == expected
+    assert list(rewards(here, 2)) == expected
+
+
+@needs_renderer
+def test_a_renderer_does_not_come_along_with_a_fork(make_env):
+    make_env(obs_mode="rgb").reset(seed=0)
+    assert "forked from one that has its own" in _in_process("fork", dict(obs_mode="rgb"))
+    assert len(_in_process("fork", dict(obs_mode="tacff"))) == 2  # needs none
+    assert len(_in_process("spawn", dict(obs_mode="rgb"))) == 2
+
+
+@needs_renderer
+def test_opened_and_closed_fifty_times(figure):
+    process = psutil.Process()
+    sizes, files = [], []
+    for i in range(50):
+        env = gym.make(PEG, sim_backend="physx_cpu", **EVERYTHING)
+        env.reset(seed=i)
+        env.step(env.action_space.sample())
+        env.close()
+        sizes.append(process.memory_info().rss / 1e6)
+        files.append(process.num_fds())
+    figure("memory after 50 environments more than after 10, MB", sizes[-1] - sizes[9], at_most=50)
+    assert files[-1] == files[9]
+
+
+@pytest.mark.slow
+@needs_renderer
+def test_ten_thousand_steps_with_all_sensors(make_env, figure):
+    env = make_env(**EVERYTHING)
+    process = psutil.Process()
+    sizes = []
+    for episode in range(100):
+        env.reset(seed=episode)
+        for _ in range(100):
+            obs, *_ = env.step(env.action_space.sample())
+        assert torch.isfinite(obs["sensor_data"]["tactile_right"]["force_field"]).all()
+        sizes.append(process.memory_info().rss / 1e6)
+    figure("memory after 100 episodes more than after 5, MB", sizes[-1] - sizes[4], at_most=50)
