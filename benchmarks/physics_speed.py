@@ -30,10 +30,11 @@ def real_time_factors(task: str) -> tuple[float, float]:
     """Simulated seconds a second: of the engine alone, of whole steps; all sample demonstrations together."""
     path = data_dir() / "sample" / task / "states.h5"
     seconds = np.zeros(3)
-    for episode in read_header(path)["episodes"]:
-        with open_trajectories(path) as file:
-            actions = np.asarray(file[f"traj_{episode['episode_id']}/actions"])
-        seconds += seconds_of(task, episode["episode_seed"], actions)
+    episodes = read_header(path)["episodes"]
+    with open_trajectories(path) as file:
+        actions = [file[f"traj_{episode['episode_id']}/actions"][()] for episode in episodes]
+    for episode, played in zip(episodes, actions, strict=True):
+        seconds += seconds_of(task, episode["episode_seed"], played)
     simulated, engine, whole = seconds
     return simulated / engine, simulated / whole
 

@@ -4,6 +4,7 @@ import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -61,7 +62,7 @@ def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarra
     """The actions, and where each object ended."""
     with open_trajectories(path) as file:
         group = file[f"traj_{episode}"]
-        actors = group["env_states/actors"]
+        actors: Any = group["env_states/actors"]
         return group["actions"][()], {name: actors[name][-1, :7] for name in actors}
 
 

@@ -10,10 +10,9 @@ import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import torch
-from mani_skill.utils import common
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.sensors.visualisation import force_field_images
+from manifeel_ms3.sensors.visualisation import pictures_of
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
@@ -36,13 +35,7 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     frames: list[Frame] = []
 
     def keep(obs: dict[str, Any]) -> None:
-        pictures = {}
-        for name, data in obs["sensor_data"].items():
-            title = name.replace("_", " ")
-            pictures[title if name in cameras else f"{title}: TacRGB"] = common.to_numpy(data["rgb"])[0]
-            if "force_field" in data:
-                pictures[f"{title}: TacFF"] = common.to_numpy(force_field_images(data["force_field"]))[0]
-        frames.append(Frame(pictures))
+        frames.append(Frame(pictures_of(obs)))
 
     outcome = evaluate_episode(env, policy, seed, keep)
     env.close()

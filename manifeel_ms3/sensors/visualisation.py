@@ -1,8 +1,11 @@
 """Pictures of touch for people: videos, reports, `render(mode="sensors")`."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
+from mani_skill.utils import common
 
 NORMAL_SCALE = 0.6  # N per taxel, drawn at full brightness
 SHEAR_SCALE = 0.1  # N per taxel, drawn as an arrow of one taxel pitch
@@ -30,3 +33,15 @@ def _draw(field: np.ndarray, size: tuple[int, int]) -> np.ndarray:
             ends = [tuple(int(round(v)) for v in point[::-1]) for point in (start, tip)]
             cv2.arrowedLine(picture, *ends, color=(255, 90, 60), thickness=1, line_type=cv2.LINE_AA, tipLength=0.35)
     return picture
+
+
+def pictures_of(obs: dict[str, Any]) -> dict[str, np.ndarray]:
+    """What an observation shows of its first environment: uint8 (H, W, 3) by name, such as "wrist", "tactile right: TacFF"."""
+    pictures = {}
+    for sensor, data in obs["sensor_data"].items():
+        title = sensor.replace("_", " ")
+        if "rgb" in data:
+            pictures[f"{title}: TacRGB" if sensor.startswith("tactile") else title] = common.to_numpy(data["rgb"])[0]
+        if "force_field" in data:
+            pictures[f"{title}: TacFF"] = common.to_numpy(force_field_images(data["force_field"]))[0]
+    return pictures

@@ -10,9 +10,8 @@ import cv2
 import numpy as np
 import viser
 import viser.uplot
-from mani_skill.utils import common
 
-from manifeel_ms3.sensors.visualisation import force_field_images
+from manifeel_ms3.sensors.visualisation import pictures_of
 
 from .operator import Mode, Operator, Wish
 
@@ -51,15 +50,14 @@ class Page:
         self._rights = threading.Lock()
         self._forces: deque[float] = deque([0.0] * PLOTTED, PLOTTED)
         self.address = f"http://{host}:{self._server.get_port()}"
-        self._server.on_client_connect(self._arrived)
+        self._server.on_client_connect(lambda client: self._claim(client.client_id))
         self._server.on_client_disconnect(self._left)
         self._build(title)
 
     # ---------------------------------------------------------------- for the session
 
     def show(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
-        pictures = list(self._pictures(obs))
-        self._server.scene.set_background_image(_mosaic(pictures), format="jpeg", jpeg_quality=80)
+        self._server.scene.set_background_image(_mosaic(list(pictures_of(obs).values())), format="jpeg", jpeg_quality=80)
         self._forces.append(float(info.get("contact_force", 0.0)))
         self._plot.data = (np.arange(PLOTTED, dtype=float), np.array(self._forces))
         self._mode.content = f"**{self.operator.mode.value}**" + (" · success" if bool(info.get("success", False)) else "")
@@ -73,10 +71,10 @@ class Page:
 
     # ---------------------------------------------------------------- who steers
 
-    def _arrived(self, client: viser.ClientHandle) -> None:
+    def _claim(self, client_id: int | None) -> None:
         with self._rights:
             if self._pilot is None:
-                self._pilot = client.client_id
+                self._pilot = client_id
         self._say_who_steers()
 
     def _left(self, client: viser.ClientHandle) -> None:
@@ -85,12 +83,6 @@ class Page:
                 return
             self._pilot = None
         self.operator.pause()
-        self._say_who_steers()
-
-    def _take_over(self, event: viser.GuiEvent) -> None:
-        with self._rights:
-            if self._pilot is None:
-                self._pilot = event.client_id
         self._say_who_steers()
 
     def _say_who_steers(self) -> None:
@@ -140,7 +132,8 @@ class Page:
                     )
             if "gripper" in self.operator.axes:
                 gui.add_button("gripper").on_click(self._if_pilot(self.operator.toggle_gripper))
-        gui.add_button("take over", hint="where the page that steered has gone").on_click(self._take_over)
+        take_over = gui.add_button("take over", hint="where the page that steered has gone")
+        take_over.on_click(lambda event: self._claim(event.client_id))
         for key, (axis, sign) in KEYS.items():
             self._key(f"{axis} {'+' if sign > 0 else '-'}", key, lambda axis=axis, sign=sign: self.operator.push(axis, sign))
         self._key("gripper", "G", self.operator.toggle_gripper)
@@ -157,13 +150,6 @@ class Page:
 
     def _start_or_pause(self) -> None:
         self.operator.pause() if self.operator.mode is Mode.RUNNING else self.operator.start()
-
-    def _pictures(self, obs: dict[str, Any]):
-        for data in obs["sensor_data"].values():
-            if "rgb" in data:
-                yield common.to_numpy(data["rgb"])[0]
-            if "force_field" in data:
-                yield common.to_numpy(force_field_images(data["force_field"]))[0]
 
 
 def _mosaic(pictures: list[np.ndarray]) -> np.ndarray:

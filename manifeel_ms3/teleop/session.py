@@ -66,8 +66,6 @@ class Session:
             screen.tell(f"seed {self._seed}, {len(self._infos)} saved")
             episode = run_episode(self.env, self._seed, self._actions, screen.show)
             wish = self._decision(screen, episode)
-            if wish is Wish.SAVE:
-                self._infos[self._seed] = episode.info | dict(episode_seed=self._seed)
             if wish is not Wish.RETRY:
                 self._seed += 1
 
@@ -115,4 +113,5 @@ class Session:
         except OSError as error:
             screen.tell(f"it could not be saved ({error}); make room, then save again: the episode is still here")
             return False
+        self._infos = infos
         return True

@@ -14,9 +14,10 @@ from manifeel_ms3.evaluation.leaderboard import __main__ as leaderboard
 from manifeel_ms3.evaluation.leaderboard.submission import SubmissionError, check, read_submission
 from manifeel_ms3.evaluation.result import read_result, result_of, write_result
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from tests.browser import browser_program
 from tests.conftest import PEG
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+BROWSER = browser_program()
 POLICY = "tests.evaluation.policies:StandStill"
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=3))
 

@@ -11,8 +11,8 @@ import pytest
 
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
+from tests.browser import Browser, browser_program, wait_until
 from tests.conftest import PEG, needs_renderer
-from tests.teleop.browser import Browser, browser_program, wait_until
 
 pytest.importorskip("viser")
 pytestmark = [needs_renderer, pytest.mark.skipif(browser_program() is None, reason="no browser on this machine")]

@@ -17,8 +17,8 @@ from manifeel_ms3.teleop import session as module
 from manifeel_ms3.teleop.devices import DEVICES, DeviceError, Reading, follow
 from manifeel_ms3.teleop.operator import HOLD, Mode, Operator, Wish
 from manifeel_ms3.teleop.session import Session
+from tests.browser import wait_until
 from tests.conftest import PEG
-from tests.teleop.browser import wait_until
 
 KWARGS = dict(obs_mode="tacff", render_backend="none", sim_backend="physx_cpu", cameras=[], tactile_sensors=["right"])
 AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")

@@ -177,6 +177,9 @@ def run_again(submission: Submission, source: PolicySource, episodes: int, seed:
             if abs(before - now) > tolerance:
                 wrong.append(f"{file}: seed {episode['seed']}: {name} says {before}, run again it is {now}")
     if wrong:
+        theirs, ours = result["versions"]["torch"], version("torch")
+        if theirs != ours:
+            wrong.append(f"{file} was made with torch {theirs}, here it is {ours}, which rounds otherwise: install that")
         raise SubmissionError(_listed(submission.folder, wrong))
 
 
