@@ -29,8 +29,10 @@ def available_render_backend(asked: str = "auto") -> str:
     global _renders_in
     if asked == "none" or renderer_lost():
         return "none"
-    _renders_in = os.getpid()
-    return _first_that_works() if asked == "auto" else asked
+    backend = _first_that_works() if asked == "auto" else asked
+    if backend != "none":
+        _renders_in = os.getpid()
+    return backend
 
 
 def renderer_lost() -> bool:
