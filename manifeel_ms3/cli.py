@@ -56,14 +56,17 @@ def main(arguments: list[str] | None = None) -> int:
     Args:
         arguments: default: those of the process.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    return run(_run, sys.argv[1:] if arguments is None else arguments)
+
+
+def _run(arguments: list[str]) -> Any:
     if arguments and arguments[0] in COMMANDS:
         args = tyro.cli(form(arguments[0]), prog=f"manifeel {arguments[0]}", args=arguments[1:])
     else:
         wanted = any("-completion" in argument for argument in arguments)
         forms = [_subcommand(name, form(name) if wanted else _NotImported, about) for name, (_, about) in COMMANDS.items()]
         args = tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)
-    return run(import_module(type(args).__module__).main, args)
+    return import_module(type(args).__module__).main(args)
 
 
 def form(command: str) -> Any:

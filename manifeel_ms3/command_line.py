@@ -11,15 +11,21 @@ import re
 import sys
 import traceback
 from collections.abc import Callable
+from importlib.metadata import metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+from packaging.requirements import Requirement
 
 from .paths import troubleshooting
 
 TRACEBACK = "MANIFEEL_TRACEBACK"
 """environment variable: anything but "" shows where a refusal was raised"""
 INTERRUPTED = 130
+PACKAGE = "manifeel-ms3"
+DISTRIBUTIONS = {"sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
+"""of modules that are not called as their distribution is"""
 _FOLDERS = [Path(spec.origin).parent for name in ("manifeel_ms3", "baselines") if (spec := find_spec(name)) and spec.origin]
 
 
@@ -32,11 +38,29 @@ def run(main: Callable[[Any], Any], args: Any) -> int:
         sys.stderr.write("stopped\n")
         return INTERRUPTED
     except (ValueError, OSError, ImportError, RuntimeError) as error:
-        if os.environ.get(TRACEBACK) or not _raised_here(error):
+        reason = _reason(error)
+        if reason is None or os.environ.get(TRACEBACK):
             raise
-        sys.stderr.write(f"error: {error}\nmore: {troubleshooting()}, or {TRACEBACK}=1 for the place where it was raised\n")
+        sys.stderr.write(f"error: {reason}\nmore: {troubleshooting()}, or {TRACEBACK}=1 for the place where it was raised\n")
         return 1
     return min(answer, 1) if isinstance(answer, int) else 0
+
+
+def _reason(error: Exception) -> str | None:
+    """What to say instead of a traceback, where that is enough."""
+    if isinstance(error, ModuleNotFoundError) and (extra := _extra_with(error.name or "")):
+        return f"{error.name} is not installed: pip install '{PACKAGE}[{extra}]'"
+    return str(error) if _raised_here(error) else None
+
+
+def _extra_with(module: str) -> str | None:
+    """The extra of this package that brings a module."""
+    name = DISTRIBUTIONS.get(module, module).replace("_", "-")
+    for requirement in map(Requirement, requires(PACKAGE) or []):
+        for extra in metadata(PACKAGE).get_all("Provides-Extra") or []:
+            if requirement.name == name and requirement.marker and requirement.marker.evaluate({"extra": extra}):
+                return extra
+    return None
 
 
 def _raised_here(error: Exception) -> bool:

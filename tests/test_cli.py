@@ -1,7 +1,9 @@
 """One entry point: it lists, parses, completes and runs every command."""
 
+import importlib
 import json
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,15 @@ def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, cap
     monkeypatch.setenv(TRACEBACK, "1")
     with pytest.raises(ValueError, match="fit='huge'"):
         run(refuse, None)
+
+
+def test_a_library_of_an_extra_is_named_with_the_extra(monkeypatch, capsys):
+    for module, extra in dict(pyspacemouse="spacemouse", sklearn="audit", rerun="view", ray="matrix", yaml="matrix").items():
+        monkeypatch.setitem(sys.modules, module, None)
+        assert run(importlib.import_module, module) == 1
+        assert f"{module} is not installed: pip install 'manifeel-ms3[{extra}]'" in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        run(importlib.import_module, "no_library_of_ours")
 
 
 def test_what_a_worker_refuses_is_a_message_too(tmp_path, capsys):
