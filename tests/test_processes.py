@@ -81,6 +81,7 @@ def test_a_renderer_does_not_come_along_with_a_fork(make_env):
     assert len(_in_process("fork", dict(obs_mode="tacff"))) == 2  # needs none
 
 
+@pytest.mark.slow
 @needs_renderer
 def test_opened_and_closed_fifty_times(figure):
     process = psutil.Process()

@@ -127,7 +127,7 @@ class VisuotactileEnv(BaseEnv):
 
     def _make_randomization(self, overrides: dict[str, float]):
         known = self.Randomization.__dataclass_fields__
-        for name, value in by_name("randomization", overrides, f"dict({next(iter(known))}=0.01)").items():
+        for name, value in by_name("randomization", overrides, "dict(socket_xy=0.01)").items():
             if name not in known:
                 raise ValueError(f"randomization[{name!r}] is unknown for {type(self).__name__}; known: {list(known)}")
             if not (is_number(value) and value >= 0):

@@ -252,7 +252,8 @@ def pictures(tmp_path_factory):
     with h5py.File(path, "w") as file:
         file["traj_0/obs/sensor_data/tactile_right/rgb"] = np.repeat(np.array(frames)[..., None], 3, -1).astype(np.uint8)
         file["traj_0/obs/sensor_data/wrist/rgb"] = np.zeros((24, 8, 8, 3), np.uint8)
-    header = dict(env_info=dict(env_id=PEG, env_kwargs={}), episodes=[dict(episode_id=0, episode_seed=0)])
+    episode = dict(episode_id=0, episode_seed=0, elapsed_steps=23, success=True)
+    header = dict(env_info=dict(env_id=PEG, env_kwargs={}), episodes=[episode])
     path.with_suffix(".json").write_text(json.dumps(header))
     return path
 
