@@ -11,6 +11,8 @@ TASK := ManiFeel-PegInsertion-v1
 TASK_ARGS := {"fit": "loose", "randomization": {"socket_xy": 0.01, "start_xy": 0.02, "start_z": 0.02, "start_rotation": 0.05, "in_hand_pitch": 0.09}}
 READY := .venv/.ready
 WORKERS := $(shell nproc)
+# what is imported is compiled once, whatever the shell says: not anew in each of the many processes
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: setup demo data benchmark-smoke test lint types
 setup: $(READY)
