@@ -17,10 +17,7 @@ def one_of(name: str, given: T, allowed: Iterable[T]) -> T:
 def several_of(name: str, given: Any, allowed: Iterable[str]) -> tuple[str, ...]:
     """A single name counts as one of several."""
     values = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
-    for value in values:
-        if value not in list(allowed):
-            raise ValueError(f"{name}: {value!r} is unknown; choose from {list(allowed)}")
-    return values
+    return tuple(one_of(name, value, allowed) for value in values)
 
 
 def by_name(name: str, given: Any, example: str) -> Mapping[str, Any]:

@@ -17,9 +17,8 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import PACKAGE, run
 
-PACKAGE = "manifeel-ms3"
 PYTHONS = ((3, 10), (3, 12))  # tested: the first and the last
 ROOM = 10.0  # GB: what the paper's demonstrations take, with observations
 PATIENCE = 300  # s

@@ -6,7 +6,6 @@ where it stopped when the same command is given again.
 """
 
 import hashlib
-import json
 import shutil
 import sys
 from dataclasses import dataclass
@@ -21,9 +20,14 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import materialize, record
-from .trajectory_file import DemonstrationError, finished_episodes, read_header, write_json
+from .trajectory_file import DemonstrationError, finished_episodes, read_header, read_json, write_json
 
 SCHEMA = "manifeel-demonstrations-1"
+MANIFEST = {  # what is read of a manifest, as a json schema
+    "type": "object",
+    "required": ["schema", "files"],
+    "properties": {"files": {"type": "object", "additionalProperties": {"type": "object"}}},
+}
 PAPER_COUNTS = {
     "ManiFeel-PegInsertion-v1": 50,
     "ManiFeel-USBInsertion-v1": 50,
@@ -149,13 +153,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     path = Path(folder) / "manifest.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
-    try:
-        manifest = json.loads(path.read_text())
-        found = manifest["schema"]
-        _ = manifest["files"].items()
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DemonstrationError(f"{path} is not a manifest ({error!r}); copy or record the folder again") from error
-    if found != SCHEMA:
+    manifest = read_json(path, MANIFEST, "a manifest")
+    if (found := manifest["schema"]) != SCHEMA:
         raise DemonstrationError(f"{path} has the schema {found!r}, this version reads {SCHEMA!r}; update manifeel-ms3")
     return manifest
 

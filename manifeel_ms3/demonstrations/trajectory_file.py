@@ -158,14 +158,22 @@ def read_header(path: Path) -> dict[str, Any]:
             raise DemonstrationError(
                 f"demonstration file {needed} does not exist; record one with `python -m manifeel_ms3.demonstrations.record`"
             )
-    about = path.with_suffix(".json")
+    return read_json(path.with_suffix(".json"), HEADER, "a trajectory's json")
+
+
+def read_json(path: Path, schema: dict[str, Any], kind: str) -> dict[str, Any]:
+    """A json file of the form that `schema` asks for.
+
+    Raises:
+        DemonstrationError: it is not json, or of another form.
+    """
     try:
-        header = json.loads(about.read_text())
-        jsonschema.validate(header, HEADER)
+        content = json.loads(path.read_text())
+        jsonschema.validate(content, schema)
     except (ValueError, jsonschema.ValidationError) as error:
         reason = f"{error.json_path}: {error.message[:200]}" if isinstance(error, jsonschema.ValidationError) else error
-        raise DemonstrationError(f"{about} is not a trajectory's json ({reason}); copy or record it again") from error
-    return header
+        raise DemonstrationError(f"{path} is not {kind} ({reason}); copy or record it again") from error
+    return content
 
 
 @contextmanager

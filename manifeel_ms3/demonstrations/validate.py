@@ -49,7 +49,7 @@ def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
                 problems += [f"seed {episode['episode_seed']}: {what}" for what in _episode_problems(file, episode)]
     except (DemonstrationError, KeyError, OSError) as error:
         return [str(error)]
-    held_out = json.loads((data_dir() / "eval_seeds.json").read_text())[entry["env_id"]]
+    held_out = json.loads((data_dir() / "eval_seeds.json").read_text()).get(found["env_id"], [])
     if shared := set(found["seeds"]) & set(held_out):
         problems.append(f"seeds {sorted(shared)} are evaluation seeds")
     if len(set(found["seeds"])) < len(found["seeds"]):

@@ -139,7 +139,7 @@ class VisuotactileEnv(BaseEnv):
 
     @staticmethod
     def _check_number(num_envs: Any) -> None:
-        if not is_number(num_envs) or not isinstance(num_envs, int) or num_envs < 1:
+        if type(num_envs) is not int or num_envs < 1:
             raise ValueError(f"num_envs={num_envs!r} must be a whole number of at least 1")
         if num_envs > 1 and not torch.cuda.is_available():
             raise RuntimeError(

@@ -136,7 +136,6 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 240) -> dic
     return json.loads(path.read_text())
 
 
-@pytest.mark.slow
 def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_path):
     root = tmp_path / "matrix"
     record, train, evaluate = stages_of(read_study(study))
