@@ -1,16 +1,27 @@
-"""The site builds without a warning, and every command that it shows is one, with flags that exist."""
+"""The site builds without a warning, and every command that it shows is one, with flags that exist; all of them run, too."""
 
 import importlib.util
+import json
+import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import h5py
 import pytest
+import torch
 import tyro
 
+from baselines.diffusion_policy import train as diffusion
+from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
+from manifeel_ms3.demonstrations import materialize
+from tests.conftest import PEG, needs_renderer
+from tests.evaluation.test_matrix import TINY
 
 REPOSITORY = Path(__file__).parents[1]
 PAGES = [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "baselines").rglob("README.md")]
@@ -27,23 +38,27 @@ def commands(page: Path) -> list[str]:
 SHOWN = [pytest.param(line, id=f"{page.stem}: {line[:60]}") for page in PAGES for line in commands(page)]
 
 
+def command_of(words: list[str]) -> list[str]:
+    """A command by its name under `manifeel`, where it has one, and its arguments."""
+    if words[:2] == ["python", "-m"] and words[2] in MODULES:
+        return [MODULES[words[2]], *words[3:]]
+    if training := re.fullmatch(r"(?:python|torchrun) .*baselines/(\w+)/train\.py (.*)", " ".join(words)):
+        return ["train", training[1], *training[2].split()]
+    return words[1:] if words[0] == "manifeel" and words[1] in cli.COMMANDS else words
+
+
 @pytest.mark.parametrize("line", SHOWN)
 def test_a_command_that_is_shown_is_one(line, capsys):
     words = shlex.split(line, comments=True)
-    if words[:2] == ["python", "-m"] and words[2] in MODULES:
-        words = ["manifeel", MODULES[words[2]], *words[3:]]
-    if words[0] == "python" and (training := re.fullmatch(r"baselines/(\w+)/train\.py", words[1])):
-        words = ["manifeel", "train", training[1], *words[2:]]
-    if words[0] == "manifeel" and words[1] in cli.COMMANDS:
-        tyro.cli(cli.form(words[1]), args=words[2:])  # leaves the process where a flag is not known
+    name, *arguments = command_of(words)
+    if name in cli.COMMANDS:
+        tyro.cli(cli.form(name), args=arguments)  # leaves the process where a flag is not known
     elif words[:2] == ["python", "-m"]:
         assert importlib.util.find_spec(words[2]), line
-    elif words[0] == "python":
-        assert (REPOSITORY / words[1]).is_file(), line
-    elif words[0] == "make":
+    elif name == "make":
         assert f"\n{words[1]}:" in (REPOSITORY / "Makefile").read_text(), line
     else:
-        assert words[0] in ("pip", "torchrun", "pytest", "wandb") or words[:2] == ["manifeel", "--help"], line
+        assert name == "pip" or words[:2] == ["manifeel", "--help"], line
 
 
 def test_the_site_builds_without_a_warning(tmp_path):
@@ -53,3 +68,109 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site/api/sensors/index.html").read_text()
     assert "TactileSensor" in page
+
+
+# -------------------------------------------------------------------- run, page by page
+
+SMALLER = {  # what follows a command, by its name or module: of a flag the last counts, and what takes hours takes seconds
+    "record": "-n 1 --cameras wrist --tactile-sensors right",
+    "dataset": "--num 10 --tasks ManiFeel-BallSorting-v1 --cameras front --tactile-sensors right --picture-size 64",
+    "materialize": "--num 1 --picture-size 64",
+    "replay": "--num 1",
+    "teleop": "--port 8137",
+    "view": "--save peg.rrd",
+    "train": "--steps 2 --batch-size 2 --image-size 64 --policy.encoder.image small_cnn --policy.encoder.crop 0 "
+    "--policy.channels 16 32 --device cpu --precision fp32 --no-compile",
+    "eval": "--episodes 2 --workers 1 --env-kwargs '{\"max_episode_steps\": 5}'",
+    "matrix": "--address local",
+    "similarity": "--features tests.evaluation.test_similarity:brightness --resamples 5",
+    "baselines.tactile_representations.pretrain": "--steps 1 --batch-size 2 --image-size 64",
+    "mani_skill.trajectory.replay_trajectory": "--count 1",
+}
+ENDLESS = ("teleop",)  # runs until it is interrupted
+
+
+@pytest.fixture(scope="module")
+def shelf(tmp_path_factory) -> Path:
+    """What pages take for granted: recordings, weights, pictures of a real sensor, a policy of one's own."""
+    shelf = tmp_path_factory.mktemp("shelf")
+    for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
+        states = REPOSITORY / f"data/sample/{task}/states.h5"
+        seen = dict(cameras=("wrist",), tactile_sensors=("right",), picture_size=64)
+        materialize.main(materialize.Args(states, shelf / f"{name}.h5", **seen, num=1))
+    for suffix in (".h5", ".json"):
+        shutil.copy(shelf / f"trajectory{suffix}", shelf / f"peg{suffix}")
+        shutil.copy(states.with_suffix(suffix), shelf)
+    (shelf / "real_pictures").mkdir()
+    with h5py.File(shelf / "trajectory.h5") as file:
+        for k, picture in enumerate(file["traj_0/obs/sensor_data/tactile_right/rgb"][:20]):
+            cv2.imwrite(str(shelf / f"real_pictures/{k}.png"), picture)
+    module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
+    (shelf / "my_module.py").write_text(module[1])
+    flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/diffusion_policy {SMALLER['train']}"
+    evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
+    diffusion.main(tyro.cli(cli.form("train"), args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated]))
+    network = T3()
+    (shelf / "t3_medium/encoders").mkdir(parents=True)
+    torch.save(network.encoder.state_dict(), shelf / "t3_medium/encoders/gs_green.pth")
+    torch.save(network.trunk.state_dict(), shelf / "t3_medium/trunk.pth")
+    return shelf
+
+
+@pytest.mark.slow
+@needs_renderer
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: f"{page.parent.name}/{page.stem}")
+def test_the_commands_of_a_page_run_one_after_the_other(page, shelf, tmp_path):
+    files = subprocess.check_output(["git", "ls-files"], cwd=REPOSITORY, text=True).splitlines()
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(REPOSITORY / file, tmp_path / file)
+    for study in (tmp_path / "configs").glob("*.yaml"):
+        study.write_text(TINY)  # the real ones are hours; tests/evaluation/test_matrix.py plans them
+    (tmp_path / ".venv").symlink_to(sys.prefix)
+    shown = commands(page)
+    for thing in shelf.iterdir():
+        makes_it = "train" if thing.name == "runs" else f"--out {thing.stem}."
+        if not any(makes_it in line for line in shown):
+            (shutil.copytree if thing.is_dir() else shutil.copy)(thing, tmp_path / thing.name)
+    for line in shown:
+        for command in _spelled_out(line, tmp_path):
+            _run(command, tmp_path)
+
+
+def _spelled_out(line: str, place: Path) -> list[str]:
+    """A line as it stands; of a make target, what it would run."""
+    if not line.startswith("make"):
+        return [re.sub(r"\s+#.*", "", line)]
+    said = subprocess.check_output(["make", "--dry-run", line.split()[1]], cwd=place, text=True)
+    return [part for part in said.replace("\\\n", " ").splitlines() if part.startswith(".venv/bin/python")]
+
+
+def _run(command: str, place: Path) -> None:
+    name, *arguments = command_of(shlex.split(command.replace(".venv/bin/python", "python")))
+    if name == "pip":  # tests/test_packaging.py
+        return
+    if name == "view" and not importlib.util.find_spec("rerun"):
+        return
+    name = arguments[1] if name == "python" and arguments[0] == "-m" else name
+    if name == "leaderboard" and arguments[0] == "submit":
+        _prepare_submission(place)
+    shown = f"{command} {SMALLER.get(name, '')}"
+    if name in ENDLESS:
+        shown = f"timeout --preserve-status --signal INT 60 {shown}"
+    path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", shown], cwd=place, env=os.environ | dict(PATH=path), capture_output=True, text=True, check=False
+    )
+    assert done.returncode == (130 if name in ENDLESS else 0), f"{shown}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+
+
+def _prepare_submission(place: Path) -> None:
+    """A policy that learnt nothing, and its 50 starts, of a few steps each."""
+    _run("python baselines/diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode tacff --run-dir runs/x", place)
+    (place / "my_submission").mkdir()
+    about = dict(name="Nothing learnt", authors="A page")
+    (place / "my_submission/submission.json").write_text(json.dumps(about))
+    few = json.dumps(dict(max_episode_steps=3, render_backend="none"))
+    arguments = ["--checkpoint", "runs/x/checkpoints/last", "--out", "my_submission/00000002.json", "--env-kwargs", few]
+    subprocess.run([sys.executable, "-m", "manifeel_ms3.evaluation.run", *arguments], cwd=place, check=True)

@@ -4,7 +4,9 @@ import os
 import subprocess
 import sys
 import tarfile
+import venv
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -60,3 +62,16 @@ def test_it_works_from_any_folder(wheel, tmp_path):
     assert refused.returncode == 1
     assert (site / "manifeel_ms3/data/troubleshooting.md").is_file()
     assert str(site) in refused.stderr.partition("more: ")[2]
+
+
+@pytest.mark.slow
+def test_it_installs_in_a_clean_environment(wheel, tmp_path):
+    """With all that it needs, from the registry: minutes, and 2 GB where torch comes without CUDA."""
+    venv.create(tmp_path / "env", with_pip=True)
+    programs = tmp_path / "env/bin"
+    torch = version("torch").partition("+")[0]
+    subprocess.run([programs / "pip", "install", "-q", str(wheel), f"torch=={torch}"], check=True)
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    for command in ([programs / "python", "-c", MAKE], [programs / "manifeel", "tasks"], [programs / "manifeel", "doctor"]):
+        done = subprocess.run(command, cwd=tmp_path, env=clean, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}"
