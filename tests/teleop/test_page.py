@@ -26,7 +26,8 @@ def address(tmp_path):
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, "--out", str(tmp_path / "human.h5"), "--port", str(port)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    heeding = ["env", "--default-signal=INT", *command]  # ignored by what a background job starts
+    process = subprocess.Popen(heeding, stderr=subprocess.PIPE, text=True)
     yield f"http://localhost:{port}"
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60)[1]
