@@ -42,8 +42,9 @@ def command_of(words: list[str]) -> list[str]:
     """A command by its name under `manifeel`, where it has one, and its arguments."""
     if words[:2] == ["python", "-m"] and words[2] in MODULES:
         return [MODULES[words[2]], *words[3:]]
-    if training := re.fullmatch(r"(?:python|torchrun) .*baselines/(\w+)/train\.py (.*)", " ".join(words)):
-        return ["train", training[1], *training[2].split()]
+    for k, word in enumerate(words):
+        if training := re.fullmatch(r"baselines/(\w+)/train\.py", word):
+            return ["train", training[1], *words[k + 1 :]]
     return words[1:] if words[0] == "manifeel" and words[1] in cli.COMMANDS else words
 
 
