@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import h5py
 import numpy as np
@@ -51,8 +52,9 @@ def main(args: Args) -> None:
     elif args.web:
         import rerun as rr  # pyright: ignore[reportMissingImports]
 
-        rr.serve_web_viewer(connect_to=recording.serve_grpc())
-        log.info("Ctrl-C ends it")
+        stream = recording.serve_grpc()
+        rr.serve_web_viewer(connect_to=stream)
+        log.info("http://localhost:9090/?url=%s\nCtrl-C ends it", quote(stream, safe=""))
         while True:
             time.sleep(1)
     else:
