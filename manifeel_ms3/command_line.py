@@ -14,6 +14,7 @@ from collections.abc import Callable
 from importlib.metadata import metadata, requires
 from importlib.util import find_spec
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from packaging.requirements import Requirement
@@ -44,6 +45,18 @@ def run(main: Callable[[Any], Any], args: Any) -> int:
         sys.stderr.write(f"error: {reason}\nmore: {troubleshooting()}, or {TRACEBACK}=1 for the place where it was raised\n")
         return 1
     return min(answer, 1) if isinstance(answer, int) else 0
+
+
+def point_to_the_page() -> None:
+    """After the traceback of an error that this package raised and nobody caught, name the page that says more."""
+    before = sys.excepthook
+
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        before(kind, error, trace)
+        if isinstance(error, Exception) and trace and _raised_here(error):
+            sys.stderr.write(f"more: {troubleshooting()}\n")
+
+    sys.excepthook = hook
 
 
 def _reason(error: Exception) -> str | None:

@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -48,6 +49,14 @@ def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, cap
     monkeypatch.setenv(TRACEBACK, "1")
     with pytest.raises(ValueError, match="fit='huge'"):
         run(refuse, None)
+
+
+@pytest.mark.parametrize(("mistake", "named"), [(f"gymnasium.make('{PEG}', obs_mode='smell')", True), ("1 / 0", False)])
+def test_an_error_that_nobody_catches_names_the_page_where_it_is_ours(mistake, named):
+    program = f"import gymnasium, manifeel_ms3; {mistake}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert "Traceback" in done.stderr
+    assert bool(re.search(r"\nmore: \S+troubleshooting\.md\n$", done.stderr)) == named
 
 
 def test_a_library_of_an_extra_is_named_with_the_extra(monkeypatch, capsys):
