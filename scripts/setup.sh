@@ -103,7 +103,7 @@ install_python_packages() {
       say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead"
   fi
   say "Installing the package and its extras"
-  "${pip[@]}" -e ".[train,report,lerobot,zarr,audit,matrix,teleop,view,docs,dev]"
+  "${pip[@]}" -e ".[train,report,lerobot,zarr,audit,matrix,teleop,spacemouse,gamepad,view,docs,dev]"
   # without libGL the opencv that mani-skill brings does not import; the headless one does
   .venv/bin/python -c 'import cv2' 2>/dev/null || "${pip[@]}" --force-reinstall --no-deps opencv-python-headless
 }

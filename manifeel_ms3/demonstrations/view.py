@@ -25,6 +25,7 @@ from .trajectory_file import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 STEP = "step"
+PORT = 9090
 FORCES = ("normal, N", "shear down the pad, N", "shear across the pad, N")  # of a whole pad
 
 
@@ -53,8 +54,8 @@ def main(args: Args) -> None:
         import rerun as rr  # pyright: ignore[reportMissingImports]
 
         stream = recording.serve_grpc()
-        rr.serve_web_viewer(connect_to=stream)
-        log.info("http://localhost:9090/?url=%s\nCtrl-C ends it", quote(stream, safe=""))
+        rr.serve_web_viewer(web_port=PORT, connect_to=stream)
+        log.info("http://localhost:%d/?url=%s\nCtrl-C ends it", PORT, quote(stream, safe=""))
         while True:
             time.sleep(1)
     else:

@@ -12,6 +12,7 @@ from .operator import Operator
 log = logging.getLogger(__name__)
 RATE = 200.0  # Hz: a SpaceMouse queues its readings, and what is read too seldom lags
 DEAD_ZONE = 0.08  # of full deflection
+SIX_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 NO_DEVICE = "no {name} was found: plug one in, or leave out --device; the page's keys and buttons work without"
 
 
@@ -34,32 +35,41 @@ def spacemouse() -> Iterator[Reading]:
     except ModuleNotFoundError as error:
         raise DeviceError("a SpaceMouse needs pip install 'manifeel-ms3[spacemouse]', and libhidapi") from error
     try:
-        mouse = pyspacemouse.open()
+        mouse = pyspacemouse.open(axis_convention="ros")  # x ahead, y left, z up, as the robot's base; right-handed turns
     except Exception as error:  # the library raises what hidapi does
         raise DeviceError(NO_DEVICE.format(name="SpaceMouse") + f" ({error})") from error
     while True:
         state = mouse.read()
-        turn = dict(roll=state.roll, pitch=state.pitch, yaw=-state.yaw)
-        yield Reading(dict(x=state.y, y=-state.x, z=state.z) | turn, bool(any(state.buttons)))
+        yield Reading({axis: getattr(state, axis) for axis in SIX_AXES}, any(state.buttons))
 
 
 def gamepad() -> Iterator[Reading]:
-    """Readings of the first gamepad: left stick x, y; right stick yaw, z; shoulders roll; first button the gripper."""
+    """Readings of the first gamepad: left stick x, y; right stick yaw, z; shoulders roll; lowest button the gripper.
+
+    By SDL's names of sticks and buttons, whose numbers are others from pad to pad and from system to system.
+    """
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, and the page is in the browser
     try:
         import pygame  # pyright: ignore
+        from pygame._sdl2 import controller  # pyright: ignore
     except ModuleNotFoundError as error:
         raise DeviceError("a gamepad needs pip install 'manifeel-ms3[gamepad]'") from error
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, and the page is in the browser
     pygame.display.init()
-    pygame.joystick.init()
-    if pygame.joystick.get_count() == 0:
+    controller.init()
+    found = [k for k in range(controller.get_count()) if controller.is_controller(k)]
+    if not found:
         raise DeviceError(NO_DEVICE.format(name="gamepad"))
-    pad = pygame.joystick.Joystick(0)
+    pad = controller.Controller(found[0])
+
+    def stick(name: str) -> float:
+        return pad.get_axis(getattr(pygame, f"CONTROLLER_AXIS_{name}")) / 32767
+
     while True:
         pygame.event.pump()
-        side, forth, turn, lift = (pad.get_axis(k) for k in (0, 1, 3, 4))
-        roll = pad.get_button(5) - pad.get_button(4)
-        yield Reading(dict(x=-forth, y=-side, z=-lift, yaw=-turn, roll=float(roll)), bool(pad.get_button(0)))
+        roll = pad.get_button(pygame.CONTROLLER_BUTTON_RIGHTSHOULDER) - pad.get_button(pygame.CONTROLLER_BUTTON_LEFTSHOULDER)
+        axes = dict(x=-stick("LEFTY"), y=-stick("LEFTX"), z=-stick("RIGHTY"), yaw=-stick("RIGHTX"), roll=float(roll))
+        yield Reading(axes, bool(pad.get_button(pygame.CONTROLLER_BUTTON_A)))
 
 
 DEVICES: dict[str, Callable[[], Iterator[Reading]]] = dict(spacemouse=spacemouse, gamepad=gamepad)

@@ -1,7 +1,6 @@
 """A person's wishes become episodes: on the real simulator, without a page."""
 
 import json
-import sys
 import threading
 import time
 from pathlib import Path
@@ -14,7 +13,6 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.teleop import session as module
-from manifeel_ms3.teleop.devices import DEVICES, DeviceError, Reading, follow
 from manifeel_ms3.teleop.operator import HOLD, Mode, Operator, Wish
 from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
@@ -189,18 +187,3 @@ def test_modes_follow_each_other():
     operator.begin()
     operator.start()
     assert operator.mode is Mode.CLOSED
-
-
-def test_a_device_pushes_beyond_its_dead_zone():
-    operator = Operator(AXES)
-    rest = Reading(dict(x=0.01, z=0.0), gripper=False)
-    readings = [rest, Reading(dict(x=0.5, z=0.05), gripper=True), Reading(dict(x=0.5, z=0.05), gripper=True)]
-    follow(iter(readings), operator).join()
-    assert operator.action() == pytest.approx([0.5 * operator.speed, 0, 0, 0, 0, 0, -1.0])
-
-
-@pytest.mark.parametrize(("device", "library"), [("spacemouse", "pyspacemouse"), ("gamepad", "pygame")])
-def test_a_device_whose_library_is_missing(monkeypatch, device, library):
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(DeviceError, match=rf"pip install 'manifeel-ms3\[{device}\]'"):
-        follow(DEVICES[device](), Operator(AXES))
