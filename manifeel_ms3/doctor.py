@@ -135,8 +135,9 @@ class _Ran:
 
 
 def _run(code: str) -> _Ran:
+    told = f"try: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
     try:
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE, check=False)
+        done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=PATIENCE, check=False)
     except subprocess.TimeoutExpired:
         return _Ran(False, "", f"no answer within {PATIENCE} s")
     last = (done.stdout.strip().splitlines() or [""])[-1]

@@ -32,6 +32,7 @@ def test_a_machine_without_a_renderer():
     assert done.returncode == 1
     lines = {line.split("│")[2].strip(): line for line in done.stdout.splitlines() if line.count("│") == 5}
     assert "wrong" in lines["a step with pictures"]
+    assert "RuntimeError: " in lines["a step with pictures"]
     assert "Mesa 24.3" in done.stdout
     assert "ok" in lines["a step with touch"]  # which needs no picture
 
