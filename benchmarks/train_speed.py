@@ -22,6 +22,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from baselines.common.dataset import Episode, SequenceDataset
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
+from baselines.common.memory import keep_freed_memory, lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
 from baselines.common.training import ON_GPU
 from baselines.common.unet import SequenceConv
@@ -93,7 +94,9 @@ def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> It
 
 def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
     """What `baselines.common.training` does between two logs."""
-    policy.to(memory_format=torch.channels_last)
+    if args.device == "cpu":
+        keep_freed_memory()
+    lay_out_channels_last(policy)
     if args.compile:
         policy.encoder.compile()
         policy.unet.compile()
@@ -138,9 +141,9 @@ def main(args: Args) -> None:
     table = Table("TacRGB encoder", "plain, img/s", "ours, img/s", "ratio", "ours, min/epoch", title=title)
     pictures = 2 * 2 * args.batch_size  # two sensors, two steps of observation
     batches = args.demos * args.demo_steps / args.batch_size
-    for tacrgb in args.tacrgb:
-        plain = seconds_a_step(args, plain_loop, tacrgb, plain_data=True)
-        ours = seconds_a_step(args, our_loop, tacrgb, plain_data=False)
+    plain_seconds = [seconds_a_step(args, plain_loop, tacrgb, plain_data=True) for tacrgb in args.tacrgb]
+    our_seconds = [seconds_a_step(args, our_loop, tacrgb, plain_data=False) for tacrgb in args.tacrgb]
+    for tacrgb, plain, ours in zip(args.tacrgb, plain_seconds, our_seconds, strict=True):
         row = (f"{pictures / plain:.1f}", f"{pictures / ours:.1f}", f"{plain / ours:.2f}", f"{batches * ours / 60:.1f}")
         table.add_row(tacrgb, *row)
     Console().print(table)

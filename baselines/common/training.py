@@ -32,6 +32,7 @@ from .checkpoint import (
 )
 from .dataset import SequenceDataset, read_episodes
 from .encoders import load_representations
+from .memory import keep_freed_memory, lay_out_channels_last
 from .policy import PolicyConfig, VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog
@@ -114,6 +115,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     """
     processes = Processes(args.device)
     device = processes.device
+    if device.type == "cpu":
+        keep_freed_memory()
     random.seed(args.seed)
     np.random.seed(args.seed)  # noqa: NPY002 (libraries draw from it)
     torch.manual_seed(args.seed)
@@ -132,7 +135,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     config |= dict(num_demos=dataset.num_episodes, num_samples=len(dataset))
 
     # policy, optimiser, schedule, EMA
-    policy = policy_class(args.policy, spec, action_dim).to(device, memory_format=torch.channels_last)
+    policy = policy_class(args.policy, spec, action_dim).to(device)
+    lay_out_channels_last(policy)
     if args.tacrgb_weights and not args.resume:
         load_representations(policy, args.tacrgb_weights)
     policy.fit_normalizers(dataset.observations, dataset.actions)

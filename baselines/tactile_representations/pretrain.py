@@ -20,6 +20,7 @@ import torch.nn.functional as F
 import tyro
 from safetensors.torch import save_file
 
+from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
@@ -64,6 +65,8 @@ def main(args: Args) -> list[float]:
     """
     torch.manual_seed(args.seed)
     pictures = torch.as_tensor(tacrgb_pictures(args.demos, args.image_size))
+    if args.device == "cpu":
+        keep_freed_memory()
     representation = REPRESENTATIONS[args.representation]().to(args.device)
     objective = VqganObjective(representation, args) if isinstance(representation, UniT) else MaeObjective(representation, args)
     losses = []

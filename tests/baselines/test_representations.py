@@ -8,7 +8,14 @@ import pytest
 import torch
 from transformers import CLIPVisionConfig, ViTConfig, ViTModel
 
-from baselines.common.encoders import EncoderConfig, ObservationEncoder, RepresentationEncoder, load_representations
+from baselines.common.encoders import (
+    TACRGB_ENCODERS,
+    EncoderConfig,
+    ObservationEncoder,
+    RepresentationEncoder,
+    load_representations,
+)
+from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
 from baselines.tactile_representations import pretrain
 from baselines.tactile_representations.anytouch import AnyTouch
@@ -300,3 +307,12 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
         ObservationEncoder(EncoderConfig(freeze_tacrgb=True), SPEC, 1)
     with pytest.raises(ValueError, match="no network takes them"):
         load_representations(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")
+
+
+@pytest.mark.parametrize("name", TACRGB_ENCODERS)
+def test_every_network_of_touch_can_be_laid_out_for_training(name):
+    with torch.device("meta"):
+        encoder = TACRGB_ENCODERS[name](224)
+    lay_out_channels_last(encoder)  # of weights of other ranks, a video's say, nothing is asked
+    laid_out = [p.is_contiguous(memory_format=torch.channels_last) for p in encoder.parameters() if p.dim() == 4]
+    assert all(laid_out)
