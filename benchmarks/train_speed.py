@@ -94,8 +94,7 @@ def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> It
 
 def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
     """What `baselines.common.training` does between two logs."""
-    if args.device == "cpu":
-        keep_freed_memory()
+    keep_freed_memory(args.device)
     lay_out_channels_last(policy)
     if args.compile:
         policy.encoder.compile()

@@ -9,12 +9,13 @@ import torch.nn as nn
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # mallopt(3)
 
 
-def keep_freed_memory() -> None:
-    """Let this process keep what it frees, on Linux with glibc.
+def keep_freed_memory(device: torch.device | str) -> None:
+    """Let this process keep what it frees, where it trains on the CPU, on Linux with glibc.
 
     glibc gives every large block back at once; the system clears it before it hands it out anew, at each step of training.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    concerned = torch.device(device).type == "cpu" and sys.platform == "linux"
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if concerned else None
     if mallopt:
         mallopt(M_MMAP_MAX, 0)
         mallopt(M_TRIM_THRESHOLD, -1)

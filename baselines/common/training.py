@@ -115,8 +115,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     """
     processes = Processes(args.device)
     device = processes.device
-    if device.type == "cpu":
-        keep_freed_memory()
+    keep_freed_memory(device)
     random.seed(args.seed)
     np.random.seed(args.seed)  # noqa: NPY002 (libraries draw from it)
     torch.manual_seed(args.seed)

@@ -65,8 +65,7 @@ def main(args: Args) -> list[float]:
     """
     torch.manual_seed(args.seed)
     pictures = torch.as_tensor(tacrgb_pictures(args.demos, args.image_size))
-    if args.device == "cpu":
-        keep_freed_memory()
+    keep_freed_memory(args.device)
     representation = REPRESENTATIONS[args.representation]().to(args.device)
     objective = VqganObjective(representation, args) if isinstance(representation, UniT) else MaeObjective(representation, args)
     losses = []
