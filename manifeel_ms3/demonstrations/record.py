@@ -99,7 +99,8 @@ def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[in
             if seed not in infos and seed not in failed:
                 if seed - args.seed >= args.max_tries * args.num:
                     raise RuntimeError(
-                        f"{len(failed)} of {seed - args.seed} seeds failed; the demonstrator does not cope with these arguments"
+                        f"{len(failed)} of {seed - args.seed} seeds failed, with no more to try: "
+                        f"see whether the demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
                     )
                 pending[pool.submit(_record_seed, seed)] = seed
             seed += 1

@@ -9,6 +9,7 @@ import json
 import logging
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -230,6 +231,7 @@ def probe(features: np.ndarray, truth: np.ndarray, episodes: np.ndarray, numeric
     A class by a support vector machine, a number by a Gaussian process; both on principal components.
     """
     from sklearn.decomposition import PCA
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     from sklearn.model_selection import GroupKFold, cross_val_predict
@@ -246,7 +248,10 @@ def probe(features: np.ndarray, truth: np.ndarray, episodes: np.ndarray, numeric
         pipeline = make_pipeline(components, GaussianProcessRegressor(kernel, normalize_y=True))
     else:
         pipeline = make_pipeline(StandardScaler(), components, SVC(C=10.0, class_weight="balanced"))
-    return cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS))
+    # no fault: a picture without change has no variance to share out, and a fit may end at its kernel's bounds
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS))
 
 
 def _score(truth: np.ndarray, guess: np.ndarray, episodes: np.ndarray, numeric: bool, resamples: int = 1000):

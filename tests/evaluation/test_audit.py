@@ -43,6 +43,14 @@ def test_probe_estimates_a_number():
     assert np.abs(audit.probe(features, angle, np.arange(80), numeric=True) - angle).max() < 1.0
 
 
+@pytest.mark.parametrize("numeric", [False, True])
+@pytest.mark.filterwarnings("error")
+def test_a_sensor_that_never_changes_is_no_better_than_chance_and_no_fault(numeric):
+    truth = np.tile([0.0, 1.0], 30)
+    guess = audit.probe(np.ones((60, 5)), truth, np.arange(60) // 2, numeric)
+    assert np.abs(guess - truth).mean() == pytest.approx(0.5, abs=0.01)
+
+
 def test_texture_shows_in_the_features():
     smooth = np.full((120, 160, 3), 128, np.uint8)
     rough = np.clip(128 + 20 * RNG.normal(size=smooth.shape), 0, 255).astype(np.uint8)
