@@ -34,7 +34,7 @@ $(RUN)/.trained: | $(DEMOS)
 	touch $@
 
 $(RUN)/evaluation.json: $(RUN)/.trained
-	$(PYTHON) -m manifeel_ms3.evaluation.run --checkpoint $(RUN)/checkpoints/last --episodes 10 --workers 2 \
+	$(PYTHON) -m manifeel_ms3.evaluation.evaluate --checkpoint $(RUN)/checkpoints/last --episodes 10 --workers 2 \
 		--out $@ --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/report.html: $(RUN)/evaluation.json
@@ -44,8 +44,8 @@ data: $(READY)
 	$(PYTHON) -m manifeel_ms3.demonstrations.dataset --workers $(WORKERS) --out data/demos
 
 benchmark-smoke: $(READY)
-	$(PYTHON) -m manifeel_ms3.evaluation.matrix configs/smoke.yaml --root runs/smoke
-	$(PYTHON) -m manifeel_ms3.evaluation.results --results runs/smoke --out runs/smoke/results.md
+	$(PYTHON) -m baselines.studies configs/smoke.yaml --root runs/smoke
+	$(PYTHON) -m manifeel_ms3.analysis.results_page --results runs/smoke --out runs/smoke/results.md
 
 test: $(READY)
 	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 12

@@ -15,14 +15,14 @@ from rich.console import Console
 from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.demonstrations.dataset import PAPER_COUNTS
-from manifeel_ms3.demonstrations.trajectory_file import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.paths import data_dir
+from manifeel_ms3.tasks.registry import all_tasks
 
 
 @dataclass
 class Args:
-    tasks: tuple[str, ...] = tuple(PAPER_COUNTS)
+    tasks: tuple[str, ...] = tuple(all_tasks())
     """tasks to time"""
 
 

@@ -17,8 +17,8 @@ from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
-from manifeel_ms3.sensors.raycast import MeshRays
-from manifeel_ms3.sensors.shader import KNOTS, Shader, fourier_terms, slope_terms
+from manifeel_ms3.sensors.depth.raycast import MeshRays
+from manifeel_ms3.sensors.optics.shader import KNOTS, Shader, fourier_terms, slope_terms
 from manifeel_ms3.sensors.touch_model import TouchModel
 from manifeel_ms3.sensors.warp_device import lend_torch_threads
 

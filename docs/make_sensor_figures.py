@@ -12,7 +12,7 @@ import torch
 import trimesh
 
 from manifeel_ms3.sensors import GelConfig, gelsight_r15, with_options
-from manifeel_ms3.sensors.raycast import MeshRays
+from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel
 from manifeel_ms3.sensors.visualisation import force_field_images
 from tests.sensors import shapes

@@ -11,8 +11,8 @@ import numpy as np
 from rich.progress import track
 
 from manifeel_ms3.demonstrations.episode import demonstrate
-from manifeel_ms3.experts import EXPERTS, make_expert
-from manifeel_ms3.tasks.names import short_name
+from manifeel_ms3.experts import make_expert
+from manifeel_ms3.tasks.registry import all_tasks, short_name
 
 IMAGES = Path(__file__).parent / "images"
 VIEWS = ("front", "side", "wrist", "tactile_left", "tactile_right")
@@ -46,7 +46,7 @@ def moment(task: str) -> np.ndarray:
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     rows = []
-    for name in track(EXPERTS, "tasks"):
+    for name in track(all_tasks(), "tasks"):
         row = moment(name)
         label = short_name(name)
         cv2.rectangle(row, (0, 0), (180, 24), (20, 20, 20), cv2.FILLED)

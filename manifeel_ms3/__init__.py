@@ -2,6 +2,3 @@
 
 from . import agents as agents
 from . import tasks as tasks
-from .command_line import point_to_the_page
-
-point_to_the_page()

@@ -5,12 +5,14 @@ from collections.abc import Iterable, Mapping
 from numbers import Real
 from typing import Any, TypeVar
 
+from .errors import InvalidArgumentError
+
 T = TypeVar("T")
 
 
 def one_of(name: str, given: T, allowed: Iterable[T]) -> T:
     if given not in list(allowed):
-        raise ValueError(f"{name}={given!r} is unknown; choose from {list(allowed)}")
+        raise InvalidArgumentError(f"{name}={given!r} is unknown; choose from {list(allowed)}")
     return given
 
 
@@ -22,7 +24,7 @@ def several_of(name: str, given: Any, allowed: Iterable[str]) -> tuple[str, ...]
 
 def by_name(name: str, given: Any, example: str) -> Mapping[str, Any]:
     if not isinstance(given, Mapping) or not all(isinstance(key, str) for key in given):
-        raise ValueError(f"{name}={given!r} must be a dict of values by name, like {example}")
+        raise InvalidArgumentError(f"{name}={given!r} must be a dict of values by name, like {example}")
     return given
 
 

@@ -4,44 +4,56 @@
     manifeel train diffusion_policy cpu --demos trajectory.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
-Each is a module that can be run by itself (`python -m`), with an `Args` and a `main` that takes it. Only the one that is asked
-for is imported; a shell's completion, though, knows the flags of all.
+Each command is a module with an `Args` and a `main` that takes it, and can be run by itself (`python -m`). Other packages add
+commands through the entry point group `manifeel.commands`. Only the command that is asked for is imported; a shell's
+completion, though, knows the flags of all.
 """
 
 import sys
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 from importlib import import_module
 from operator import or_
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from manifeel_ms3.command_line import run
+from manifeel_ms3 import plugins
+from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.errors import PluginError
 
-TRAIN = "train"
+
+@dataclass(frozen=True)
+class Command:
+    """A command of `manifeel`."""
+
+    module: str
+    """Module with the command's `Args`, a type that tyro can read, and its function `main(args)`."""
+    about: str
+    """What the command does, in a few words, for the list of all commands."""
+
+
 COMMANDS = {
-    "tasks": ("manifeel_ms3.tasks.__main__", "list the tasks, or say what one is"),
-    "doctor": ("manifeel_ms3.doctor", "what this machine can do, and how to mend what it cannot"),
-    "record": ("manifeel_ms3.demonstrations.record", "record a demonstrator"),
-    "teleop": ("manifeel_ms3.teleop.__main__", "record by hand, in a browser"),
-    "dataset": ("manifeel_ms3.demonstrations.dataset", "record the paper's number of demonstrations of every task"),
-    "replay": ("manifeel_ms3.demonstrations.replay", "run recorded actions again"),
-    "materialize": ("manifeel_ms3.demonstrations.materialize", "add observations to recorded states"),
-    "validate": ("manifeel_ms3.demonstrations.validate", "check recorded files"),
-    "view": ("manifeel_ms3.demonstrations.view", "look at a recorded episode"),
-    "summary": ("manifeel_ms3.demonstrations.summary", "what a recorded file holds"),
-    "export": ("manifeel_ms3.demonstrations.export", "write LeRobot, the paper's zarr, or npz"),
-    TRAIN: ("baselines", "train a policy"),
-    "eval": ("manifeel_ms3.evaluation.run", "evaluate a policy on fixed seeds"),
-    "report": ("manifeel_ms3.evaluation.report", "a page about one run"),
-    "matrix": ("manifeel_ms3.evaluation.matrix.__main__", "record, train and evaluate a whole study"),
-    "results": ("manifeel_ms3.evaluation.results", "a page of all that was run, beside the paper's figures"),
-    "claims": ("manifeel_ms3.evaluation.claims", "the paper's claims, from what was run"),
-    "leaderboard": ("manifeel_ms3.evaluation.leaderboard.__main__", "check a submission, build the page"),
-    "similarity": ("manifeel_ms3.evaluation.similarity", "how near simulated touch is to real touch"),
-    "audit": ("manifeel_ms3.evaluation.audit", "what each sense can tell in each task"),
+    "tasks": Command("manifeel_ms3.tasks.__main__", "List the tasks, or describe one of them."),
+    "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and say how to mend what it cannot."),
+    "record": Command("manifeel_ms3.demonstrations.record", "Record a scripted demonstrator."),
+    "teleop": Command("manifeel_ms3.teleop.__main__", "Record demonstrations by hand, in a browser."),
+    "dataset": Command("manifeel_ms3.demonstrations.dataset", "Record the paper's number of demonstrations of every task."),
+    "replay": Command("manifeel_ms3.demonstrations.replay", "Run recorded actions again."),
+    "render-observations": Command("manifeel_ms3.demonstrations.render_observations", "Add observations to recorded states."),
+    "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files."),
+    "view": Command("manifeel_ms3.demonstrations.view", "Look at a recorded episode in Rerun."),
+    "summary": Command("manifeel_ms3.demonstrations.summary", "Summarize what a recorded file holds."),
+    "export": Command(
+        "manifeel_ms3.demonstrations.export", "Write demonstrations for LeRobot, as the paper's zarr, or as npz."
+    ),
+    "eval": Command("manifeel_ms3.evaluation.evaluate", "Evaluate a policy on fixed seeds."),
+    "report": Command("manifeel_ms3.evaluation.report", "Write a page about one training run."),
+    "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's figures."),
+    "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on the results at hand."),
+    "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Check a submission, or build the leaderboard's page."),
+    "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how near simulated touch is to real touch."),
+    "audit": Command("manifeel_ms3.analysis.information_audit", "Measure what each sense can tell in each task."),
 }
 
 
@@ -51,41 +63,57 @@ class _NotImported:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command; returns the exit code.
+    """Run a command and return its exit code.
 
     Args:
-        arguments: default: those of the process.
+        arguments: The command's name and its arguments; those of the process if not given.
     """
     return run(_run, sys.argv[1:] if arguments is None else arguments)
 
 
+@cache
+def all_commands() -> dict[str, Command]:
+    """The package's own commands, then those of plug-ins, by their names.
+
+    Raises:
+        PluginError: A plug-in does not import, is not a `Command`, or has the name of one of the package's own commands.
+    """
+    commands = dict(COMMANDS)
+    for name in plugins.registered(plugins.COMMANDS):
+        command = plugins.load(plugins.COMMANDS, name)
+        if not isinstance(command, Command):
+            raise PluginError(f"the plug-in command {name!r} is {command!r}; it must be a manifeel_ms3.cli.Command")
+        if name in COMMANDS:
+            raise PluginError(
+                f"the plug-in command {name!r} ({command.module}) has the name of one of manifeel's own; rename it"
+            )
+        commands[name] = command
+    return commands
+
+
 def _run(arguments: list[str]) -> Any:
-    if arguments and arguments[0] in COMMANDS:
-        args = tyro.cli(form(arguments[0]), prog=f"manifeel {arguments[0]}", args=arguments[1:])
-    else:
-        wanted = any("-completion" in argument for argument in arguments)
-        forms = [_subcommand(name, form(name) if wanted else _NotImported, about) for name, (_, about) in COMMANDS.items()]
-        args = tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)
-    return import_module(type(args).__module__).main(args)
+    commands = all_commands()
+    if arguments and arguments[0] in commands:
+        name = arguments[0]
+        module = command_module(name)
+        return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
+    wanted = any("-completion" in argument for argument in arguments)
+    forms = [
+        Annotated[command_module(name).Args if wanted else _NotImported, tyro.conf.subcommand(name, description=command.about)]
+        for name, command in commands.items()
+    ]
+    tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)  # prints the list, a completion, or what is wrong
+    return None
 
 
-def form(command: str) -> Any:
-    """What tyro reads a command's arguments into."""
-    module = import_module(COMMANDS[command][0])
-    if command != TRAIN:
-        return module.Args
-    forms = []
-    for folder in sorted(path.parent for path in Path(module.__path__[0]).glob("*/train.py")):
-        train = import_module(f"baselines.{folder.name}.train")
-        presets = {name: args for name, (_, args) in train.PRESETS.items()}
-        about = {name: text for name, (text, _) in train.PRESETS.items()}
-        settings = tyro.extras.subcommand_type_from_defaults(presets, about)
-        forms.append(_subcommand(folder.name, settings, str(train.__doc__).partition("\n")[0]))
-    return reduce(or_, forms)
+def command_module(name: str) -> Any:
+    """The module of a command, with its `Args` and `main`.
 
-
-def _subcommand(name: str, form: Any, about: str) -> Any:
-    return Annotated[form, tyro.conf.subcommand(name, description=about)]
+    Raises:
+        MissingExtraError: The module needs an optional dependency that is not installed.
+    """
+    with missing_extras_named():
+        return import_module(all_commands()[name].module)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
 
-from manifeel_ms3.command_line import PACKAGE, run
+from .command_line import PACKAGE, run
 
 PYTHONS = ((3, 10), (3, 12))  # tested: the first and the last
 ROOM = 10.0  # GB: what the paper's demonstrations take, with observations
@@ -108,7 +108,7 @@ def _disk() -> Finding:
 
 
 def _cache() -> Finding:
-    from manifeel_ms3.paths import cache_dir
+    from .paths import cache_dir
 
     folder = cache_dir()
     try:

@@ -14,10 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from baselines.studies.study import read_study
 from manifeel_ms3 import cli
-from manifeel_ms3.demonstrations import summary, trajectory_file, validate
+from manifeel_ms3.demonstrations import summary, validate
+from manifeel_ms3.demonstrations.formats import maniskill_h5
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
-from manifeel_ms3.evaluation.matrix.study import read_study
 from manifeel_ms3.evaluation.result import read_result
 from tests.conftest import PEG
 
@@ -129,7 +130,7 @@ def mutated(tree, chance: random.Random, value):
 
 
 def read_demonstrations(path: Path) -> None:
-    trajectory_file.read_demonstrations(path, ["extra/tcp_pose"])
+    maniskill_h5.read_demonstrations(path, ["extra/tcp_pose"])
     summary.summary(path)
 
 
@@ -185,7 +186,7 @@ def test_trajectory_files(tmp_path, chance, how):
         assert str(path) in str(error)
 
 
-COMMANDS = sorted(set(cli.COMMANDS) - {"teleop", "doctor", "dataset"})  # those would start
+COMMANDS = sorted(set(cli.all_commands()) - {"teleop", "doctor", "dataset"})  # those would start
 WORDS = (*COMMANDS, PEG, "--out", "--workers", "-1", "nan", "{", "--num", "cpu")
 
 

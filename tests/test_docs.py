@@ -19,13 +19,13 @@ import tyro
 from baselines.diffusion_policy import train as diffusion
 from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
-from manifeel_ms3.demonstrations import materialize
+from manifeel_ms3.demonstrations import render_observations
+from tests.baselines.test_studies import TINY
 from tests.conftest import PEG, needs_renderer
-from tests.evaluation.test_matrix import TINY
 
 REPOSITORY = Path(__file__).parents[1]
 PAGES = [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "baselines").rglob("README.md")]
-MODULES = {module.removesuffix(".__main__"): name for name, (module, _) in cli.COMMANDS.items()}
+MODULES = {command.module.removesuffix(".__main__"): name for name, command in cli.all_commands().items()}
 
 
 def commands(page: Path) -> list[str]:
@@ -45,15 +45,15 @@ def command_of(words: list[str]) -> list[str]:
     for k, word in enumerate(words):
         if training := re.fullmatch(r"baselines/(\w+)/train\.py", word):
             return ["train", training[1], *words[k + 1 :]]
-    return words[1:] if words[0] == "manifeel" and words[1] in cli.COMMANDS else words
+    return words[1:] if words[0] == "manifeel" and words[1] in cli.all_commands() else words
 
 
 @pytest.mark.parametrize("line", SHOWN)
 def test_a_command_that_is_shown_is_one(line, capsys):
     words = shlex.split(line, comments=True)
     name, *arguments = command_of(words)
-    if name in cli.COMMANDS:
-        tyro.cli(cli.form(name), args=arguments)  # leaves the process where a flag is not known
+    if name in cli.all_commands():
+        tyro.cli(cli.command_module(name).Args, args=arguments)  # leaves the process where a flag is not known
     elif words[:2] == ["python", "-m"]:
         assert importlib.util.find_spec(words[2]), line
     elif name == "make":
@@ -84,7 +84,7 @@ SMALLER = {  # what follows a command, by its name or module: of a flag the last
     "--policy.channels 16 32 --device cpu --precision fp32 --no-compile",
     "eval": "--episodes 2 --workers 1 --env-kwargs '{\"max_episode_steps\": 5}'",
     "matrix": "--address local",
-    "similarity": "--features tests.evaluation.test_similarity:brightness --resamples 5",
+    "similarity": "--features tests.analysis.test_sim_real_similarity:brightness --resamples 5",
     "baselines.tactile_representations.pretrain": "--steps 1 --batch-size 2 --image-size 64",
     "mani_skill.trajectory.replay_trajectory": "--count 1",
 }
@@ -98,7 +98,7 @@ def shelf(tmp_path_factory) -> Path:
     for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
         states = REPOSITORY / f"data/sample/{task}/states.h5"
         seen = dict(cameras=("wrist",), tactile_sensors=("right",), picture_size=64)
-        materialize.main(materialize.Args(states, shelf / f"{name}.h5", **seen, num=1))
+        render_observations.main(render_observations.Args(states, shelf / f"{name}.h5", **seen, num=1))
     for suffix in (".h5", ".json"):
         shutil.copy(shelf / f"trajectory{suffix}", shelf / f"peg{suffix}")
         shutil.copy(states.with_suffix(suffix), shelf)
@@ -110,7 +110,9 @@ def shelf(tmp_path_factory) -> Path:
     (shelf / "my_module.py").write_text(module[1])
     flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/diffusion_policy {SMALLER['train']}"
     evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
-    diffusion.main(tyro.cli(cli.form("train"), args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated]))
+    diffusion.main(
+        tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
+    )
     network = T3()
     (shelf / "t3_medium/encoders").mkdir(parents=True)
     torch.save(network.encoder.state_dict(), shelf / "t3_medium/encoders/gs_green.pth")
@@ -127,7 +129,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, shelf, tmp_path):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(REPOSITORY / file, tmp_path / file)
     for study in (tmp_path / "configs").glob("*.yaml"):
-        study.write_text(TINY)  # the real ones are hours; tests/evaluation/test_matrix.py plans them
+        study.write_text(TINY)  # the real ones are hours; tests/baselines/test_studies.py plans them
     (tmp_path / ".venv").symlink_to(sys.prefix)
     shown = commands(page)
     for thing in shelf.iterdir():
@@ -172,4 +174,4 @@ def _prepare_submission(place: Path) -> None:
     (place / "my_submission/submission.json").write_text(json.dumps(about))
     few = json.dumps(dict(max_episode_steps=3, render_backend="none"))
     arguments = ["--checkpoint", "runs/x/checkpoints/last", "--out", "my_submission/00000002.json", "--env-kwargs", few]
-    subprocess.run([sys.executable, "-m", "manifeel_ms3.evaluation.run", *arguments], cwd=place, check=True)
+    subprocess.run([sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", *arguments], cwd=place, check=True)

@@ -9,7 +9,7 @@ from baselines.common.encoders import EncoderConfig
 from baselines.diffusion_policy import train
 from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
-from manifeel_ms3.evaluation import report, run
+from manifeel_ms3.evaluation import evaluate, report
 from manifeel_ms3.evaluation.result import ResultError
 from tests.conftest import PEG, needs_renderer
 
@@ -33,14 +33,14 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
         run_dir=tmp_path,
     )
     checkpoint = train.main(args)
-    result_file = run.main(run.Args(checkpoint, episodes=1, env_kwargs=TASK_ARGS))
+    result_file = evaluate.main(evaluate.Args(checkpoint, episodes=1, env_kwargs=TASK_ARGS))
     result = json.loads(result_file.read_text())
     assert result["env_id"] == PEG
     assert len(result["episodes"]) == 1
     assert result["success_once"]["low"] <= result["success_once"]["rate"] <= result["success_once"]["high"]
     assert set(result["versions"]) >= {"mani-skill", "sapien", "torch"}
     again = json.loads(
-        run.main(run.Args(checkpoint, out=tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text()
+        evaluate.main(evaluate.Args(checkpoint, out=tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text()
     )
     for name in ("success_once", "length", "peak_contact_force"):
         assert again["episodes"][0][name] == result["episodes"][0][name]

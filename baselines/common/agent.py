@@ -1,6 +1,5 @@
 """A trained policy as evaluation wants it: an environment's observations in, one action out."""
 
-import importlib
 import typing
 from collections import deque
 from dataclasses import fields, is_dataclass
@@ -17,22 +16,18 @@ from .checkpoint import WEIGHTS, load_weights, read_tensors
 from .observation import ObservationSpec, observation_spec, prepare
 from .policy import VisuotactilePolicy
 
-KIND = "baselines.common.agent:PolicyAgent"
 
-
-def build_policy(config: dict[str, Any]) -> VisuotactilePolicy:
-    """The untrained network of a checkpoint's config, whose "policy_class" reads "module:Class".
+def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
+    """The untrained network of a checkpoint's config.
 
     Raises:
-        CheckpointError: the config is not one of a policy of these baselines.
+        CheckpointError: The config is not one of this policy.
     """
     try:
-        module, _, name = config["policy_class"].partition(":")
-        policy_class = getattr(importlib.import_module(module), name)
         return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
-    except (KeyError, TypeError, ValueError, ImportError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"config is not one of a policy of these baselines ({error!r}); evaluate it with the code it was trained with"
+            f"config is not one of the policy {policy_class.name!r} ({error!r}); evaluate it with the code it was trained with"
         ) from error
 
 
@@ -55,14 +50,22 @@ class PolicyAgent:
     """Carries out `action_horizon` actions of a prediction, then predicts anew from the last `obs_horizon` observations.
 
     Args:
-        checkpoint: folder with config.json and model.safetensors.
+        checkpoint: Folder with config.json and model.safetensors.
+        policy_class: Class of the policy.
         inference_steps: of generation; None: as trained.
         seed: of the sampled noise; `reset` starts it anew, so that an episode depends on its observations alone.
     """
 
-    def __init__(self, checkpoint: Path, inference_steps: int | None = None, seed: int = 0, device: str = "cpu"):
+    def __init__(
+        self,
+        checkpoint: Path,
+        policy_class: type[VisuotactilePolicy],
+        inference_steps: int | None = None,
+        seed: int = 0,
+        device: str = "cpu",
+    ):
         self.config = checkpoint_config(checkpoint)
-        self.policy = build_policy(self.config).to(device).eval()
+        self.policy = build_policy(self.config, policy_class).to(device).eval()
         load_weights(self.policy, read_tensors(Path(checkpoint) / WEIGHTS), checkpoint)
         self.device, self.seed = torch.device(device), seed
         self.inference_steps = inference_steps or self.config["inference_steps"]

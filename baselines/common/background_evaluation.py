@@ -42,7 +42,7 @@ class BackgroundEvaluation:
 
     def _start(self, checkpoint: Path) -> tuple[Path, subprocess.Popen]:
         self.folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "manifeel_ms3.evaluation.run", "--checkpoint", str(checkpoint)]
+        command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--checkpoint", str(checkpoint)]
         command += ["--out", str(self._result(checkpoint)), *self._arguments]
         with self._result(checkpoint).with_suffix(".log").open("w") as output:
             return checkpoint, subprocess.Popen(command, stdout=output, stderr=output)

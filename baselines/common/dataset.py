@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from manifeel_ms3.demonstrations import DemonstrationError, lerobot, paper_zarr, read_demonstrations, read_header
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, read_header
+from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -46,8 +47,8 @@ def _format(file: Path, env_id: str) -> tuple[Callable[[Path], int], Callable[..
     """How episodes of a file are counted, and read."""
     if lerobot.is_lerobot(file):  # these two do not say of what task they are
         return lerobot.count_episodes, lerobot.read_lerobot
-    if paper_zarr.is_zarr(file):
-        return paper_zarr.count_episodes, paper_zarr.read_zarr
+    if diffusion_policy_zarr.is_zarr(file):
+        return diffusion_policy_zarr.count_episodes, diffusion_policy_zarr.read_zarr
     return lambda file: len(read_header(file)["episodes"]), partial(read_demonstrations, env_id=env_id)
 
 

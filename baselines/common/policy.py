@@ -1,6 +1,7 @@
 """What every policy shares: an observation encoder, normalisers, and how a prediction becomes actions."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 import torch.nn as nn
@@ -36,6 +37,8 @@ class VisuotactilePolicy(nn.Module):
     Subclasses define `generation_loss` and `generate`, and may make other networks of their own.
     """
 
+    name: ClassVar[str]
+    """Name under which the policy is registered (`baselines.registry`)."""
     Config = PolicyConfig
 
     def __init__(self, config: PolicyConfig, spec: ObservationSpec, action_dim: int):

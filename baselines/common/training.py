@@ -16,7 +16,7 @@ from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.progress import progress_bar
 
-from .agent import KIND, spec_of
+from .agent import spec_of
 from .background_evaluation import BackgroundEvaluation
 from .checkpoint import (
     TRAINING,
@@ -37,6 +37,7 @@ from .policy import PolicyConfig, VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog
 
+PAPER_EPOCHS = 50_000
 ON_GPU = torch.cuda.is_available()
 
 
@@ -105,6 +106,11 @@ FREE_ON_RESUME = {
 }
 
 
+def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:
+    """Number of gradient steps of the paper's public code: 50,000 epochs over all demonstrations, divided by their number."""
+    return round(PAPER_EPOCHS / num_demos) * math.ceil(num_samples / batch_size)
+
+
 def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     """Train, and return the last checkpoint.
 
@@ -128,9 +134,9 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     dataset = SequenceDataset(episodes, spec, args.policy.obs_horizon, args.policy.pred_horizon, device)
     batch_size = args.batch_size * processes.count
     steps_per_epoch = math.ceil(len(dataset) / batch_size)
-    total_steps = args.steps or steps_per_epoch * round(50_000 / dataset.num_episodes)
+    total_steps = args.steps or default_steps(dataset.num_episodes, len(dataset), batch_size)
     action_dim = dataset.actions.shape[1]
-    config |= dict(kind=KIND, policy_class=f"{policy_class.__module__}:{policy_class.__name__}", action_dim=action_dim)
+    config |= dict(policy_name=policy_class.name, action_dim=action_dim)
     config |= dict(num_demos=dataset.num_episodes, num_samples=len(dataset))
 
     # policy, optimiser, schedule, EMA

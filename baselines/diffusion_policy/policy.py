@@ -26,6 +26,7 @@ class DiffusionConfig(PolicyConfig):
 class DiffusionPolicy(VisuotactilePolicy):
     """Denoises an action sequence."""
 
+    name = "diffusion_policy"
     Config = DiffusionConfig
     config: DiffusionConfig
 

@@ -24,6 +24,7 @@ class EquivariantConfig(DiffusionConfig):
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):
+    name = "equivariant_diffusion_policy"
     Config = EquivariantConfig
     config: EquivariantConfig
 

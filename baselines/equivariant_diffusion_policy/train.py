@@ -10,12 +10,11 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
 from baselines.common.encoders import EncoderConfig
 from baselines.common.presets import for_cpu
-from baselines.common.training import TrainArgs, train
+from baselines.common.training import TrainArgs
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
+from baselines.registry import PolicySpec, Preset, preset_cli
 from manifeel_ms3.command_line import run
 
 
@@ -28,15 +27,17 @@ class Args(TrainArgs):
 
 
 PRESETS = {
-    "paper": ("the paper's hyperparameters", Args(demos=())),
-    "cpu": ("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, hidden=16)),
+    "paper": Preset("the paper's hyperparameters", Args(demos=())),
+    "cpu": Preset("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, hidden=16)),
 }
+
+SPEC = PolicySpec(EquivariantDiffusionPolicy, Args, PRESETS)
 
 
 def main(args: Args) -> Path:
     """Train, and return the last checkpoint."""
-    return train(args, EquivariantDiffusionPolicy)
+    return SPEC.train(args)
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.extras.overridable_config_cli(PRESETS)))
+    sys.exit(run(main, preset_cli(SPEC)))

@@ -32,6 +32,7 @@ class FlowConfig(PolicyConfig):
 class FlowMatchingPolicy(VisuotactilePolicy):
     """Learns the velocity v(x, t) at which noise (t = 0) flows into actions (t = 1)."""
 
+    name = "flow_matching"
     Config = FlowConfig
     config: FlowConfig
 

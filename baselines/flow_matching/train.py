@@ -12,11 +12,10 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
-
 from baselines.common.presets import for_cpu
-from baselines.common.training import TrainArgs, train
+from baselines.common.training import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
+from baselines.registry import PolicySpec, Preset, preset_cli
 from manifeel_ms3.command_line import run
 
 
@@ -29,16 +28,18 @@ class Args(TrainArgs):
 
 
 PRESETS = {
-    "paper": ("the paper's hyperparameters", Args(demos=())),
-    "consistency": ("for one-step generation", Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1)),
-    "cpu": ("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, prediction="sample")),
+    "paper": Preset("the paper's hyperparameters", Args(demos=())),
+    "consistency": Preset("for one-step generation", Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1)),
+    "cpu": Preset("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, prediction="sample")),
 }
+
+SPEC = PolicySpec(FlowMatchingPolicy, Args, PRESETS)
 
 
 def main(args: Args) -> Path:
     """Train, and return the last checkpoint."""
-    return train(args, FlowMatchingPolicy)
+    return SPEC.train(args)
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.extras.overridable_config_cli(PRESETS)))
+    sys.exit(run(main, preset_cli(SPEC)))

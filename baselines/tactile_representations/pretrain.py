@@ -24,7 +24,7 @@ from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.trajectory_file import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.progress import progress_bar
 
 from .anytouch import AnyTouch

@@ -14,7 +14,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
-from manifeel_ms3.sensors.wrench import WrenchGauge
+from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
 from .controllers import HoldGripperControllerConfig, LeashedEEPoseControllerConfig
 from .panda_gelsight_urdf import panda_gelsight_urdf

@@ -1,3 +1,3 @@
-from .trajectory_file import DemonstrationError as DemonstrationError
-from .trajectory_file import read_demonstrations as read_demonstrations
-from .trajectory_file import read_header as read_header
+from .formats.maniskill_h5 import DemonstrationError as DemonstrationError
+from .formats.maniskill_h5 import read_demonstrations as read_demonstrations
+from .formats.maniskill_h5 import read_header as read_header

@@ -8,7 +8,7 @@ where it stopped when the same command is given again.
 import hashlib
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,13 @@ from typing import Any
 import tyro
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import MachineError
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
-from . import materialize, record
-from .trajectory_file import DemonstrationError, finished_episodes, read_header, read_json, write_json
+from . import record, render_observations
+from .formats.maniskill_h5 import DemonstrationError, finished_episodes, read_header, read_json, write_json
 
 SCHEMA = "manifeel-demonstrations-1"
 MANIFEST = {  # what is read of a manifest, as a json schema
@@ -28,28 +30,13 @@ MANIFEST = {  # what is read of a manifest, as a json schema
     "required": ["schema", "files"],
     "properties": {"files": {"type": "object", "additionalProperties": {"type": "object"}}},
 }
-PAPER_COUNTS = {
-    "ManiFeel-PegInsertion-v1": 50,
-    "ManiFeel-USBInsertion-v1": 50,
-    "ManiFeel-PowerPlugInsertion-v1": 50,
-    "ManiFeel-GearAssembly-v1": 100,
-    "ManiFeel-NutBoltAssembly-v1": 30,
-    "ManiFeel-BulbInstallation-v1": 20,
-    "ManiFeel-PegReorientation-v1": 50,
-    "ManiFeel-ObjectSearch-v1": 50,
-    "ManiFeel-BallSorting-v1": 80,
-    "ManiFeel-BallSortingDim-v1": 80,
-}
-BYTES_A_DEMO = 13e6  # observed with everything, at most about
-BYTES_A_LONG_DEMO = 70e6
-LONG = ("ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1")  # 400 steps
 
 
 @dataclass
 class Args:
     out: Path = Path("data/demos")
     """folder to write"""
-    tasks: tuple[str, ...] = tuple(PAPER_COUNTS)
+    tasks: tuple[str, ...] = field(default_factory=lambda: tuple(all_tasks()))
     """tasks to record"""
     num: int | None = None
     """episodes a task; default: the paper's counts"""
@@ -70,11 +57,9 @@ def main(args: Args) -> Path:
 
     Raises:
         ValueError: a task that is not known.
-        OSError: the disk has no room for it.
+        MachineError: the disk has no room for it.
     """
-    counts = {task: args.num or PAPER_COUNTS.get(task, 0) for task in args.tasks}
-    if unknown := set(args.tasks) - set(PAPER_COUNTS):
-        raise ValueError(f"tasks {sorted(unknown)} are unknown; choose from {list(PAPER_COUNTS)}")
+    counts = {task: args.num or task_spec(task).paper_demos for task in args.tasks}
     observed = args.obs_mode != "none"
     args.out.mkdir(parents=True, exist_ok=True)
     _check_room(args, counts if observed else {})
@@ -94,7 +79,7 @@ def main(args: Args) -> Path:
             if observed:
                 bar.update(whole, description=f"observing {task}")
                 pictures = (args.obs_mode, args.cameras, args.tactile_sensors, args.picture_size)
-                materialize.main(materialize.Args(states, trajectory, *pictures, workers=args.workers), count)
+                render_observations.main(render_observations.Args(states, trajectory, *pictures, workers=args.workers), count)
             write_manifest(args.out)
     return args.out / "manifest.json"
 
@@ -102,9 +87,9 @@ def main(args: Args) -> Path:
 def _check_room(args: Args, counts: dict[str, int]) -> None:
     free = shutil.disk_usage(args.out).free
     pixels = ((args.picture_size or 256) / 256) ** 2
-    whole = sum(count * (BYTES_A_LONG_DEMO if task in LONG else BYTES_A_DEMO) for task, count in counts.items())
+    whole = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
     if (needed := whole * max(pixels, 0.2)) > free:
-        raise OSError(
+        raise MachineError(
             f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} episodes take up to {needed / 1e9:.1f}; give "
             "another --out, fewer --tasks or cameras, or --obs-mode none (what is there already is kept)"
         )
@@ -147,12 +132,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """A folder's manifest.
 
     Raises:
-        FileNotFoundError: there is none.
-        DemonstrationError: it is of another form, or of a newer version.
+        DemonstrationError: there is none, it is of another form, or of a newer version.
     """
     path = Path(folder) / "manifest.json"
     if not path.is_file():
-        raise FileNotFoundError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
+        raise DemonstrationError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
     manifest = read_json(path, MANIFEST, "a manifest")
     if (found := manifest["schema"]) != SCHEMA:
         raise DemonstrationError(f"{path} has the schema {found!r}, this version reads {SCHEMA!r}; update manifeel-ms3")

@@ -9,7 +9,7 @@ from mani_skill.utils import common
 
 from manifeel_ms3.experts import make_expert
 
-from .trajectory_file import Episode
+from .formats.maniskill_h5 import Episode
 
 
 def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:

@@ -14,9 +14,9 @@ import tyro
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
 
-from .lerobot import write_lerobot
-from .paper_zarr import write_zarr
-from .trajectory_file import DemonstrationError, each_demonstration, observed
+from .formats.diffusion_policy_zarr import write_zarr
+from .formats.lerobot import write_lerobot
+from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observed
 
 log = logging.getLogger(__name__)
 Format = Literal["lerobot", "zarr", "npz"]

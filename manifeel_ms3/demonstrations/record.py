@@ -21,12 +21,13 @@ import torch
 import tyro
 
 from manifeel_ms3.command_line import json_object, run
-from manifeel_ms3.experts import EXPERTS
+from manifeel_ms3.errors import WorkFailedError
+from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from .episode import demonstrate
-from .trajectory_file import (
+from .formats.maniskill_h5 import (
     DemonstrationError,
     consolidate,
     episode_folder,
@@ -66,8 +67,7 @@ class Args:
 
 def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     """Record, and return the file's path. `on_episode` is called after each episode, instead of a progress bar."""
-    if args.env_id not in EXPERTS:
-        raise ValueError(f"{args.env_id!r} has no demonstrator; there are ones for {sorted(EXPERTS)}")
+    require_demonstrator(args.env_id)
     path = args.out or Path("data/demos") / args.env_id / "trajectory.h5"
     env_kwargs = _env_kwargs(args)
     header = make_header(args.env_id, env_kwargs)
@@ -98,7 +98,7 @@ def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[in
         while len(infos) + len(pending) < args.num:
             if seed not in infos and seed not in failed:
                 if seed - args.seed >= args.max_tries * args.num:
-                    raise RuntimeError(
+                    raise WorkFailedError(
                         f"{len(failed)} of {seed - args.seed} seeds failed, with no more to try: "
                         f"see whether the demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
                     )

@@ -15,7 +15,7 @@ import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
 
-from .trajectory_file import open_trajectories, read_header
+from .formats.maniskill_h5 import open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from manifeel_ms3.command_line import run
 
-from .trajectory_file import open_trajectories, read_header
+from .formats.maniskill_h5 import open_trajectories, read_header
 
 BARS = " ▁▂▃▄▅▆▇█"
 WIDTH = 28  # characters of a sparkline

@@ -1,6 +1,5 @@
 """Check a set of demonstrations: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`."""
 
-import json
 import logging
 import sys
 from dataclasses import dataclass
@@ -12,12 +11,12 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import run
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 
 from .dataset import describe, read_manifest
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from .replay import replay
-from .trajectory_file import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 
@@ -49,9 +48,8 @@ def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
                 problems += [f"seed {episode['episode_seed']}: {what}" for what in _episode_problems(file, episode)]
     except (DemonstrationError, KeyError, OSError) as error:
         return [str(error)]
-    held_out = json.loads((data_dir() / "eval_seeds.json").read_text()).get(found["env_id"], [])
-    if shared := set(found["seeds"]) & set(held_out):
-        problems.append(f"seeds {sorted(shared)} are evaluation seeds")
+    if shared := [seed for seed in found["seeds"] if seed >= FIRST_EVALUATION_SEED]:
+        problems.append(f"seeds {sorted(shared)} are evaluation seeds; demonstrations use seeds below {FIRST_EVALUATION_SEED}")
     if len(set(found["seeds"])) < len(found["seeds"]):
         problems.append("a seed occurs twice")
     if num_replays:

@@ -21,7 +21,7 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.command_line import run
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .trajectory_file import DemonstrationError, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 STEP = "step"

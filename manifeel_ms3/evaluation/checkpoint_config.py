@@ -4,8 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from manifeel_ms3.errors import InvalidFileError
 
-class CheckpointError(ValueError):
+
+class CheckpointError(InvalidFileError):
     """A checkpoint that cannot be used as asked."""
 
 

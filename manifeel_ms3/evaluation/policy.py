@@ -8,6 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from manifeel_ms3 import plugins
+from manifeel_ms3.errors import ManifeelError, UnknownNameError
+
 from .checkpoint_config import CheckpointError, checkpoint_config
 
 
@@ -23,7 +26,7 @@ class Policy(Protocol):
         ...
 
 
-class PolicyError(ValueError):
+class PolicyError(ManifeelError, ValueError):
     """A policy that cannot be made."""
 
 
@@ -61,21 +64,23 @@ class PolicySource:
             ) from error
 
 
-def load_policy(checkpoint: Path, **kwargs) -> Policy:
-    """The policy of a checkpoint folder: its config.json names the class ("kind": "module:Class").
+def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:
+    """The policy of a checkpoint folder, whose config.json names it as it is registered in `manifeel.policies`.
 
     Raises:
-        CheckpointError: the folder is not a checkpoint, or its class cannot be found.
+        CheckpointError: The folder is not a checkpoint, or names no registered policy.
+        PluginError: The policy does not import.
     """
-    kind = str(checkpoint_config(checkpoint).get("kind", ""))
-    try:
-        policy_class = import_name(kind)
-    except (ImportError, AttributeError, ValueError) as error:
+    config = checkpoint_config(checkpoint)
+    if "policy_name" not in config:
         raise CheckpointError(
-            f"{checkpoint}: its policy is {kind!r}, which cannot be imported ({error}); it must read 'module:Class', and the "
-            "module must be installed"
-        ) from error
-    return policy_class(checkpoint, **kwargs)
+            f"{checkpoint} does not name its policy: it was written by manifeel-ms3 0.1.0 or is of another kind; train it again"
+        )
+    try:
+        plugin = plugins.load(plugins.POLICIES, str(config["policy_name"]))
+    except UnknownNameError as error:
+        raise CheckpointError(f"{checkpoint}: its policy is unknown: {error}; install the package that registers it") from error
+    return plugin.load(checkpoint, **kwargs)
 
 
 def import_name(name: str) -> Any:

@@ -22,9 +22,9 @@ import tyro
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
 
-from .film import Frame, record_episode, video
 from .policy import load_policy
 from .result import read_result
+from .video import Frame, record_episode, video
 
 log = logging.getLogger(__name__)
 STRIP_FRAMES = 8

@@ -10,17 +10,19 @@ from typing import Any
 import jsonschema
 import numpy as np
 
+from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.paths import data_dir
+from manifeel_ms3.tasks.registry import task_spec
 
-from .provenance import machine, task_hash
+from .provenance import machine
 from .rollout import EpisodeOutcome
 from .statistics import wilson_interval
 
-SCHEMA = "manifeel-evaluation-1"
+SCHEMA = "manifeel-evaluation-2"
 PATHS = ("demos", "run_dir", "tacrgb_weights")  # a config's, on the machine it was trained on
 
 
-class ResultError(ValueError):
+class ResultError(InvalidFileError):
     """A file that is not a result."""
 
 
@@ -39,12 +41,12 @@ def result_of(
         env_id=env_id,
         env_kwargs=env_kwargs,
         obs_mode=config["obs_mode"],
-        policy=config.get("policy_class", config["kind"]),
+        policy=config["policy_name"],
         training_seed=config.get("seed"),
         config=config,
         versions={name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")},
         git_commit=_git_commit(),
-        task_hash=task_hash(env_id),
+        revision=task_spec(env_id).revision,
         machine=machine(),
         **rates,
         mean_length=float(np.mean([outcome.length for outcome in outcomes])),
@@ -84,7 +86,7 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
     if not found:
         raise ResultError(
             f"{[str(folder) for folder in folders]} hold no results; train with --eval-episodes 50, or run "
-            "`python -m manifeel_ms3.evaluation.matrix`"
+            "`python -m baselines.studies`"
         )
     return [read_result(path) for path in found]
 

@@ -1,11 +1,13 @@
-"""Scripted demonstrators, one a task."""
+"""Scripted demonstrators. Importing this package attaches them to their tasks (`manifeel_ms3.tasks.registry`)."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import numpy as np
 
+from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.tasks import VisuotactileEnv
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
 from .ball_sorting import BallSortingExpert as BallSortingExpert
 from .insertion import GearExpert as GearExpert
@@ -22,26 +24,23 @@ class Expert(Protocol):
         ...
 
 
-EXPERTS: dict[str, Callable[[Any, int], Expert]] = {
-    "ManiFeel-PegInsertion-v1": InsertionExpert,
-    "ManiFeel-PegReorientation-v1": InsertionExpert,
-    "ManiFeel-USBInsertion-v1": InsertionExpert,
-    "ManiFeel-BallSorting-v1": BallSortingExpert,
-    "ManiFeel-BallSortingDim-v1": BallSortingExpert,
-    "ManiFeel-GearAssembly-v1": GearExpert,
-    "ManiFeel-BulbInstallation-v1": ScrewingExpert,
-    "ManiFeel-NutBoltAssembly-v1": ScrewingExpert,
-    "ManiFeel-ObjectSearch-v1": ObjectSearchExpert,
-    "ManiFeel-PowerPlugInsertion-v1": InsertionExpert,
-}
-
-
 def make_expert(env_id: str, env: VisuotactileEnv, seed: int) -> Expert:
-    """The demonstrator of a task.
+    """The demonstrator of a task, for the episode that the environment has just been reset to.
 
     Raises:
-        ValueError: the task has none.
+        UnknownNameError: The task is not registered, or has no demonstrator.
     """
-    if env_id not in EXPERTS:
-        raise ValueError(f"{env_id!r} has no demonstrator; there are ones for {sorted(EXPERTS)}")
-    return EXPERTS[env_id](env, seed)
+    return require_demonstrator(env_id)(env, seed)
+
+
+def require_demonstrator(env_id: str) -> Callable[[Any, int], Expert]:
+    """What makes the demonstrator of a task from an environment and a seed.
+
+    Raises:
+        UnknownNameError: The task is not registered, or has no demonstrator.
+    """
+    demonstrator = task_spec(env_id).demonstrator
+    if demonstrator is None:
+        known = [name for name, spec in all_tasks().items() if spec.demonstrator is not None]
+        raise UnknownNameError(f"{env_id!r} has no demonstrator; tasks with one are {known}")
+    return demonstrator

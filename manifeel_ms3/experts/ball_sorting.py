@@ -5,7 +5,8 @@ import numpy as np
 
 from manifeel_ms3.geometry.balls import SEAT_HEIGHT, SEAT_SPACING
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
-from manifeel_ms3.tasks.ball_sorting import BOWLS, BallSortingEnv
+from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS, BallSortingEnv
+from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills, seen
 
@@ -17,6 +18,7 @@ LIFT_BY = 0.12  # m
 IN_BOWL = 0.045  # m: tool height at which a ball hangs just over a bowl's floor
 
 
+@register_demonstrator("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1")
 class BallSortingExpert:
     """Sees two balls alike, guesses one, and decides on what TacRGB shows of the one it holds."""
 

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.tasks.insertion import InsertionEnv
+from manifeel_ms3.tasks.insertion.base import InsertionEnv
+from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills, seen
 
@@ -28,6 +29,9 @@ TWIST_GROWS = 50  # steps in which it swings as far again
 STRAIGHT = Rotation.identity()
 
 
+@register_demonstrator(
+    "ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1", "ManiFeel-PegReorientation-v1"
+)
 class InsertionExpert:
     """Knows the parts, sees roughly where the socket is, and finds the hole by touch.
 
@@ -166,6 +170,7 @@ class InsertionExpert:
             yield skills.command(command + move, skills.towards(twist * self._facing(STRAIGHT), STAND_UP_TURN))
 
 
+@register_demonstrator("ManiFeel-GearAssembly-v1")
 class GearExpert(InsertionExpert):
     """Puts the bore over the shaft like a plug into a socket, its rim hooked on the shaft's side."""
 

@@ -3,7 +3,8 @@
 import numpy as np
 
 from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR
-from manifeel_ms3.tasks.object_search import CONTAINER_XY, PLACES_X, ObjectSearchEnv
+from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY, PLACES_X, ObjectSearchEnv
+from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills
 
@@ -13,6 +14,7 @@ FELT = 3.0  # N on each pad: something is between the fingers
 LIFT_BY = 0.13  # m
 
 
+@register_demonstrator("ManiFeel-ObjectSearch-v1")
 class ObjectSearchExpert:
     """Knows the two places, guesses one, and goes by what the pads feel when it closes the fingers there."""
 

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.tasks.screwing import WOUND_UP, ScrewingEnv
+from manifeel_ms3.tasks.registry import register_demonstrator
+from manifeel_ms3.tasks.screwing.base import WOUND_UP, ScrewingEnv
 
 from .skills import DOWNWARD, Actions, Skills, position_rotation, seen
 
@@ -22,6 +23,7 @@ RUB, SLOW_TURN = 0.03, 0.02  # N m from which it turns slower; rad a step
 TIGHTEN = 0.16  # N m, at which it stops turning and holds
 
 
+@register_demonstrator("ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1")
 class ScrewingExpert:
     """Knows the parts, sees roughly where the axis is, and goes by the loads that the pads feel."""
 

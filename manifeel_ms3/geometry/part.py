@@ -16,7 +16,7 @@ from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.paths import cache_dir
-from manifeel_ms3.sensors.surfaces import give_relief
+from manifeel_ms3.sensors.depth.surfaces import give_relief
 
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
 """Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""

@@ -50,7 +50,7 @@ class OpticsConfig:
     """Height map to RGB."""
 
     calibration: Path = field(default_factory=lambda: data_dir() / "gelsight_r15_shader.npz")
-    """Coefficients of the compact shader (`manifeel_ms3.sensors.fit_shader`), or a table in Taxim's format, `polycalib.npz`."""
+    """Coefficients of the compact shader (`manifeel_ms3.sensors.optics.fit_shader`), or a table in Taxim's format, `polycalib.npz`."""
     smoothing: float = 1.0
     """Blur of the gel's surface, pixels (the reflective coat does not follow an edge)."""
     shadow: float = 0.0

@@ -7,11 +7,11 @@ from mani_skill.sensors.base_sensor import BaseSensor
 from mani_skill.utils.structs import Articulation
 
 from .config import TactileSensorConfig
-from .depth_camera import CameraDepth
-from .raycast import RaycastDepth
+from .depth.depth_camera import CameraDepth
+from .depth.raycast import RaycastDepth
+from .mechanics.wrench import WrenchGauge
 from .touch_model import OUTPUTS, TouchModel
 from .visualisation import force_field_images
-from .wrench import WrenchGauge
 
 
 class TactileSensor(BaseSensor):

@@ -7,10 +7,10 @@ import torch
 import torch.nn.functional as F
 
 from .config import TactileSensorConfig
-from .contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
-from .optics import Optics
-from .raycast import Window
-from .taxels import Taxels, tacsl_field
+from .depth.raycast import Window
+from .mechanics.contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
+from .mechanics.taxels import Taxels, tacsl_field
+from .optics.tacrgb import Optics
 from .warp_device import lend_torch_threads
 
 CONTACT_CELL = 3.5e-4  # m: a tenth of a millimetre of error in the contact's outline; 6,279 cells on the R1.5

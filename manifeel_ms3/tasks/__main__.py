@@ -5,16 +5,14 @@ import sys
 from dataclasses import dataclass
 from typing import Annotated
 
-import gymnasium as gym
 import tyro
-from mani_skill.utils.registration import REGISTERED_ENVS
 from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
 
 from manifeel_ms3.command_line import run
 
-from .names import PREFIX, SUFFIX, short_name
+from .registry import PREFIX, SUFFIX, all_tasks, task_spec
 
 
 @dataclass
@@ -27,21 +25,18 @@ def main(args: Args) -> None:
     """Print them.
 
     Raises:
-        ValueError: there is no such task.
+        UnknownNameError: there is no such task.
     """
-    tasks = {name: spec.cls for name, spec in REGISTERED_ENVS.items() if name.startswith(PREFIX)}
-    short = {short_name(name): name for name in tasks}
     if args.task is None:
-        table = Table("task", "steps", "camera", "what is to be done", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
-        for task, name in short.items():
-            cls = tasks[name]
-            table.add_row(task, str(gym.spec(name).max_episode_steps), ", ".join(cls.policy_cameras), _description(cls))
+        table = Table("task", "category", "steps", "camera", "what is to be done", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
+        for spec in all_tasks().values():
+            steps = str(spec.max_episode_steps)
+            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _description(spec.env_class))
         Console().print(table)
         return
-    name = short.get(args.task, args.task)
-    if name not in tasks:
-        raise ValueError(f"there is no task {args.task!r}; choose from {list(short)}")
-    Console().print(Markdown(f"# {name}\n\n{inspect.getdoc(tasks[name])}"))
+    by_name = {spec.name: env_id for env_id, spec in all_tasks().items()}
+    spec = task_spec(by_name.get(args.task, args.task))
+    Console().print(Markdown(f"# {spec.env_id}\n\n{inspect.getdoc(spec.env_class)}"))
 
 
 def _description(cls: type) -> str:

@@ -10,8 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from manifeel_ms3.demonstrations.episode import run_episode
-from manifeel_ms3.demonstrations.record import already_there, make_header
-from manifeel_ms3.demonstrations.trajectory_file import (
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import (
     Episode,
     consolidate,
     episode_folder,
@@ -19,6 +18,7 @@ from manifeel_ms3.demonstrations.trajectory_file import (
     write_episode,
     write_index,
 )
+from manifeel_ms3.demonstrations.record import already_there, make_header
 
 from .operator import Mode, Operator, Wish
 

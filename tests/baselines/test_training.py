@@ -16,11 +16,11 @@ from baselines.common.agent import PolicyAgent
 from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.encoders import EncoderConfig
-from baselines.common.references import MeanAction, Untrained
 from baselines.common.training import TrainArgs, TrainingError
 from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
+from baselines.references import MeanAction, Untrained
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from tests.conftest import PEG

@@ -8,10 +8,11 @@ import h5py
 import numpy as np
 import pytest
 
-from manifeel_ms3.demonstrations import DemonstrationError, dataset, materialize, record
-from manifeel_ms3.demonstrations.trajectory_file import read_header
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, record, render_observations
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.paths import data_dir
+from manifeel_ms3.tasks.registry import all_tasks
 from tests.conftest import PEG, needs_renderer
 
 SEARCH = "ManiFeel-ObjectSearch-v1"
@@ -71,7 +72,7 @@ def test_a_changed_action_is_found(folder, tmp_path):
     assert any("sha256" in problem for problem in problems)
     assert any("seed 1 does not come out as recorded" in problem for problem in problems)
     with pytest.raises(DemonstrationError, match="seed 1 .* does not come out as it was recorded"):
-        materialize.main(materialize.Args(copy / PEG / "states.h5", copy / "again.h5", "tacff", ()))
+        render_observations.main(render_observations.Args(copy / PEG / "states.h5", copy / "again.h5", "tacff", ()))
     with h5py.File(copy / "again.h5") as file:  # what was finished before is kept
         assert len(file) == 1
 
@@ -99,7 +100,7 @@ def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
         dataset.main(dataset.Args(tmp_path, (PEG,)))
     states = folder / PEG / "states.h5"
     with pytest.raises(ValueError, match="is the file that is read"):
-        materialize.main(materialize.Args(states, states))
+        render_observations.main(render_observations.Args(states, states))
 
 
 @needs_renderer
@@ -110,7 +111,9 @@ def test_materialised_observations_are_those_of_the_recording(tmp_path):
     bare = record.main(
         record.Args(SEARCH, 1, seed=3, out=tmp_path / "bare.h5", obs_mode="none", cameras=(), tactile_sensors=())
     )
-    again = materialize.main(materialize.Args(bare, tmp_path / "again.h5", cameras=("front",), tactile_sensors=("right",)))
+    again = render_observations.main(
+        render_observations.Args(bare, tmp_path / "again.h5", cameras=("front",), tactile_sensors=("right",))
+    )
     first, second = contents(direct), contents(again)
     assert set(first) == set(second)
     for name, values in first.items():
@@ -122,5 +125,5 @@ def test_sample_is_sound():
     """The sample in data/: two episodes of every task."""
     assert validate(data_dir() / "sample") == []
     files = json.loads((data_dir() / "sample" / "manifest.json").read_text())["files"]
-    assert {entry["env_id"] for entry in files.values()} == set(dataset.PAPER_COUNTS)
+    assert {entry["env_id"] for entry in files.values()} == set(all_tasks())
     assert all(len(entry["seeds"]) == 2 for entry in files.values())

@@ -9,8 +9,9 @@ import pytest
 
 from baselines.common.dataset import read_episodes
 from baselines.common.observation import observation_spec
-from manifeel_ms3.demonstrations import DemonstrationError, export, lerobot, paper_zarr, read_demonstrations
-from manifeel_ms3.demonstrations.trajectory_file import observed
+from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
+from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observed
 from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
 
@@ -70,23 +71,23 @@ def test_lerobots_own_reader_takes_it(tmp_path):
 
 def test_zarr_of_the_papers_layout(tmp_path):
     folder = exported("zarr", tmp_path)
-    assert paper_zarr.is_zarr(folder)
+    assert diffusion_policy_zarr.is_zarr(folder)
     assert (folder / "data/wrist/.zarray").is_file()  # format 2, which the paper's code reads
     assert {path.name for path in (folder / "data").iterdir() if path.is_dir()} == {
         *("wrist", "tactile_force_field_right", "state", "action")
     }
-    require_same(paper_zarr.read_zarr(folder, KEYS, 2), last_is_repeated=True)
+    require_same(diffusion_policy_zarr.read_zarr(folder, KEYS, 2), last_is_repeated=True)
 
 
 def test_pictures_of_touch_lie_as_in_the_papers_data():
     key = "sensor_data/tactile_right/rgb"
-    assert paper_zarr.array_name(key) == "right_tactile_camera_taxim"
+    assert diffusion_policy_zarr.array_name(key) == "right_tactile_camera_taxim"
     pictures = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), np.uint8)
-    theirs = paper_zarr._theirs(key, pictures)
+    theirs = diffusion_policy_zarr._theirs(key, pictures)
     assert theirs.shape == (3, 320, 240, 3)
     assert theirs.dtype == np.float32
     assert theirs.max() <= 1
-    assert np.array_equal(paper_zarr._ours(key, theirs), pictures)
+    assert np.array_equal(diffusion_policy_zarr._ours(key, theirs), pictures)
 
 
 def test_npz(tmp_path):
@@ -109,10 +110,10 @@ def test_what_is_there_or_broken_is_said(tmp_path):
     with pytest.raises(DemonstrationError, match="is there already"):
         export.main(export.Args(SAMPLE, "zarr", folder))
     with pytest.raises(DemonstrationError, match=r"lacks \['front'\]; it holds \['action'"):
-        paper_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1)
+        diffusion_policy_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1)
     for file in (folder / "meta").rglob("*"):
         if file.is_file():
             file.unlink()
     with pytest.raises(DemonstrationError, match="is no store of the paper's layout"):
-        paper_zarr.count_episodes(folder)
+        diffusion_policy_zarr.count_episodes(folder)
     assert not list(tmp_path.glob("*.partial"))

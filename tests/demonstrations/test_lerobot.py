@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.lerobot import count_episodes, feature_name, is_lerobot, read_lerobot
+from manifeel_ms3.demonstrations.formats.lerobot import count_episodes, feature_name, is_lerobot, read_lerobot
 
 pytest.importorskip("pyarrow")
 DATASETS = Path(__file__).with_name("lerobot")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
-from manifeel_ms3.demonstrations.trajectory_file import episode_folder, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import episode_folder, read_header
 from tests.conftest import PEG
 
 EASY = dict(fit="loose", render_backend="none")

@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.summary import sparkline, summary
-from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
 from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
 

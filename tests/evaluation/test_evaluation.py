@@ -5,8 +5,8 @@ import pytest
 
 from manifeel_ms3.evaluation import evaluate_episode
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.evaluate import evaluation_seeds
 from manifeel_ms3.evaluation.policy import load_policy
-from manifeel_ms3.evaluation.run import evaluation_seeds
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from tests.conftest import PEG

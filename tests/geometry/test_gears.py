@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry import gear_fit
 from manifeel_ms3.geometry.gears import BACKLASH, BASE_SIZE, MODULE, SHAFT_X, TEETH, gear_base, neighbour_gear, tooth_polygon
-from manifeel_ms3.tasks.gear_assembly import GearAssemblyEnv
+from manifeel_ms3.tasks.insertion.gear_assembly import GearAssemblyEnv
 from tests.sensors.bench import PadBench
 
 SPEED = 1.0  # rad/s

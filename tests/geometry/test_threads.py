@@ -6,19 +6,11 @@ import sapien
 import torch
 from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.geometry.screws import (
-    BOLT_FOOT,
-    BOLT_TURN,
-    E27,
-    M16,
-    NUT_HEIGHT,
-    NUT_MOUTH,
-    bulb_yaw,
-)
+from manifeel_ms3.geometry.screws import BOLT_FOOT, BOLT_TURN, E27, M16, NUT_HEIGHT, NUT_MOUTH, bulb_yaw
 from manifeel_ms3.geometry.threads import external_mesh, internal_mesh, iso_metric, ridge
-from manifeel_ms3.tasks.bulb_installation import BulbInstallationEnv
-from manifeel_ms3.tasks.nut_bolt_assembly import NutBoltAssemblyEnv
-from manifeel_ms3.tasks.screwing import ScrewingEnv
+from manifeel_ms3.tasks.screwing.base import ScrewingEnv
+from manifeel_ms3.tasks.screwing.bulb_installation import BulbInstallationEnv
+from manifeel_ms3.tasks.screwing.nut_bolt_assembly import NutBoltAssemblyEnv
 from tests.sensors.bench import PadBench
 
 

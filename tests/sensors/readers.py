@@ -4,8 +4,8 @@ import numpy as np
 from scipy.fft import dctn, idctn
 from scipy.ndimage import gaussian_filter
 
-from manifeel_ms3.sensors.shader import Shader, fourier_terms, place_terms, slope_terms
-from manifeel_ms3.sensors.taxim_table import portrait_place
+from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
+from manifeel_ms3.sensors.optics.taxim_table import portrait_place
 
 
 def gradients(surface: np.ndarray, pixel_size: float) -> tuple[np.ndarray, np.ndarray]:

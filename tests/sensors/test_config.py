@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.sensors import GelConfig, OpticsConfig, TouchRandomization, gelsight_mini, gelsight_r15, with_options
-from manifeel_ms3.sensors.shader import Shader
-from manifeel_ms3.sensors.taxim_table import read_table
+from manifeel_ms3.sensors.optics.shader import Shader
+from manifeel_ms3.sensors.optics.taxim_table import read_table
 
 
 @pytest.mark.parametrize(

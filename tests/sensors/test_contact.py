@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from manifeel_ms3.sensors.config import GelConfig
-from manifeel_ms3.sensors.contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
-from manifeel_ms3.sensors.taxels import Taxels, tacsl_field
+from manifeel_ms3.sensors.mechanics.contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
+from manifeel_ms3.sensors.mechanics.taxels import Taxels, tacsl_field
 
 GEL = GelConfig()
 GRID = ContactGrid.covering(GEL.size, 3.5e-4, torch.device("cpu"))

@@ -7,10 +7,11 @@ import trimesh
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
-from manifeel_ms3.sensors.surfaces import entity_mesh
+from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from tests.conftest import needs_renderer
-from tests.sensors import shapes
 from tests.sensors.bench import PadBench
+
+from . import shapes
 
 DEEP = 5e-4  # m into the gel
 BALL, ROD, WEDGE = 0.008, 0.006, 0.005  # radii, and half the side of a bar on its edge, m

@@ -6,7 +6,7 @@ import sapien
 import torch
 import trimesh
 
-from manifeel_ms3.sensors.contact import depth_below_face, solve_indentation
+from manifeel_ms3.sensors.mechanics.contact import depth_below_face, solve_indentation
 from tests.conftest import needs_renderer
 from tests.sensors.bench import PadBench
 from tests.sensors.press import Press, indenter

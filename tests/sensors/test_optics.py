@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from manifeel_ms3.sensors import gelsight_r15, with_options
-from manifeel_ms3.sensors.contact import ContactGrid
-from manifeel_ms3.sensors.fit_shader import Presses, main
-from manifeel_ms3.sensors.optics import Optics
-from manifeel_ms3.sensors.shader import Shader, fourier_terms, place_terms, slope_terms
-from manifeel_ms3.sensors.taxim_table import fit_table, portrait_place, read_table
+from manifeel_ms3.sensors.mechanics.contact import ContactGrid
+from manifeel_ms3.sensors.optics.fit_shader import Presses, main
+from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
+from manifeel_ms3.sensors.optics.tacrgb import Optics
+from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
 from tests.sensors.readers import photometric_stereo, ssim, table_change
 from tests.sensors.shapes import dimples
 

@@ -6,7 +6,7 @@ import torch
 import trimesh
 
 from manifeel_ms3.sensors import gelsight_r15, with_options
-from manifeel_ms3.sensors.raycast import MeshRays
+from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel
 
 CPU = torch.device("cpu")

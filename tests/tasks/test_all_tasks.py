@@ -1,23 +1,27 @@
 """What holds for every task."""
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-from manifeel_ms3.experts import EXPERTS
-from manifeel_ms3.paths import data_dir
+import manifeel_ms3.experts  # noqa: F401
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, all_tasks, evaluation_seeds
 
 TASKS = sorted(name for name in gym.registry if name.startswith("ManiFeel-"))
 
 
-def test_every_task_has_a_demonstrator_and_evaluation_seeds():
-    assert set(EXPERTS) == set(TASKS)
-    seeds = json.loads((data_dir() / "eval_seeds.json").read_text())
-    assert set(seeds) == set(TASKS)
-    assert all(len(set(s)) == 50 and min(s) >= 100_000 for s in seeds.values())
+def test_every_task_has_a_demonstrator():
+    assert set(all_tasks()) == set(TASKS)
+    assert all(spec.demonstrator is not None for spec in all_tasks().values())
+
+
+def test_evaluation_seeds_are_the_papers_and_disjoint_from_those_of_demonstrations():
+    assert evaluation_seeds(50) == list(range(100_000, 100_050))
+    assert min(evaluation_seeds(3)) >= FIRST_EVALUATION_SEED
+    with pytest.raises(InvalidArgumentError, match="at least 1"):
+        evaluation_seeds(0)
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -4,11 +4,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from manifeel_ms3.demonstrations.dataset import PAPER_COUNTS
 from manifeel_ms3.experts.skills import Skills
+from manifeel_ms3.tasks.registry import all_tasks
 
 pytestmark = pytest.mark.slow
-TASKS = sorted(PAPER_COUNTS)
+TASKS = sorted(all_tasks())
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit, reorientation_fit, usb_fit
 from manifeel_ms3.geometry.part import Hulls
 from manifeel_ms3.geometry.plugs import PEG_HOLES
-from manifeel_ms3.tasks.insertion import InsertionEnv
-from manifeel_ms3.tasks.peg_reorientation import PegReorientationEnv
+from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
+from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from tests.conftest import PEG
 
 FITS = {

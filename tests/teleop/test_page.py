@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.replay import replay
-from manifeel_ms3.demonstrations.trajectory_file import open_trajectories
 from tests.browser import Browser, browser_program, wait_until
 from tests.conftest import PEG, needs_renderer
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.demonstrations.replay import replay
-from manifeel_ms3.demonstrations.trajectory_file import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.teleop import session as module
 from manifeel_ms3.teleop.operator import HOLD, Mode, Operator, Wish
 from manifeel_ms3.teleop.session import Session

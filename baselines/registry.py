@@ -1,0 +1,89 @@
+"""The policies that can be trained, by their registered names.
+
+A policy is registered through the entry point group `manifeel.policies`; the baselines register theirs in `pyproject.toml` as
+another package would. A checkpoint names its policy by the registered name, and nothing that a checkpoint says is imported.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from manifeel_ms3 import plugins
+from manifeel_ms3.errors import PluginError, UnknownNameError
+
+from .common.agent import PolicyAgent
+from .common.policy import VisuotactilePolicy
+from .common.training import TrainArgs, train
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Settings of a training run to begin from."""
+
+    about: str
+    """What the settings are for, in a few words."""
+    args: TrainArgs
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """A policy that can be trained, evaluated and named by a study."""
+
+    policy_class: type[VisuotactilePolicy]
+    """The policy; its attribute `name` is the registered name."""
+    args_class: type[TrainArgs]
+    """Arguments of its training; a class of its own."""
+    presets: dict[str, Preset]
+    """Settings by name; the first is the paper's."""
+
+    @property
+    def name(self) -> str:
+        """The registered name, such as "diffusion_policy"."""
+        return self.policy_class.name
+
+    def train(self, args: TrainArgs) -> Path:
+        """Train, and return the last checkpoint."""
+        return train(args, self.policy_class)
+
+    def load(self, checkpoint: Path, **kwargs: Any) -> PolicyAgent:
+        """The trained policy of a checkpoint, as evaluation asks for it."""
+        return PolicyAgent(checkpoint, self.policy_class, **kwargs)
+
+
+def all_policies() -> dict[str, PolicySpec]:
+    """Every registered policy that these baselines can train, by its name.
+
+    Raises:
+        PluginError: A plug-in does not import, or is registered under another name than its own.
+    """
+    specs = {name: plugins.load(plugins.POLICIES, name) for name in plugins.registered(plugins.POLICIES)}
+    for name, spec in specs.items():
+        if isinstance(spec, PolicySpec) and spec.name != name:
+            raise PluginError(
+                f"the policy {spec.name!r} is registered as {name!r} in {plugins.POLICIES}; register it as {spec.name!r}"
+            )
+    return {name: spec for name, spec in specs.items() if isinstance(spec, PolicySpec)}
+
+
+def policy_spec(name: str) -> PolicySpec:
+    """A registered policy.
+
+    Raises:
+        UnknownNameError: No policy of this name can be trained; the message lists those that can.
+    """
+    if name not in (known := all_policies()):
+        raise UnknownNameError(f"the policy {name!r} is not registered; registered are {list(known)}")
+    return known[name]
+
+
+def preset_cli(spec: PolicySpec, args: list[str] | None = None) -> Any:
+    """Training arguments of a policy from the command line, which begins with a preset's name.
+
+    Args:
+        spec: The policy.
+        args: The arguments; those of the process if not given.
+    """
+    presets = {name: (preset.about, preset.args) for name, preset in spec.presets.items()}
+    return tyro.extras.overridable_config_cli(presets, args=args)

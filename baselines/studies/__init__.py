@@ -1,0 +1,1 @@
+"""Record, train and evaluate whatever a study combines; see `python -m baselines.studies --help`."""

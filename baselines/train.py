@@ -1,0 +1,35 @@
+"""Train any registered policy: `manifeel train diffusion_policy cpu --demos trajectory.h5`."""
+
+import sys
+from functools import reduce
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from baselines.common.training import TrainArgs
+from baselines.registry import PolicySpec, all_policies
+from manifeel_ms3.command_line import run
+
+
+def _form(spec: PolicySpec) -> Any:
+    """A policy's presets, as a subcommand that tyro can read."""
+    args = {name: preset.args for name, preset in spec.presets.items()}
+    about = {name: preset.about for name, preset in spec.presets.items()}
+    settings = tyro.extras.subcommand_type_from_defaults(args, about)
+    description = (spec.policy_class.__doc__ or "").partition("\n")[0]
+    return Annotated[settings, tyro.conf.subcommand(spec.name, description=description)]
+
+
+Args = reduce(or_, map(_form, all_policies().values()))
+
+
+def main(args: TrainArgs) -> Path:
+    """Train the policy that the arguments are of, and return the last checkpoint."""
+    (spec,) = [spec for spec in all_policies().values() if type(args) is spec.args_class]
+    return spec.train(args)
+
+
+if __name__ == "__main__":
+    sys.exit(run(lambda _: main(tyro.cli(Args)), None))

@@ -1,1 +1,0 @@
-"""Submissions, their checks, and the page that ranks them; see `python -m manifeel_ms3.evaluation.leaderboard --help`."""

@@ -1,0 +1,64 @@
+"""Plug-ins: tasks, policies and commands that installed packages add through entry points (`importlib.metadata`).
+
+A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows one of each group:
+
+    [project.entry-points."manifeel.policies"]
+    my_policy = "my_package.train:SPEC"
+
+Only what an installed package registers is ever imported: never a module that a file or a checkpoint names.
+"""
+
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+from .errors import PluginError, UnknownNameError
+
+TASKS = "manifeel.tasks"
+"""Modules that register tasks when they are imported (`manifeel_ms3.tasks.registry.register_task`)."""
+POLICIES = "manifeel.policies"
+"""Objects with a method `load(checkpoint, **kwargs)` that returns a `manifeel_ms3.evaluation.Policy`."""
+COMMANDS = "manifeel.commands"
+"""`manifeel_ms3.cli.Command` objects."""
+
+
+@cache
+def registered(group: str) -> dict[str, EntryPoint]:
+    """The entry points of a group by their names, in alphabetical order.
+
+    Raises:
+        PluginError: two packages register different objects under one name.
+    """
+    found: dict[str, EntryPoint] = {}
+    for point in sorted(entry_points(group=group), key=lambda point: point.name):
+        other = found.setdefault(point.name, point)
+        if other.value != point.value:
+            raise PluginError(
+                f"{group}: {point.name!r} is registered twice, by {_described(other)} and by {_described(point)}; "
+                "uninstall one of the two packages"
+            )
+    return found
+
+
+@cache
+def load(group: str, name: str) -> Any:
+    """The object that a plug-in registers.
+
+    Raises:
+        UnknownNameError: no plug-in of this name is registered.
+        PluginError: the plug-in does not import.
+    """
+    points = registered(group)
+    if name not in points:
+        raise UnknownNameError(f"{name!r} is not registered in {group}; registered are {list(points)}")
+    try:
+        return points[name].load()
+    except Exception as error:  # a plug-in is anybody's code
+        raise PluginError(
+            f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); mend or "
+            f"uninstall it. Registered in {group} are {list(points)}"
+        ) from error
+
+
+def _described(point: EntryPoint) -> str:
+    return f"{point.value} ({point.dist.name})" if point.dist else point.value

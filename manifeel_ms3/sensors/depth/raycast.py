@@ -1,0 +1,307 @@
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+# (warp reads a kernel's annotations as its own types)
+"""Depth from rays: the orthographic camera in the pad as warp rays against triangle meshes. Needs no renderer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import sapien
+import torch
+import trimesh
+import warp as wp
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
+from mani_skill.utils.structs import Actor, Link
+
+from manifeel_ms3.sensors.warp_device import launch_split, warp_device
+
+from .surfaces import scene_surfaces
+
+START = 4.2e-3  # m behind the face, where the rays start: the gel's back, deeper than any object comes
+REACH = 5.0e-3  # m in front of the face, where they end
+
+wp.set_module_options({"enable_backward": False})
+
+
+@dataclass
+class Window:
+    """Parts of a face worth looking at: `open` (N, rows, cols) bool, cells that cover a face of `size`, m."""
+
+    open: torch.Tensor
+    size: tuple[float, float]
+
+
+@wp.struct
+class Hit:
+    distance: float
+    place: int  # of the body in the list of near ones, -1 for none
+    normal: wp.vec3f  # body frame
+
+
+@wp.func
+def _nearest(
+    count: wp.array(dtype=wp.int32),
+    meshes: wp.array2d(dtype=wp.int64),
+    pad_in_body: wp.array2d(dtype=wp.transformf),
+    n: int,
+    at: wp.vec2f,
+    start: float,
+    end: float,
+) -> Hit:
+    nearest = Hit()
+    nearest.distance = start + end
+    nearest.place = -1
+    for k in range(count[n]):
+        pose = pad_in_body[n, k]
+        origin = wp.transform_point(pose, wp.vec3f(at[0], at[1], -start))
+        ahead = wp.transform_vector(pose, wp.vec3f(0.0, 0.0, 1.0))
+        hit = wp.mesh_query_ray(wp.uint64(meshes[n, k]), origin, ahead, nearest.distance)
+        if hit.result:
+            nearest.distance = hit.t
+            nearest.place = k
+            nearest.normal = hit.normal
+    return nearest
+
+
+@wp.kernel
+def _approach(
+    body: wp.array2d(dtype=wp.transformf),  # (N, B), world
+    pad: wp.array(dtype=wp.transformf),  # (N,), world
+    ids: wp.array2d(dtype=wp.int64),  # (N, B), 0 for none
+    low: wp.array2d(dtype=wp.vec3f),  # (N, B), the mesh's box
+    high: wp.array2d(dtype=wp.vec3f),
+    middle: wp.vec3f,  # of the box that the rays sweep, pad frame
+    half: wp.vec3f,
+    count: wp.array(dtype=wp.int32),  # (N,)
+    near: wp.array2d(dtype=wp.int32),  # (N, B), and from here on: of the `count` bodies near enough to matter
+    meshes: wp.array2d(dtype=wp.int64),
+    pad_in_body: wp.array2d(dtype=wp.transformf),
+):
+    """List the bodies whose box meets the swept box, boxed along the body's axes."""
+    n = wp.tid()
+    found = int(0)
+    for b in range(ids.shape[1]):
+        pose = wp.transform_multiply(wp.transform_inverse(body[n, b]), pad[n])
+        centre = wp.transform_point(pose, middle)
+        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+        meets = ids[n, b] != wp.int64(0)
+        for axis in range(3):
+            extent = wp.dot(wp.abs(rotation[axis]), half)
+            meets = meets and centre[axis] + extent > low[n, b][axis] and centre[axis] - extent < high[n, b][axis]
+        if meets:
+            near[n, found] = b
+            meshes[n, found] = ids[n, b]
+            pad_in_body[n, found] = pose
+            found += 1
+    count[n] = found
+
+
+@wp.kernel
+def _cast(
+    first: int,
+    count: wp.array(dtype=wp.int32),
+    meshes: wp.array2d(dtype=wp.int64),
+    pad_in_body: wp.array2d(dtype=wp.transformf),
+    grid: wp.array(dtype=wp.vec2f),  # (C,), pad frame
+    window: wp.array3d(dtype=wp.bool),  # (N, rows, cols), may be empty: look everywhere
+    size: wp.vec2f,
+    start: float,
+    end: float,
+    height: wp.array2d(dtype=wp.float32),  # (N, C)
+):
+    n, c = wp.tid()
+    c += first
+    at = grid[c]
+    rows = window.shape[1]
+    cols = window.shape[2]
+    if rows > 0:
+        row = wp.clamp(int((at[0] / size[0] + 0.5) * float(rows)), 0, rows - 1)
+        col = wp.clamp(int((at[1] / size[1] + 0.5) * float(cols)), 0, cols - 1)
+        if not window[n, row, col]:
+            height[n, c] = -end
+            return
+    height[n, c] = start - _nearest(count, meshes, pad_in_body, n, at, start, end).distance
+
+
+@wp.kernel
+def _cast_moving(
+    count: wp.array(dtype=wp.int32),
+    meshes: wp.array2d(dtype=wp.int64),
+    pad_in_body: wp.array2d(dtype=wp.transformf),
+    near: wp.array2d(dtype=wp.int32),
+    twist: wp.array2d(
+        dtype=wp.spatial_vectorf
+    ),  # (N, B): velocity of the pad's origin, and spin, of pad against body, pad frame
+    grid: wp.array(dtype=wp.vec2f),
+    start: float,
+    end: float,
+    height: wp.array2d(dtype=wp.float32),
+    velocity: wp.array2d(dtype=wp.vec2f),
+):
+    n, c = wp.tid()
+    hit = _nearest(count, meshes, pad_in_body, n, grid[c], start, end)
+    height[n, c] = start - hit.distance
+    velocity[n, c] = wp.vec2f(0.0)
+    if hit.place >= 0:
+        normal = wp.transform_vector(wp.transform_inverse(pad_in_body[n, hit.place]), hit.normal)
+        motion = twist[n, near[n, hit.place]]
+        point = wp.vec3f(grid[c][0], grid[c][1], hit.distance - start)
+        v = wp.spatial_top(motion) + wp.cross(wp.spatial_bottom(motion), point)
+        v -= wp.dot(v, normal) * normal
+        velocity[n, c] = wp.vec2f(v[0], v[1])
+
+
+class MeshRays:
+    """Rays from N pads to B meshes each.
+
+    Args:
+        meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are kept once. Bodies and pads lie
+            at the origin until `move`.
+        size: of the pads' face, m.
+    """
+
+    def __init__(self, meshes: Sequence[Sequence[trimesh.Trimesh | None]], size: tuple[float, float], device: torch.device):
+        self.device = device
+        shape = (len(meshes[0]), len(meshes))
+        ids, low, high = torch.zeros(shape, dtype=torch.int64), torch.zeros(*shape, 3), torch.zeros(*shape, 3)
+        self._meshes: dict[bytes, wp.Mesh] = {}
+        for b, row in enumerate(meshes):
+            for n, mesh in enumerate(row):
+                if mesh is not None:
+                    ids[n, b] = self._upload(mesh).id
+                    low[n, b], high[n, b] = torch.tensor(mesh.bounds, dtype=torch.float32)
+        self._boxes = [t.to(device) for t in (ids, low, high)]
+        self._swept = wp.vec3f(0.0, 0.0, (REACH - START) / 2), wp.vec3f(size[0] / 2, size[1] / 2, (REACH + START) / 2)
+        self._count = torch.zeros(shape[0], dtype=torch.int32, device=device)
+        self._near = torch.zeros(shape, dtype=torch.int32, device=device)
+        self._near_ids = torch.zeros(shape, dtype=torch.int64, device=device)
+        self._near_poses = torch.zeros(*shape, 7, device=device)
+        self._everywhere = torch.zeros(0, 0, 0, dtype=torch.bool, device=device)
+
+        at_origin = torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device)
+        self.move(at_origin.expand(*shape, 7), at_origin.expand(shape[0], 7))
+
+    def _upload(self, mesh: trimesh.Trimesh) -> wp.Mesh:
+        key = mesh.vertices.tobytes() + mesh.faces.tobytes()
+        if key not in self._meshes:
+            device = warp_device(self.device)
+            self._meshes[key] = wp.Mesh(
+                points=wp.array(mesh.vertices, dtype=wp.vec3f, device=device),
+                indices=wp.array(mesh.faces.flatten(), dtype=wp.int32, device=device),
+            )
+        return self._meshes[key]
+
+    def move(self, bodies: torch.Tensor, pads: torch.Tensor) -> None:
+        """Put the bodies (N, B, 7) and the pads (N, 7): world poses, m and xyzw."""
+        ids, low, high = self._boxes
+        inputs = [_transforms(bodies), _transforms(pads), ids, _vectors(low), _vectors(high), *self._swept]
+        outputs = [self._count, self._near, self._near_ids, _transforms(self._near_poses)]
+        self._launch(_approach, self._count.shape, inputs, outputs)
+
+    def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH where none."""
+        height = torch.empty(len(self._near), len(grid), device=self.device)
+        where, size = (self._everywhere, (1.0, 1.0)) if window is None else (window.open, window.size)
+        inputs = [*self._found(), wp.from_torch(grid, dtype=wp.vec2f), wp.from_torch(where), wp.vec2f(*size), START, REACH]
+        launch_split(_cast, tuple(height.shape), inputs, [wp.from_torch(height)], self.device)
+        return height
+
+    def sliding(self, grid: torch.Tensor, twist: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Heights as above, and the pads' velocity (N, C, 2), m/s, along what they face there.
+
+        `twist` (N, B, 6): velocity of the pad's origin and its spin, m/s and rad/s, against each body, in the pad's frame.
+        """
+        height = torch.empty(len(self._near), len(grid), device=self.device)
+        velocity = torch.empty(*height.shape, 2, device=self.device)
+        motion = wp.from_torch(twist.contiguous(), dtype=wp.spatial_vectorf)
+        inputs = [*self._found(), self._near, motion, wp.from_torch(grid, dtype=wp.vec2f), START, REACH]
+        self._launch(_cast_moving, height.shape, inputs, [height, wp.from_torch(velocity, dtype=wp.vec2f)])
+        return height, velocity
+
+    def _found(self) -> list:
+        return [wp.from_torch(self._count), wp.from_torch(self._near_ids), _transforms(self._near_poses)]
+
+    def _launch(self, kernel, dim: tuple[int, ...], inputs: list, outputs: list) -> None:
+        arguments = [[wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in group] for group in (inputs, outputs)]
+        wp.launch(kernel, dim=tuple(dim), inputs=arguments[0], outputs=arguments[1], device=warp_device(self.device))
+
+
+def _transforms(poses: torch.Tensor) -> wp.array:
+    return wp.from_torch(poses.contiguous(), dtype=wp.transformf)
+
+
+def _vectors(vectors: torch.Tensor) -> wp.array:
+    return wp.from_torch(vectors, dtype=wp.vec3f)
+
+
+class RaycastDepth:
+    """What is near one pad of a scene's robot: height over points of its face, and how it slides there.
+
+    Args:
+        scene: all its actors and links are felt, but for `excluded` links.
+        pad: link that carries the pad.
+        pad_pose: the pad frame in that link's frame.
+        size: of the face, m.
+    """
+
+    def __init__(self, scene: ManiSkillScene, pad: Link, pad_pose: sapien.Pose, size: tuple[float, float], excluded: set[str]):
+        self.pad, self.device = pad, scene.device
+        self._pad_pose = pad_pose
+        self.surfaces = scene_surfaces(scene, excluded)
+        self._rays = MeshRays([_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces], size, scene.device)
+        self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
+        self._world[..., 3] = 1.0
+        self._moving = [b for b, surface in enumerate(self.surfaces) if not _is_static(surface.body)]
+        self._take_poses(range(len(self.surfaces)))
+
+    def _take_poses(self, indices) -> None:
+        for b in indices:
+            self._world[self.surfaces[b].env_idx, b] = self.surfaces[b].body.pose.raw_pose
+
+    def look(self) -> None:
+        """Take the poses of now."""
+        self._take_poses(self._moving)
+        self._pad_world = (self.pad.pose * self._pad_pose).raw_pose
+        self._rays.move(_xyzw(self._world), _xyzw(self._pad_world))
+
+    def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH where none is, or where
+        the window is not open."""
+        return self._rays.heights(grid, window)
+
+    def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Heights (N, C) everywhere, and the velocity (N, C, 2), m/s, pad frame, of the pad along what it faces."""
+        to_pad = quaternion_to_matrix(self._pad_world[:, 3:]).transpose(1, 2)[:, None]
+        origin = self._pad_world[:, :3]
+        pad_linear, pad_spin = _motion(self.pad, origin)
+        twist = torch.zeros(*self._world.shape[:2], 6, device=self.device)
+        for b, surface in enumerate(self.surfaces):
+            env = surface.env_idx
+            linear, spin = _motion(surface.body, origin[env])
+            twist[env, b] = torch.cat([pad_linear[env] - linear, pad_spin[env] - spin], dim=-1)
+        return self._rays.sliding(grid, (to_pad @ twist.unflatten(-1, (2, 3))[..., None])[..., 0].flatten(-2))
+
+
+def _by_env(env_idx: torch.Tensor, meshes: list[trimesh.Trimesh], num_envs: int) -> list[trimesh.Trimesh | None]:
+    row: list[trimesh.Trimesh | None] = [None] * num_envs
+    for env, mesh in zip(env_idx.tolist(), meshes, strict=True):
+        row[env] = mesh
+    return row
+
+
+def _is_static(body: Actor | Link) -> bool:
+    return isinstance(body, Actor) and body.px_body_type == "static"
+
+
+def _motion(body: Actor | Link, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Velocity of the body's point that is now at `at` (n, 3), and its spin: m/s and rad/s, (n, 3) each, world frame."""
+    if _is_static(body):
+        return torch.zeros_like(at), torch.zeros_like(at)
+    spin, pose = body.angular_velocity, body.pose.raw_pose
+    centre = torch.tensor(body._bodies[0].cmass_local_pose.p, device=at.device)  # the engine's velocity is the mass centre's
+    centre = pose[:, :3] + (quaternion_to_matrix(pose[:, 3:]) @ centre)
+    return body.linear_velocity + torch.linalg.cross(spin, at - centre), spin
+
+
+def _xyzw(pose: torch.Tensor) -> torch.Tensor:
+    return pose[..., [0, 1, 2, 4, 5, 6, 3]]

@@ -1,0 +1,121 @@
+"""Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.optics.fit_shader {table,presses} ...`.
+
+From a table in Taxim's format, or from presses of a ball of known radius: a folder with `background.png` (untouched gel), the
+pictures, and `presses.csv`, whose lines say `file,row,col,radius`: the contact circle in pixels.
+"""
+
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import tyro
+
+from manifeel_ms3.command_line import run
+
+from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
+from .taxim_table import fit_table, read_table
+
+RIDGE = 1e-6  # of the mean diagonal: slopes and places that no press reached stay at zero
+
+
+@dataclass
+class Table:
+    """Fit to a polycalib.npz in Taxim's format."""
+
+    table: Path
+    """npz with grad_r, grad_g, grad_b, each (bins, bins, 6)"""
+    out: Path
+    image_shape: tuple[int, int] = (240, 320)
+    """rows and columns of our picture, the table's on its side"""
+
+
+@dataclass
+class Presses:
+    """Fit to pictures of ball presses."""
+
+    folder: Path
+    ball_radius: float
+    """m"""
+    pixel_size: float
+    """m per pixel"""
+    out: Path
+
+
+def fit_presses(
+    background: np.ndarray, pictures: np.ndarray, circles: np.ndarray, ball_radius: float, pixel_size: float
+) -> Shader:
+    """Shader of a gel from presses of a ball.
+
+    Within a contact circle the gel has the ball's shape, so that every pixel there is a sample of slope, direction and place.
+
+    Args:
+        background: (H, W, 3), RGB, untouched gel.
+        pictures: (P, H, W, 3), RGB, of presses.
+        circles: (P, 3), row, column and radius of the contact, pixels.
+        ball_radius: m.
+        pixel_size: m per pixel.
+
+    Raises:
+        ValueError: a contact circle larger than the ball, or pictures of different shapes.
+    """
+    rows, cols = background.shape[:2]
+    if pictures.shape[1:] != background.shape:
+        raise ValueError(f"pictures have shape {pictures.shape[1:]}, the background {background.shape}; they must be the same")
+    if (circles[:, 2] * pixel_size >= ball_radius).any():
+        raise ValueError(f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball: mend radius or pixel_size")
+    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
+    place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
+    columns = FOURIER_TERMS * (len(KNOTS) - 1) * PLACE_TERMS
+    normal, right = np.zeros((columns, columns)), np.zeros((columns, 3))
+    for picture, (middle_row, middle_col, radius) in zip(pictures, circles, strict=True):
+        y, x = (row - middle_row) * pixel_size, (col - middle_col) * pixel_size
+        r2 = x * x + y * y
+        inside = r2 < (radius * pixel_size) ** 2
+        slope = np.sqrt(r2[inside] / (ball_radius**2 - r2[inside]))
+        phi = np.arctan2(-x[inside], -y[inside])  # uphill, into the gel, is towards the middle
+        design = np.einsum("nf,nk,nq->nfkq", fourier_terms(phi), slope_terms(slope), place[inside]).reshape(-1, columns)
+        normal += design.T @ design
+        right += design.T @ (picture[inside].astype(float) - background[inside])
+    weights = np.linalg.solve(normal + RIDGE * np.trace(normal) / columns * np.eye(columns), right)
+    flat = np.linalg.lstsq(place.reshape(-1, PLACE_TERMS), background.reshape(-1, 3).astype(float), rcond=None)[0]
+    return Shader(weights.T.reshape(3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS), flat.T)
+
+
+def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Background, pictures and circles of a folder, as `fit_presses` takes them.
+
+    Raises:
+        ValueError: a file is missing or cannot be read.
+    """
+    listing = folder / "presses.csv"
+    if not listing.is_file():
+        raise ValueError(f"{listing} does not exist; it must say file,row,col,radius of every press")
+    with listing.open(newline="") as lines:
+        presses = list(csv.DictReader(lines))
+    if not presses or set(presses[0]) < {"file", "row", "col", "radius"}:
+        raise ValueError(f"{listing} must have the columns file, row, col, radius and at least one press")
+    circles = np.array([[float(press[name]) for name in ("row", "col", "radius")] for press in presses])
+    return _picture(folder / "background.png"), np.stack([_picture(folder / p["file"]) for p in presses]), circles
+
+
+def _picture(path: Path) -> np.ndarray:
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise ValueError(f"{path} is missing or no picture")
+    return picture[..., ::-1]
+
+
+def main(args: Table | Presses) -> None:
+    if isinstance(args, Table):
+        shader = fit_table(read_table(args.table), args.image_shape)
+    else:
+        shader = fit_presses(*read_presses(args.folder), args.ball_radius, args.pixel_size)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    shader.save(args.out)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, tyro.cli(Table | Presses)))

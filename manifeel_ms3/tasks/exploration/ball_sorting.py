@@ -1,0 +1,148 @@
+"""ManiFeel-BallSorting-v1 and ManiFeel-BallSortingDim-v1"""
+
+from dataclasses import dataclass
+
+import sapien
+import torch
+from mani_skill.utils.geometry.rotation_conversions import random_quaternions
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
+from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
+from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose
+from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
+
+STAND_XY = (0.5, 0.0)  # m, nominal
+START_XYZ = (0.5, 0.0, 0.17)  # m
+LIFTED = 0.10  # m above its seat
+IN_PLACE = 0.010  # m from its seat
+PAD_END = 0.021  # m under the tool, and some air
+BOWLS = {"golf": ((0.40, 0.19), (0.90, 0.45, 0.10)), "tennis": ((0.40, -0.19), (0.15, 0.35, 0.75))}  # xy, m; orange, blue
+GOALS = ("lift", "bowls")
+
+
+@dataclass
+class Randomization:
+    """Half ranges of the uniform distributions; the default of the stand is the paper's."""
+
+    stand_xy: float = 0.05
+    """m, each axis"""
+    start_xy: float = 0.05
+    """m, each axis"""
+    start_z: float = 0.02
+    """m"""
+
+
+@register_task(
+    "ManiFeel-BallSorting-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("II", "III")
+)
+class BallSortingEnv(VisuotactileEnv):
+    """
+    **Task Description:**
+    A table-tennis ball and a golf ball of the same size and colour sit on a stand. The gripper lifts the golf ball and leaves
+    the other: which is which, only touch can tell. The golf ball's 336 dimples are there for the pads, and not for the cameras.
+
+    **Randomizations:** (half ranges; the argument `randomization` overrides them)
+    - stand: xy +-50 mm around (0.5, 0) m; the balls swap seats with even chances; the golf ball is turned at random
+    - gripper start: 170 mm above the table, xy +-50 mm, z +-20 mm; open
+
+    **Success Conditions:** held for 0.5 s
+    - the golf ball is 100 mm or more above its seat
+    - the table-tennis ball is in its own (10 mm)
+
+    **Fail Conditions:** a ball lies on the table.
+
+    `goal="bowls"` is the paper's task on the real robot: the golf ball goes into an orange bowl and the other into a blue one.
+    """
+
+    Randomization = Randomization
+    policy_cameras = ("front",)
+    default_control_mode = "pd_ee_delta_pose"
+    front_camera_at = (0.80, 0.0, 0.15)
+
+    def __init__(self, *args, goal: str = "lift", **kwargs):
+        self.goal = one_of("goal", goal, GOALS)
+        super().__init__(*args, **kwargs)
+
+    def _largest_ranges(self):
+        lowest = SEAT_HEIGHT + BALL_RADIUS + PAD_END
+        return dict(
+            stand_xy=(REACH_XY - SEAT_SPACING / 2, OUT_OF_REACH),
+            start_xy=(REACH_XY, OUT_OF_REACH),
+            start_z=(height_range(START_XYZ[2], lowest), "the fingers would start in the balls, or out of reach"),
+        )
+
+    def _load_task(self):
+        if self.goal == "bowls":
+            for name, ((x, y), colour) in BOWLS.items():
+                bowl(f"{name}_bowl", colour).build(self.scene, "static", sapien.Pose([x, y, 0]))
+        self.stand = ball_stand().build(self.scene, "kinematic", sapien.Pose([*STAND_XY, 0]))
+        self.golf = golf_ball().build(self.scene, "dynamic", sapien.Pose([0.45, 0, 0.1]))
+        self.tennis = tennis_ball().build(self.scene, "dynamic", sapien.Pose([0.55, 0, 0.1]))
+        self.swapped = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+
+    def _initialize_task(self, env_idx: torch.Tensor):
+        n, ranges = len(env_idx), self.randomization
+        stand = torch.tensor([*STAND_XY, 0.0]).repeat(n, 1)
+        stand[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.stand_xy
+        self.stand.set_pose(Pose.create_from_pq(stand))
+        swapped = torch.rand(n) < 0.5
+        self.swapped[env_idx] = swapped
+        side = torch.where(swapped, 1.0, -1.0)[:, None] * torch.tensor([0.0, SEAT_SPACING / 2, 0.0])
+        seat = stand + torch.tensor([0.0, 0.0, SEAT_HEIGHT])
+        self.golf.set_pose(Pose.create_from_pq(seat + side, random_quaternions(n, device=self.device)))
+        self.tennis.set_pose(Pose.create_from_pq(seat - side))
+        start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
+        self.agent.reset_tool(start)
+
+    def _seats(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where the golf ball's and the other's centres belong, (N, 3), m."""
+        middle = self.stand.pose.p + torch.tensor([0.0, 0.0, SEAT_HEIGHT], device=self.device)
+        side = torch.where(self.swapped, 1.0, -1.0)[:, None] * torch.tensor([0.0, SEAT_SPACING / 2, 0.0], device=self.device)
+        return middle + side, middle - side
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        golf_seat, tennis_seat = self._seats()
+        return dict(
+            golf_height=self.golf.pose.p[:, 2] - golf_seat[:, 2],  # m, over its seat
+            tennis_away=torch.linalg.norm(self.tennis.pose.p - tennis_seat, dim=1),  # m, from its seat
+        ) | {f"{name}_to_bowl": self._to_bowl(name) for name in BOWLS if self.goal == "bowls"}
+
+    def _to_bowl(self, ball: str) -> torch.Tensor:
+        """Distance (N,), m, of a ball from where it would lie in the middle of its bowl."""
+        middle = torch.tensor([*BOWLS[ball][0], BOWL_FLOOR + BALL_RADIUS], device=self.device)
+        return torch.linalg.norm(getattr(self, ball).pose.p - middle, dim=1)
+
+    def goal_reached(self, measures):
+        if self.goal == "bowls":
+            return (measures["golf_to_bowl"] < BOWL_RADIUS) & (measures["tennis_to_bowl"] < BOWL_RADIUS)
+        return (measures["golf_height"] > LIFTED) & (measures["tennis_away"] < IN_PLACE)
+
+    def failed(self, measures):
+        lowest = torch.minimum(self.golf.pose.p[:, 2], self.tennis.pose.p[:, 2])
+        return lowest < BALL_RADIUS + 0.005  # on the table
+
+    def _privileged_state(self):
+        return dict(golf_pose=self.golf.pose.raw_pose, tennis_pose=self.tennis.pose.raw_pose)
+
+    def compute_dense_reward(self, obs, action, info):
+        """In [0, 4]: 1 for reaching the golf ball, 1 for lifting it, 1 for leaving the other, 1 for success.
+
+        With bowls: 1.5 for each ball's way to its own, 1 for success.
+        """
+        if self.goal == "bowls":
+            near = [1 - torch.tanh(4 * info[f"{name}_to_bowl"]) for name in BOWLS]
+            return 1.5 * (near[0] + near[1]) + info["success"].float()
+        reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.golf.pose.p, dim=1))
+        lifted = (info["golf_height"] / LIFTED).clamp(0.0, 1.0)
+        return reach + lifted + (info["tennis_away"] < IN_PLACE).float() + info["success"].float()
+
+
+@register_task("ManiFeel-BallSortingDim-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("I",))
+class BallSortingDimEnv(BallSortingEnv):
+    """BallSorting at 5 % of the light."""
+
+    def __init__(self, *args, lighting: str = "dim", **kwargs):
+        super().__init__(*args, lighting=lighting, **kwargs)

@@ -1,0 +1,105 @@
+"""ManiFeel-ObjectSearch-v1"""
+
+from dataclasses import dataclass
+
+import sapien
+import torch
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR, CONTAINER_OUTER, CONTAINER_WALL, battery, container
+from manifeel_ms3.tasks.placement import height_range, start_pose
+from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
+
+CONTAINER_XY = (0.5, 0.0)  # m
+PLACES_X = (-0.075, 0.075)  # m from the container's middle
+START_XYZ = (0.5, 0.0, 0.23)  # m
+HAND, LOWEST = 0.08, 0.07  # m: half of the hand's width; of the tool over the table, clear of the battery
+LIFTED = 0.10  # m above where it lies
+
+
+@dataclass
+class Randomization:
+    """Half ranges of the uniform distributions."""
+
+    place_xy: float = 0.005
+    """m, each axis, around the place drawn"""
+    start_xy: float = 0.03
+    """m, each axis"""
+    start_z: float = 0.02
+    """m"""
+
+
+@register_task(
+    "ManiFeel-ObjectSearch-v1", max_episode_steps=400, category="exploration", paper_demos=50, paper_tables=("I", "II", "III")
+)
+class ObjectSearchEnv(VisuotactileEnv):
+    """
+    **Task Description:**
+    A battery block, a cube of 25 mm, lies in one of two places on the floor of an opaque container, 322 x 281 x 161 mm, that
+    the policy's camera, in front of it, cannot look into. The gripper finds it by touch and lifts it.
+
+    **Randomizations:** (the argument `randomization` overrides the half ranges)
+    - battery: one of two places, 150 mm apart along x, with even chances; +-5 mm
+    - gripper start: 230 mm above the table, over the container, xy +-30 mm, z +-20 mm; open
+
+    **Success Conditions:** held for 0.5 s
+    - the battery is 100 mm or more above the container's floor
+
+    **Fail Conditions:** the battery is outside the container and not lifted.
+
+    `occlusion=False` leaves the container's front undrawn.
+    """
+
+    Randomization = Randomization
+    policy_cameras = ("front",)
+    default_control_mode = "pd_ee_delta_pose"
+    has_occluder = True
+    max_reward = 3.0
+    front_camera_at = (0.80, 0.0, 0.15)
+
+    def _largest_ranges(self):
+        to_wall = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - PLACES_X[1] - BATTERY_SIZE / 2
+        to_hand = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - HAND
+        return dict(
+            place_xy=(to_wall, "the battery would start in the container's wall"),
+            start_xy=(to_hand, "the hand would start in the container's wall"),
+            start_z=(height_range(START_XYZ[2], LOWEST), "the fingers would start in the battery, or out of reach"),
+        )
+
+    def _load_task(self):
+        self.container = container(self.occlusion).build(self.scene, "static", sapien.Pose([*CONTAINER_XY, 0]))
+        self.battery = battery().build(self.scene, "dynamic", sapien.Pose([*CONTAINER_XY, 0.05]))
+        self.place = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
+
+    def _initialize_task(self, env_idx: torch.Tensor):
+        n, ranges = len(env_idx), self.randomization
+        self.place[env_idx] = torch.randint(2, (n,))
+        position = torch.zeros(n, 3)
+        position[:, 0] = CONTAINER_XY[0] + torch.tensor(PLACES_X)[self.place[env_idx]]
+        position[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.place_xy
+        position[:, 2] = CONTAINER_FLOOR + BATTERY_SIZE / 2
+        self.battery.set_pose(Pose.create_from_pq(position))
+        start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
+        self.agent.reset_tool(start)
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        position = self.battery.pose.p
+        return dict(
+            height=position[:, 2] - CONTAINER_FLOOR - BATTERY_SIZE / 2,  # m, over where it lay
+            away=(position[:, :2] - torch.tensor(CONTAINER_XY, device=self.device)).abs().amax(1),  # m, from the middle
+        )
+
+    def goal_reached(self, measures):
+        return measures["height"] > LIFTED
+
+    def failed(self, measures):
+        return (measures["away"] > 0.17) & (measures["height"] < 0.02)
+
+    def _privileged_state(self):
+        return dict(battery_pose=self.battery.pose.raw_pose)
+
+    def compute_dense_reward(self, obs, action, info):
+        """In [0, 3]: 1 for reaching the battery, 1 for lifting it, 1 for success."""
+        reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.battery.pose.p, dim=1))
+        return reach + (info["height"] / LIFTED).clamp(0.0, 1.0) + info["success"].float()

@@ -1,0 +1,99 @@
+"""ManiFeel-GearAssembly-v1"""
+
+from dataclasses import dataclass
+
+import sapien
+import torch
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_apply
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.geometry import gear_fit
+from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
+from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.visuotactile_env import CONTACTS
+
+from .base import SOCKET_XY, InsertionEnv
+from .base import Randomization as InsertionRandomization
+
+NEIGHBOURS = ("small", "large")
+ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
+
+
+@dataclass
+class Randomization(InsertionRandomization):
+    """Half ranges of the uniform distributions; the defaults are the paper's, of its simulation."""
+
+    base_yaw: float = 0.0
+    """rad, of the base about the vertical"""
+
+
+@register_task(
+    "ManiFeel-GearAssembly-v1", max_episode_steps=300, category="insertion", paper_demos=100, paper_tables=("I", "II", "III")
+)
+class GearAssemblyEnv(InsertionEnv):
+    """
+    **Task Description:**
+    The gripper holds the medium one of three gears (19 teeth, 42 mm across) by a handle and puts it on the middle shaft of a
+    base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.
+
+    **Randomizations:** (half ranges; the argument `randomization` overrides them)
+    - base: xy +-50 mm around (0.5, 0) m; the neighbours are turned at random; `base_yaw`, 0 by default, turns the base in its
+      plane, as the paper does on the real robot
+    - gripper start: 200 mm above the table, xy +-100 mm, z +-50 mm, +-0.1 rad about each axis
+    - gear in hand: pitch about the closing axis +-10 degrees
+
+    **Success Conditions:** held for 0.5 s
+    - the gear is on its shaft, within 1 mm of the base, tilted by less than 3 degrees
+    - both neighbours are on theirs: there, its teeth are in their gaps
+
+    **Fail Conditions:** the gear has left the grip (30 mm).
+    """
+
+    Randomization = Randomization
+    contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
+    fit = gear_fit()
+    max_gap = 1.0e-3
+    lift = 0.05
+
+    def _load_task(self):
+        super()._load_task()
+        self.neighbours = {
+            name: neighbour_gear(name).build(
+                self.scene, "dynamic", sapien.Pose([SOCKET_XY[0] + SHAFT_X[name], SOCKET_XY[1], BASE_SIZE[2]])
+            )
+            for name in NEIGHBOURS
+        }
+
+    def _largest_ranges(self):
+        return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is all the way round"))
+
+    def _initialize_task(self, env_idx: torch.Tensor):
+        super()._initialize_task(env_idx)
+        n = len(env_idx)
+        if self.randomization.base_yaw > 0:
+            turned = _random_yaw(n, self.randomization.base_yaw)
+            self.socket.set_pose(Pose.create_from_pq(self.socket.pose.p[env_idx], turned))
+        for name, actor in self.neighbours.items():
+            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], _random_yaw(n, torch.pi)))
+
+    def _place_of(self, neighbour: str) -> torch.Tensor:
+        """Where a neighbour belongs, (N, 3), m."""
+        place = torch.tensor([SHAFT_X[neighbour], 0.0, BASE_SIZE[2]], device=self.device).expand(self.num_envs, 3)
+        return self.socket.pose.p + quaternion_apply(self.socket.pose.q, place)
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        off = [torch.linalg.norm(actor.pose.p - self._place_of(name), dim=1) for name, actor in self.neighbours.items()]
+        return super().measure() | dict(neighbours_off=torch.stack(off).amax(0))  # m, the worse of both
+
+    def goal_reached(self, measures):
+        return super().goal_reached(measures) & (measures["neighbours_off"] < ON_SHAFT)
+
+    def _privileged_state(self):
+        return super()._privileged_state() | {f"{name}_gear_pose": a.pose.raw_pose for name, a in self.neighbours.items()}
+
+
+def _random_yaw(n: int, half_range: float) -> torch.Tensor:
+    """Quaternions (n, 4), turned about the vertical."""
+    turn = torch.zeros(n, 3)
+    turn[:, 2] = (2 * torch.rand(n) - 1) * half_range
+    return axis_angle_to_quaternion(turn)

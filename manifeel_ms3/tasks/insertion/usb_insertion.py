@@ -1,0 +1,30 @@
+"""ManiFeel-USBInsertion-v1"""
+
+from manifeel_ms3.geometry import usb_fit
+from manifeel_ms3.tasks.registry import register_task
+
+from .base import InsertionEnv
+
+
+@register_task("ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
+class USBInsertionEnv(InsertionEnv):
+    """
+    **Task Description:**
+    The gripper holds a USB-A plug by its handle and puts it into a port that looks up. Shell and tongue have 0.1 mm around them
+    on each side; the plug goes in one way round alone, which is the way it is held.
+
+    **Randomizations:** (half ranges; the argument `randomization` overrides them)
+    - port: xy +-50 mm around (0.5, 0) m
+    - gripper start: 180 mm above the table, xy +-100 mm, z +-50 mm, +-0.1 rad about each axis
+    - plug in hand: pitch about the closing axis +-10 degrees
+
+    **Success Conditions:** held for 0.5 s
+    - at least 90 % of the shell is in the port
+    - the plug is tilted by less than 3 degrees
+
+    **Fail Conditions:** the plug has left the grip (30 mm).
+    """
+
+    fit = usb_fit()
+    max_gap = 0.1 * fit.depth
+    lift = 0.03

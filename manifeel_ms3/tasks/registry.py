@@ -1,0 +1,194 @@
+"""Every task, and all that the pack says of it: one `TaskSpec` a task.
+
+A task registers itself with one decorator, which also makes its id known to `gym.make`:
+
+    @register_task("MyTask-v1", category="insertion", max_episode_steps=300, paper_demos=50)
+    class MyTaskEnv(VisuotactileEnv): ...
+
+Recording, training, evaluation, studies, the leaderboard and the documentation ask this registry. Whoever stands on a task
+attaches a part of his own: a demonstrator (`register_demonstrator`), a question of the information audit. Another package's
+tasks are found through the entry point group `manifeel.tasks`.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, TypeVar
+
+from mani_skill.utils.registration import register_env
+
+from manifeel_ms3 import plugins
+from manifeel_ms3.errors import InvalidArgumentError, PluginError, UnknownNameError
+
+log = logging.getLogger(__name__)
+Class = TypeVar("Class", bound=type)
+FIRST_EVALUATION_SEED = 100_000
+"""Episodes from this seed on are for evaluation, as in the paper's public code; demonstrations use the seeds below it."""
+PREFIX, SUFFIX = "ManiFeel-", "-v1"
+
+
+@dataclass
+class TaskSpec:
+    """All that the pack says of one task."""
+
+    env_id: str
+    """Id for `gym.make`, such as "ManiFeel-PegInsertion-v1"."""
+    env_class: Any
+    """The environment's class, a `VisuotactileEnv`."""
+    category: str
+    """Category of the paper: "insertion", "screwing" or "exploration"."""
+    max_episode_steps: int
+    """Time limit of an episode, in control steps."""
+    paper_demos: int
+    """Number of demonstrations that the paper recorded; what `manifeel dataset` records."""
+    paper_tables: tuple[str, ...] = ()
+    """Tables of the paper that report the task: "I", "II", "III"."""
+    revision: int = 1
+    """Raised by one whenever the task's outcomes change; results of different revisions cannot be compared."""
+    demo_megabytes: float = 13.0
+    """Size of one demonstration with every observation, in MB, rounded up; to see whether the disk has room."""
+    demonstrator: Callable[[Any, int], Any] | None = None
+    """Makes a scripted demonstrator from an environment and a seed; attached by `register_demonstrator`."""
+    probes: list[Any] = field(default_factory=list)
+    """Questions that the information audit asks of the task; attached by `manifeel_ms3.analysis.information_audit`."""
+
+    @property
+    def name(self) -> str:
+        """Short name, such as "PegInsertion"."""
+        return short_name(self.env_id)
+
+    @property
+    def policy_camera(self) -> str:
+        """Camera that the paper's policies look through."""
+        return self.env_class.policy_cameras[0]
+
+
+_SPECS: dict[str, TaskSpec] = {}
+
+
+def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Callable[[Class], Class]:
+    """Class decorator that registers a task here, with ManiSkill and with gymnasium.
+
+    Args:
+        env_id: Id for `gym.make`; it must end in a version, such as "-v1".
+        max_episode_steps: Time limit of an episode, in control steps.
+        about: The other fields of `TaskSpec`.
+
+    Raises:
+        PluginError: Another class has registered the id.
+    """
+
+    def register(env_class: Class) -> Class:
+        known = _SPECS.get(env_id)
+        if known and _qualified(known.env_class) != _qualified(env_class):
+            raise PluginError(
+                f"the task {env_id!r} is registered twice, by {_qualified(known.env_class)} and by {_qualified(env_class)}; "
+                f"give one of them another id. Registered are {list(_SPECS)}"
+            )
+        register_env(env_id, max_episode_steps=max_episode_steps, override=known is not None)(env_class)
+        _SPECS[env_id] = TaskSpec(env_id, env_class, max_episode_steps=max_episode_steps, **about)
+        return env_class
+
+    return register
+
+
+def register_demonstrator(*env_ids: str) -> Callable[[Class], Class]:
+    """Class decorator that makes a class the scripted demonstrator of tasks that are registered already.
+
+    Raises:
+        UnknownNameError: A task is not registered.
+        PluginError: A task has a demonstrator of another class.
+    """
+
+    def attach(expert_class: Class) -> Class:
+        for env_id in env_ids:
+            spec = _known(env_id)
+            if spec.demonstrator is not None and _qualified(spec.demonstrator) != _qualified(expert_class):
+                raise PluginError(f"{env_id!r} has the demonstrator {_qualified(spec.demonstrator)} already")
+            spec.demonstrator = expert_class
+        return expert_class
+
+    return attach
+
+
+def task_spec(env_id: str) -> TaskSpec:
+    """The specification of a task.
+
+    Args:
+        env_id: Id of the task. A module before a colon ("manifeel_ms3:ManiFeel-PegInsertion-v1"), as ManiSkill's files
+            have it, is left aside: it is never imported.
+
+    Raises:
+        UnknownNameError: The task is not registered; the message lists those that are.
+    """
+    _load_plugins()
+    return _known(env_id.rpartition(":")[2])
+
+
+def all_tasks() -> dict[str, TaskSpec]:
+    """The specifications of all registered tasks by their ids: the pack's own in the paper's order, then those of plug-ins."""
+    _load_plugins()
+    return dict(_SPECS)
+
+
+def tasks_of_table(table: str) -> list[str]:
+    """Ids of the tasks that a table of the paper ("I", "II" or "III") reports.
+
+    Raises:
+        UnknownNameError: The paper has no such table.
+    """
+    found = [env_id for env_id, spec in all_tasks().items() if table in spec.paper_tables]
+    if not found:
+        known = sorted({name for spec in _SPECS.values() for name in spec.paper_tables})
+        raise UnknownNameError(f"no task is in table {table!r} of the paper; its tables are {known}")
+    return found
+
+
+def evaluation_seeds(count: int) -> list[int]:
+    """Seeds of the first `count` evaluation episodes, the same for every task.
+
+    Raises:
+        InvalidArgumentError: `count` is less than 1.
+    """
+    if count < 1:
+        raise InvalidArgumentError(f"{count} evaluation episodes are asked for; at least 1 is needed")
+    return list(range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + count))
+
+
+def short_name(env_id: str) -> str:
+    """Short name of a task: "PegInsertion" for "ManiFeel-PegInsertion-v1"."""
+    return env_id.removeprefix(PREFIX).removesuffix(SUFFIX)
+
+
+def full_id(name: str) -> str:
+    """Id of one of the pack's own tasks: "ManiFeel-PegInsertion-v1" for "PegInsertion"."""
+    return f"{PREFIX}{name}{SUFFIX}"
+
+
+def _known(env_id: str) -> TaskSpec:
+    if env_id not in _SPECS:
+        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{_left_out()}")
+    return _SPECS[env_id]
+
+
+@cache
+def _load_plugins() -> dict[str, str]:
+    """Import the task modules of other packages; a broken one is left out, and the reason kept by its name."""
+    failed = {}
+    for name in plugins.registered(plugins.TASKS):
+        try:
+            plugins.load(plugins.TASKS, name)
+        except PluginError as error:
+            log.warning("%s", error)
+            failed[name] = str(error)
+    return failed
+
+
+def _left_out() -> str:
+    failed = _load_plugins()
+    return f" ({len(failed)} plug-ins do not import: {', '.join(failed)})" if failed else ""
+
+
+def _qualified(kind: Any) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"

@@ -1,0 +1,107 @@
+"""What the screwing tasks share: a held part with a thread, and the fixed one that it is turned onto or into."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_apply, quaternion_multiply
+from mani_skill.utils.structs import Pose
+
+from manifeel_ms3.geometry import Screw
+from manifeel_ms3.tasks.placement import height_range, start_pose
+from manifeel_ms3.tasks.visuotactile_env import CONTACTS, VisuotactileEnv
+
+FIXED_XY = (0.5, 0.0)  # m, nominal
+START_Z = 0.15  # m
+WOUND_UP = np.deg2rad(200)  # about the vertical, that the hand starts turned by: near the end of its joint
+MAX_XY, CLEAR = 0.07, 0.02  # m; m over where the threads first meet
+WRIST_END = "further out the wrist comes to its end"
+LOST = 0.05  # m from the hand, and
+OFF_AXIS = 0.004  # m from the axis
+
+
+@dataclass
+class Randomization:
+    """Half ranges of the uniform distributions; the defaults are the paper's."""
+
+    fixed_xy: float = 0.05
+    """m, each axis, of the bolt or the holder"""
+    start_xy: float = 0.0
+    """m, each axis"""
+    start_z: float = 0.0
+    """m"""
+
+
+class ScrewingEnv(VisuotactileEnv):
+    """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, takes it again.
+
+    Subclasses define `screw` and `grip_indentation`, m, of each gel under its grip.
+    """
+
+    Randomization = Randomization
+    default_control_mode = "pd_ee_delta_pose"
+    physics_rate = 720  # at 240 a thread tilts and jams
+    contacts = CONTACTS | dict(contact_offset=5e-5)  # m: threads have a tenth of a millimetre of play
+    screw: Screw
+    grip_indentation: float
+    start = "hand"
+    """where the held part is at the start: in the hand, or already in the "holder"."""
+
+    def _largest_ranges(self):
+        lowest = self.screw.engaged + CLEAR
+        return dict(
+            fixed_xy=(MAX_XY, WRIST_END),
+            start_xy=(MAX_XY, WRIST_END),
+            start_z=(height_range(START_Z, lowest), "the threads would start in each other, or out of reach"),
+        )
+
+    def _load_task(self):
+        self.held = self.screw.held.build(self.scene, "dynamic", sapien.Pose([0.5, 0, 0.3]))
+        self.fixed = self.screw.fixed.build(self.scene, "kinematic", sapien.Pose([*FIXED_XY, 0]))
+
+    def _initialize_task(self, env_idx: torch.Tensor):
+        n, ranges = len(env_idx), self.randomization
+        fixed = torch.tensor([*FIXED_XY, 0.0]).repeat(n, 1)
+        fixed[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.fixed_xy
+        self.fixed.set_pose(Pose.create_from_pq(fixed))
+        self._initialize_held(env_idx)
+
+    def _initialize_held(self, env_idx: torch.Tensor) -> None:
+        """Put the tool at its start, the held part in it."""
+        opening = self.screw.grip_width / 2 - self.grip_indentation
+        start = self._start_tool(env_idx, START_Z, opening, self.screw.grip_force)
+        self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([[0.0, 1.0, 0.0, 0.0]])))
+
+    def _start_tool(self, env_idx: torch.Tensor, height: float, opening: float, grip_force: float) -> Pose:
+        """Put the wound-up tool at a random start around a height, and return where."""
+        n, ranges = len(env_idx), self.randomization
+        start = start_pose(n, (*FIXED_XY, height), (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
+        wound = axis_angle_to_quaternion(torch.tensor([[0.0, 0.0, WOUND_UP]])).expand(n, 4)
+        start = Pose.create_from_pq(start.p, quaternion_multiply(wound, start.q))
+        self.agent.reset_tool(start, opening, grip_force, wrist_turn=-WOUND_UP)
+        return start
+
+    def measure(self) -> dict[str, torch.Tensor]:
+        held = self.fixed.pose.inv() * self.held.pose
+        up = quaternion_apply(held.q, held.q.new_tensor([0.0, 0.0, 1.0]).expand(self.num_envs, 3))
+        return dict(
+            descent=self.screw.engaged - held.p[:, 2],  # m, from where the threads first meet
+            offset=torch.linalg.norm(held.p[:, :2], dim=1),  # m, from the fixed part's axis
+            tilt=torch.acos(up[:, 2].clamp(-1.0, 1.0)),  # rad
+            torque=-self.agent.torque_on_held(self.held.pose.p),  # N m, of the hand, clockwise seen from above
+        )
+
+    def failed(self, measures):
+        away = torch.linalg.norm(self.agent.tcp.pose.p - self.held.pose.p, dim=1)
+        return (away > LOST) & (measures["offset"] > OFF_AXIS)
+
+    def _privileged_state(self):
+        return dict(held_pose=self.held.pose.raw_pose, fixed_pose=self.fixed.pose.raw_pose)
+
+    def compute_dense_reward(self, obs, action, info):
+        """In [0, 4]: 1 for coming over the axis, 1 for being upright there, 1 for depth, 1 for success."""
+        near = 1 - torch.tanh(20 * info["offset"] + 5 * (-info["descent"]).clamp(min=0.0))
+        upright = near * (1 - torch.tanh(10 * info["tilt"]))
+        deep = (info["descent"] / (self.screw.engaged - self.screw.seated)).clamp(0.0, 1.0)
+        return near + upright + deep * (info["offset"] < OFF_AXIS).float() + info["success"].float()

@@ -1,0 +1,109 @@
+"""The audit finds what is there, and nothing where there is nothing."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from manifeel_ms3.analysis import information_audit
+from manifeel_ms3.demonstrations import DemonstrationError
+
+pytest.importorskip("sklearn")
+RNG = np.random.default_rng(0)
+EPISODES = 24
+
+
+def test_probe_tells_a_class_that_shows_and_not_one_that_does_not():
+    truth = np.repeat(RNG.integers(2, size=60), 3).astype(float)
+    episodes = np.repeat(np.arange(60), 3)
+    noise = RNG.normal(size=(len(truth), 40))
+    shown = noise + 2.0 * truth[:, None]
+    assert (information_audit.probe(shown, truth, episodes, numeric=False) == truth).mean() > 0.95
+    assert 0.3 < (information_audit.probe(noise, truth, episodes, numeric=False) == truth).mean() < 0.7
+
+
+def test_probe_does_not_learn_an_episode_by_heart():
+    """Features that name the episode say nothing of episodes that it has not seen."""
+    truth = np.repeat(RNG.integers(2, size=40), 5).astype(float)
+    episodes = np.repeat(np.arange(40), 5)
+    names = np.eye(40)[episodes]
+    assert (information_audit.probe(names, truth, episodes, numeric=False) == truth).mean() < 0.75
+
+
+def test_an_answer_that_never_looks_scores_a_half_however_rare_a_class():
+    truth, episodes = np.r_[np.zeros(95), np.ones(5)], np.arange(100) // 5
+    assert information_audit._score(truth, np.zeros(100), episodes, numeric=False)[0] == 0.5
+    assert information_audit._score(truth, truth, episodes, numeric=False) == (1.0, 1.0, 1.0)
+
+
+def test_probe_estimates_a_number():
+    angle = RNG.uniform(-30, 30, 80)
+    features = np.stack([np.sin(np.deg2rad(angle + k)) for k in range(0, 90, 5)], axis=1)
+    assert np.abs(information_audit.probe(features, angle, np.arange(80), numeric=True) - angle).max() < 1.0
+
+
+@pytest.mark.parametrize("numeric", [False, True])
+@pytest.mark.filterwarnings("error")
+def test_a_sensor_that_never_changes_is_no_better_than_chance_and_no_fault(numeric):
+    truth = np.tile([0.0, 1.0], 30)
+    guess = information_audit.probe(np.ones((60, 5)), truth, np.arange(60) // 2, numeric)
+    assert np.abs(guess - truth).mean() == pytest.approx(0.5, abs=0.01)
+
+
+def test_texture_shows_in_the_features():
+    smooth = np.full((120, 160, 3), 128, np.uint8)
+    rough = np.clip(128 + 20 * RNG.normal(size=smooth.shape), 0, 255).astype(np.uint8)
+    energy = [information_audit.image_features(image)[3 * information_audit.GRID**2 :].sum() for image in (smooth, rough)]
+    assert energy[0] == pytest.approx(0, abs=1e-4)
+    assert energy[1] > 10
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """ObjectSearch episodes with a field that shows the battery and a picture that does not."""
+    task = tmp_path / "ManiFeel-ObjectSearch-v1"
+    task.mkdir()
+    with h5py.File(task / "trajectory.h5", "w") as file:
+        for i in range(EPISODES):
+            place, steps = i % 2, 12
+            group = file.create_group(f"traj_{i}")
+            group["actions"] = np.zeros((steps, 7))
+            group["contact_force"] = np.zeros(steps, np.float32)
+            group["env_states/actors/battery"] = np.tile([0.425 + 0.15 * place, *np.zeros(12)], (steps + 1, 1))
+            group["obs/extra/tcp_pose"] = np.tile([0.425, 0, 0.1, 0, 1, 0, 0], (steps + 1, 1))
+            sensors = group.create_group("obs/sensor_data")
+            sensors["front/rgb"] = RNG.integers(0, 255, (steps + 1, 32, 32, 3), dtype=np.uint8)
+            sensors["tactile_right/rgb"] = RNG.integers(0, 255, (steps + 1, 24, 32, 3), dtype=np.uint8)
+            sensors["tactile_right/force_field"] = np.full((steps + 1, 10, 14, 3), place, np.float32)
+    episodes = [dict(episode_id=i, episode_seed=i, elapsed_steps=1, success=True) for i in range(EPISODES)]
+    header = dict(env_info=dict(env_id="manifeel_ms3:ManiFeel-ObjectSearch-v1", env_kwargs={}), episodes=episodes)
+    (task / "trajectory.json").write_text(json.dumps(header))
+    return tmp_path
+
+
+def test_audit_writes_table_figure_and_numbers(recorded, tmp_path):
+    answers = information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+    before = {answer.modality: answer for answer in answers if "before" in answer.question}
+    assert before["tacff"].score == 1.0
+    assert before["camera"].score < 0.8
+    assert before["camera"].sensor == "front"
+    low, high = before["camera"].interval
+    assert low < before["camera"].score < high
+    assert "100%" in (tmp_path / "out/audit.md").read_text()
+    assert (tmp_path / "out/audit.png").stat().st_size > 5000
+    assert len(json.loads((tmp_path / "out/audit.json").read_text())) == len(answers)
+
+
+def test_audit_says_what_is_missing(recorded, tmp_path):
+    with pytest.raises(DemonstrationError, match="demonstrations.dataset"):
+        information_audit.main(information_audit.Args(tmp_path / "nothing"))
+    path = recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5"
+    with h5py.File(path, "r+") as file:
+        del file["traj_3/obs/sensor_data/tactile_right/rgb"]
+    with pytest.raises(DemonstrationError, match="lacks tacrgb"):
+        information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+    header = json.loads(path.with_suffix(".json").read_text())
+    path.with_suffix(".json").write_text(json.dumps(header | dict(episodes=header["episodes"][:3])))
+    with pytest.raises(DemonstrationError, match="3 episodes, at least"):
+        information_audit.main(information_audit.Args(recorded, tmp_path / "out"))

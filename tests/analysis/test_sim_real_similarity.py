@@ -1,0 +1,134 @@
+"""Distances between sets of tactile pictures, against cases whose answer is known."""
+
+import json
+from math import comb
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from transformers import ConvNextImageProcessor, ResNetConfig, ResNetModel
+
+from manifeel_ms3.analysis import sim_real_similarity
+from manifeel_ms3.analysis.sim_real_similarity import Args, SimilarityError, fid, kid
+from manifeel_ms3.paths import data_dir
+
+RNG = np.random.default_rng(0)
+OWN = "tests.analysis.test_sim_real_similarity:brightness"
+
+
+def brightness(pictures: np.ndarray) -> np.ndarray:
+    """Features of one's own: mean of each colour."""
+    return pictures.mean((1, 2))
+
+
+def test_fid_of_normal_distributions_is_the_closed_form():
+    """|m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^1/2); with diagonal covariances the last is the sum of (s1 - s2)^2."""
+    first, second = (RNG.standard_normal((200_000, 4)) * scale + shift for scale, shift in ((1.0, 0.0), ([1, 2, 3, 0.5], 0.3)))
+    assert fid(first, second) == pytest.approx(4 * 0.3**2 + 1 + 4 + 0.25, rel=0.01)
+    assert fid(first, first[::-1]) == pytest.approx(0, abs=1e-6)
+
+
+def test_kid_of_normal_distributions_is_the_closed_form():
+    """E k(x, y) for k = (x y + 1)^3 in one dimension, from the moments of N(0, 1) and N(m, 1)."""
+    m = 0.7
+    moments = {0.0: (1, 0, 1, 0), m: (1, m, 1 + m**2, 3 * m + m**3)}
+
+    def mean_kernel(a: float, b: float) -> float:
+        return sum(comb(3, k) * moments[a][k] * moments[b][k] for k in range(4))
+
+    expected = mean_kernel(0.0, 0.0) + mean_kernel(m, m) - 2 * mean_kernel(0.0, m)
+    measured = [kid(RNG.standard_normal((1500, 1)), RNG.standard_normal((1500, 1)) + m) for _ in range(20)]
+    assert np.mean(measured) == pytest.approx(expected, abs=3 * np.std(measured) / np.sqrt(len(measured)))
+    none = [kid(RNG.standard_normal((300, 1)), RNG.standard_normal((300, 1))) for _ in range(100)]  # unbiased: 0, on average
+    assert np.mean(none) == pytest.approx(0, abs=3 * np.std(none) / 10)
+
+
+def test_the_interval_covers_what_is_true():
+    """Of 40 pairs of samples, about 38 intervals of the mean's distance hold the true one."""
+
+    def gap(sim, real):
+        return float(sim.mean() - real.mean())
+
+    found = [
+        sim_real_similarity.bootstrapped(gap, RNG.normal(1, 1, (120, 1)), RNG.normal(0, 1, (80, 1)), 200) for _ in range(40)
+    ]
+    assert sum(estimate.low <= 1 <= estimate.high for estimate in found) >= 34
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """Pictures that differ by 20 grey levels, and fields."""
+    for side, level in (("sim", 100), ("real", 120)):
+        (tmp_path / side).mkdir()
+        (tmp_path / f"{side}_fields").mkdir()
+        for k in range(12):
+            cv2.imwrite(str(tmp_path / side / f"{k}.png"), RNG.integers(level - 5, level + 6, (48, 64, 3)))
+            np.save(tmp_path / f"{side}_fields/{k}.npy", RNG.uniform(0, level / 1000, (10, 14, 3)).astype(np.float32))
+    return tmp_path
+
+
+def test_folders_are_compared_and_pairs_shown(folders):
+    out = folders / "out"
+    result = sim_real_similarity.main(Args(folders / "sim", folders / "real", features=OWN, resamples=20, out=out))
+    assert result.fid.value == pytest.approx(3 * 20**2, rel=0.05)
+    assert result.fid.low < result.fid.value < result.fid.high
+    written = json.loads((out / "similarity.json").read_text())
+    assert (written["features"], written["dimensions"], written["sim_count"], written["real_count"]) == (OWN, 3, 12, 12)
+    assert cv2.imread(str(out / "nearest.png")).shape == (320, 8 * 160, 3)
+
+
+def test_force_fields_and_recordings_are_compared(folders):
+    fields = sim_real_similarity.main(
+        Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", resamples=5, out=folders / "out")
+    )
+    assert fields.fid.value > 0
+    recording = data_dir() / "sample/ManiFeel-PegInsertion-v1/trajectory.h5"
+    same = sim_real_similarity.main(Args(recording, recording, OWN, "tacff", resamples=5, out=folders / "out"))
+    assert same.fid.value == pytest.approx(0, abs=1e-6)
+    with pytest.raises(SimilarityError, match="lacks tacrgb of tactile_left"):
+        sim_real_similarity.main(Args(recording, recording, OWN, "tacrgb", "tactile_left", out=folders / "out"))
+
+
+def test_a_resnet_from_a_folder(folders):
+    config = ResNetConfig(embedding_size=8, hidden_sizes=[8, 16], depths=[1, 1], layer_type="basic")
+    ResNetModel(config).save_pretrained(folders / "resnet")
+    ConvNextImageProcessor(size={"shortest_edge": 32}, crop_pct=1.0).save_pretrained(folders / "resnet")
+    result = sim_real_similarity.main(
+        Args(folders / "sim", folders / "real", features=str(folders / "resnet"), resamples=5, out=folders / "out")
+    )
+    assert result.dimensions == 16
+    assert result.fid.value > 0
+
+
+def test_inception_with_weights_at_hand(folders, monkeypatch):
+    """They lie where torch keeps downloads; here they are random."""
+    module = pytest.importorskip("torch_fidelity.feature_extractor_inceptionv3")
+    monkeypatch.setenv("TORCH_HOME", str(folders))
+    weights = folders / "hub/checkpoints" / module.URL_INCEPTION_V3.rpartition("/")[2]
+    weights.parent.mkdir(parents=True)
+    with monkeypatch.context() as patched:  # the network itself, which cannot be made without weights
+        patched.setattr(module, "load_state_dict_from_url", lambda *_, **__: None)
+        patched.setattr(module.FeatureExtractorInceptionV3, "load_state_dict", lambda *_: None)
+        network = module.FeatureExtractorInceptionV3("inception", ["2048"])
+    torch.save(network.state_dict(), weights)
+    result = sim_real_similarity.main(Args(folders / "sim", folders / "real", "inception", resamples=2, out=folders / "out"))
+    assert (result.features, result.dimensions) == ("inception", 2048)
+    assert result.fid.value > 0
+
+
+def test_what_cannot_be_used_is_named(folders, monkeypatch):
+    args = dict(out=folders / "out", resamples=2)
+    with pytest.raises(SimilarityError, match="holds 0 of"):
+        sim_real_similarity.main(Args(folders / "nowhere", folders / "real", OWN, **args))
+    with pytest.raises(SimilarityError, match="cannot be had as a ResNet"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", str(folders / "sim"), **args))
+    monkeypatch.setitem(__import__("sys").modules, "torch_fidelity.feature_extractor_inceptionv3", None)
+    with pytest.raises(SimilarityError, match="Inception network cannot be had"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", "inception", **args))
+    (folders / "sim/3.png").write_bytes(b"no picture")
+    with pytest.raises(SimilarityError, match=r"3\.png cannot be read"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", OWN, **args))
+    np.save(folders / "real_fields/3.npy", np.zeros((10, 14)))
+    with pytest.raises(SimilarityError, match=r"3\.npy holds an array \(10, 14\)"):
+        sim_real_similarity.main(Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", **args))

@@ -1,0 +1,151 @@
+"""Evaluating any policy: bad ones fail their episodes with a reason, and the run goes on."""
+
+import json
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.evaluation import evaluate as evaluate_command
+from manifeel_ms3.evaluation.evaluate import Args
+from manifeel_ms3.evaluation.policy import PolicyError
+from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
+from manifeel_ms3.evaluation.result import ResultError, read_result
+from tests.conftest import PEG
+
+BARE = json.dumps(dict(render_backend="none", max_episode_steps=12))
+SERVER = Path(__file__).parents[2] / "examples/policy_server.py"
+
+
+def evaluate(policy: str, out: Path, **changes) -> dict:
+    settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=2, env_kwargs=BARE, out=out / "evaluation.json")
+    name = policy if "://" in policy else f"tests.evaluation.policies:{policy}"
+    return read_result(evaluate_command.main(Args(policy=name, **settings | changes)))
+
+
+def test_a_policy_of_ones_own_is_evaluated(tmp_path):
+    result = evaluate("StandStill", tmp_path)
+    assert [episode["seed"] for episode in result["episodes"]] == evaluate_command.evaluation_seeds(PEG, 2)
+    assert [(e["length"], e["success_once"], e["error"]) for e in result["episodes"]] == [(12, False, None)] * 2
+    assert result["policy"] == "tests.evaluation.policies:StandStill"
+    assert result["success_once"]["rate"] == 0.0
+    assert result["env_kwargs"]["obs_mode"] == "tacff"
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [
+        ("Raises", "step 0: RuntimeError: out of ideas"),
+        ("SaysNaN", "step 3: the action holds NaN"),
+        ("SaysWords", "step 0: the action is no array of numbers"),
+        ("Sleeps", "step 0: no answer within 1 s"),
+        ("Crashes", "exit code 7"),
+    ],
+)
+def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_path):
+    result = evaluate(policy, tmp_path, step_timeout=1.0)
+    assert len(result["episodes"]) == 2
+    for episode in result["episodes"]:
+        assert reason in episode["error"]
+        assert not episode["success_once"]
+
+
+def test_a_wrong_number_of_actions_is_named(tmp_path):
+    result = evaluate("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
+    assert "shape (9,), the task takes (6,)" in result["episodes"][0]["error"]
+
+
+def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
+    with pytest.raises(PolicyError, match="OSError: no weights.*--policy-kwargs"):
+        evaluate("CannotBeMade", tmp_path)
+    with pytest.raises(PolicyError, match="give module:Class"):
+        evaluate("Nobody", tmp_path)
+    assert not (tmp_path / "evaluation.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "word"),
+    [
+        (dict(), "either --checkpoint, or --policy"),
+        (dict(policy="a:B"), "--env-id"),
+        (dict(policy="a:B", env_id=PEG, obs_mode="rgb", episodes=2, videos=(2,)), "the episodes are 0 to 1"),
+    ],
+)
+def test_what_is_missing_is_named(settings, word):
+    with pytest.raises(ValueError, match=word):
+        evaluate_command.main(Args(**settings))
+
+
+@pytest.fixture
+def server():
+    port = 8900 + int(time.time()) % 90
+    process = subprocess.Popen([sys.executable, str(SERVER), "--port", str(port)])
+    policy = RemotePolicy(f"http://127.0.0.1:{port}", timeout=10)
+    for _ in range(50):
+        try:
+            policy.reset()
+            break
+        except ConnectionError:
+            time.sleep(0.1)
+    yield policy
+    process.terminate()
+    process.wait()
+
+
+def test_a_policy_in_another_process_is_asked(server, tmp_path):
+    result = evaluate(server.address, tmp_path, episodes=1)
+    assert result["episodes"][0]["length"] == 12
+    assert result["episodes"][0]["error"] is None
+    assert result["policy"] == server.address
+
+
+def test_a_servers_error_and_its_absence_are_told(server):
+    with pytest.raises(ConnectionError, match="500: ValueError"):
+        server._ask("act", b"nonsense")
+    with pytest.raises(ConnectionError, match="start the server first"):
+        RemotePolicy("http://127.0.0.1:9").reset()
+
+
+def test_observations_travel_by_their_paths():
+    obs = dict(extra=dict(tcp_pose=np.zeros((1, 7))), sensor_data=dict(wrist=dict(rgb=np.zeros((1, 4, 4, 3), np.uint8))))
+    flat = dict(flat_observation(obs))
+    assert {name: array.shape for name, array in flat.items()} == {"extra/tcp_pose": (7,), "sensor_data/wrist/rgb": (4, 4, 3)}
+
+
+@pytest.fixture
+def result_file(tmp_path):
+    evaluate("StandStill", tmp_path, episodes=1)
+    return tmp_path / "evaluation.json"
+
+
+def test_results_that_are_not_of_the_published_form_are_refused(result_file):
+    good = json.loads(result_file.read_text())
+    for broken, word in (
+        (good | dict(schema="manifeel-evaluation-9"), "has the schema 'manifeel-evaluation-9'"),
+        (good | dict(success_once=dict(rate=1.5, low=0, high=1)), "success_once/rate"),
+        ({name: value for name, value in good.items() if name != "episodes"}, "'episodes' is a required property"),
+        (good | dict(episodes=[good["episodes"][0] | dict(length="long")]), "episodes/0/length"),
+        ([1], "has the schema None"),
+    ):
+        result_file.write_text(json.dumps(broken))
+        with pytest.raises(ResultError, match=word):
+            read_result(result_file)
+    result_file.write_text("{")
+    with pytest.raises(ResultError, match="cannot be read as a result"):
+        read_result(result_file)
+
+
+def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
+    page = (SERVER.parents[1] / "docs/evaluation.md").read_text()
+    (code,) = re.findall(r"```python\n# my_module.py\n(.*?)```", page, flags=re.DOTALL)
+    (tmp_path / "my_module.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=1, env_kwargs=BARE, policy_kwargs='{"gain": 0.3}')
+    result = read_result(evaluate_command.main(Args(policy="my_module:MyPolicy", out=tmp_path / "evaluation.json", **settings)))
+    assert result["episodes"][0]["error"] is None
+    assert len([line for line in code.splitlines() if line.strip()]) <= 20

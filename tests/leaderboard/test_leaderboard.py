@@ -1,0 +1,180 @@
+"""Submissions are checked, run again, ranked, and shown on a page that is tried in a browser."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.result import read_result, result_of, write_result
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.leaderboard import __main__ as leaderboard
+from manifeel_ms3.leaderboard.submission import SubmissionError, check, read_submission
+from tests.browser import browser_program
+from tests.conftest import PEG
+
+BROWSER = browser_program()
+POLICY = "tests.evaluation.policies:StandStill"
+BARE = json.dumps(dict(render_backend="none", max_episode_steps=3))
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory) -> Path:
+    """A real result, of all 50 starts, each a few steps."""
+    out = tmp_path_factory.mktemp("evaluated") / "00000000.json"
+    return evaluate.main(evaluate.Args(policy=POLICY, env_id=PEG, obs_mode="tacff", cameras=(), env_kwargs=BARE, out=out))
+
+
+@pytest.fixture
+def submission(evaluated, tmp_path) -> Path:
+    folder = tmp_path / "still"
+    folder.mkdir()
+    (folder / "submission.json").write_text(json.dumps(dict(name="Still", authors="Nobody", link="https://example.org")))
+    shutil.copy(evaluated, folder)
+    return folder
+
+
+def submit(folder: Path, board: Path, **changes) -> Path:
+    return leaderboard.main(leaderboard.Submit(folder, policy=POLICY, board=board, **changes))
+
+
+def test_a_submission_is_run_again_and_taken(submission, tmp_path):
+    board = tmp_path / "board"
+    taken = submit(submission, board, rerun=2)
+    assert read_result(taken / "00000000.json")["policy"] == POLICY
+    with pytest.raises(FileExistsError, match="rename"):
+        submit(submission, board, rerun=1)
+
+
+def change(folder: Path, edit) -> None:
+    path = folder / "00000000.json"
+    result = json.loads(path.read_text())
+    edit(result)
+    path.write_text(json.dumps(result))
+
+
+@pytest.mark.parametrize(
+    ("edit", "word"),
+    [
+        (lambda r: r["episodes"].pop(), "its 49 starts are not the 50"),
+        (lambda r: r["episodes"][3].update(seed=7), r"foreign \[7\]"),
+        (lambda r: r.update(revision=99), "is of revision 99 of"),
+        (lambda r: r["versions"].update(sapien="2.2.0"), "run with sapien 2.2.0, the leaderboard takes 3"),
+        (lambda r: r["success_once"].update(rate=0.9), "success_once says"),
+        (lambda r: r["episodes"][0].update(length=301), "301 steps, the task ends after 300"),
+        (lambda r: r["episodes"][0].update(success_at_end=True), "succeeds at the end, but never"),
+        (lambda r: r["episodes"][0].update(success_once=True, error="no idea"), "with the error no idea"),
+        (lambda r: r["episodes"][0].update(peak_contact_force=1e4), "more than the arm can press with"),
+        (lambda r: r.update(mean_length=5.0), "mean_length says 5.0"),
+        (lambda r: r.update(env_id="ManiFeel-Knitting-v1"), "is no task of this leaderboard"),
+    ],
+)
+def test_what_is_wrong_with_a_result_is_said(submission, edit, word):
+    change(submission, edit)
+    with pytest.raises(SubmissionError, match=word):
+        check(read_submission(submission))
+
+
+def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
+    def lie(result):
+        for episode in result["episodes"]:
+            episode["length"] = 2
+        result["mean_length"] = 2.0
+
+    change(submission, lie)
+    with pytest.raises(SubmissionError, match="length says 2, run again it is 3"):
+        submit(submission, tmp_path / "board", rerun=1)
+    assert not (tmp_path / "board").exists()
+
+
+def test_foreign_and_broken_files_are_all_named(submission, tmp_path):
+    (submission / "other.json").write_text("{}")
+    (submission / "broken.json").write_text("{")
+    (submission / "submission.json").write_text('{"name": "x"}')
+    with pytest.raises(SubmissionError) as error:
+        read_submission(submission)
+    for word in ("other.json has the schema None", "broken.json cannot be read", "submission.json: ", "authors"):
+        assert word in str(error.value)
+
+
+def test_a_result_of_another_policy_is_not_run_for_this_one(submission, tmp_path):
+    with pytest.raises(SubmissionError, match="no result is of tests.evaluation.policies:Raises"):
+        leaderboard.main(leaderboard.Submit(submission, policy="tests.evaluation.policies:Raises", board=tmp_path / "board"))
+
+
+# -------------------------------------------------------------------- the page
+
+
+def made_up(folder: Path, name: str, task: str, mode: str, won: int) -> None:
+    """Two checkpoints of two training seeds."""
+    folder.mkdir(parents=True)
+    (folder / "submission.json").write_text(json.dumps(dict(name=name, authors="Us")))
+    env_id = f"ManiFeel-{task}-v1"
+    for seed in (0, 1):
+        for step in (100, 200):
+            config = dict(kind="m:DiffusionPolicy", obs_mode=mode, seed=seed, step=step, num_demos=50)
+            outcomes = [
+                EpisodeOutcome(start, k < won, k < won, 9, 1.0, 1.0)
+                for k, start in enumerate(evaluate.evaluation_seeds(env_id, 50))
+            ]
+            write_result(
+                result_of(env_id, dict(cameras=["wrist"]), config, outcomes), folder / f"results/{seed}/{step:08d}.json"
+            )
+
+
+@pytest.fixture(scope="module")
+def board(tmp_path_factory) -> Path:
+    board = tmp_path_factory.mktemp("board")
+    for name, task, mode, won in (
+        ("Alpha <b>", "PegInsertion", "rgb", 10),
+        ("Beta", "PegInsertion", "rgb+tacff", 30),
+        ("Gamma", "ObjectSearch", "rgb", 20),
+    ):
+        made_up(board / name[:2], name, task, mode, won)
+    leaderboard.main(leaderboard.Build(board))
+    return board
+
+
+def test_the_table_ranks_within_a_task(board):
+    lines = [line for line in (board / "README.md").read_text().splitlines() if line.startswith("| ObjectS") or "Peg" in line]
+    assert [re.findall(r"(\d+)% \[", line)[0] for line in lines] == ["40", "60", "20"]
+    assert "2 x 2 x 50" in lines[0]
+
+
+def browsed(board: Path, address: str) -> str:
+    """The page as a browser has made it."""
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=4000", "--dump-dom"]
+    url = f"file://{board}/index.html#{address}"
+    return subprocess.run([*command, url], capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+def shown(board: Path, address: str) -> list[str]:
+    """Names of the rows that are to be seen, in their order."""
+    rows = re.findall(r'<tr class="row"[^>]*>', browsed(board, address))
+    return [html.unescape(re.findall(r'data-name="([^"]*)"', row)[0]) for row in rows if "hidden" not in row]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
+def test_the_page_sorts_filters_and_searches_in_a_browser(board):
+    assert shown(board, "") == ["Gamma", "Beta", "Alpha <b>"]
+    assert shown(board, "sort=success") == ["Alpha <b>", "Gamma", "Beta"]
+    assert shown(board, "task=PegInsertion&sort=-name") == ["Beta", "Alpha <b>"]
+    assert shown(board, "sensing=rgb%2Btacff") == ["Beta"]
+    assert shown(board, "search=gamma") == ["Gamma"]
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser on this machine")
+def test_a_row_opens_with_its_curves(board):
+    assert '<svg class="main-svg"' not in browsed(board, "task=ObjectSearch")
+    page = browsed(board, "task=ObjectSearch&open=0")
+    assert page.count('<g class="trace scatter') == 2  # one a training seed
+
+
+def test_the_page_needs_nothing_else(board):
+    page = (board / "index.html").read_text()
+    assert not re.search(r'<(script|link|img)[^>]+(src|href)="https?:', page)
+    assert "Alpha &lt;b&gt;" in page
