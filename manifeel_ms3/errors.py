@@ -26,6 +26,10 @@ class FileExistsAlreadyError(ManifeelError, FileExistsError):
     """A file or folder that would have been written exists already."""
 
 
+class InUseError(ManifeelError, RuntimeError):
+    """Another process works on a file or folder; the message names the process."""
+
+
 class MissingExtraError(ManifeelError, ModuleNotFoundError):
     """An optional dependency is not installed; the message names the extra that brings it."""
 

@@ -1,0 +1,61 @@
+"""One process at a time works on a file or folder.
+
+The lock is advisory and belongs to the operating system (`filelock`): it ends with the process that holds it, however that
+process ends. A small json beside it names the holder, for the message that the second process gets.
+"""
+
+import json
+import os
+import socket
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from .errors import InUseError, MachineError
+
+
+@contextmanager
+def owned(path: Path) -> Iterator[None]:
+    """Hold a file or folder, which need not exist yet, for as long as the context lasts.
+
+    Args:
+        path: File or folder. Its parent folder is created if it is missing and receives the lock, `.<name>.lock`.
+
+    Raises:
+        InUseError: Another process holds it; the message names the process.
+        MachineError: The parent folder cannot be created or written.
+    """
+    path = Path(path).absolute()
+    lock, holder = (path.with_name(f".{path.name}.{kind}") for kind in ("lock", "holder.json"))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        held = FileLock(lock, timeout=0, mode=0o666)  # another user of the machine may be the next to hold it
+        held.acquire()
+    except Timeout:
+        raise InUseError(f"{path} is in use by {_described(holder)}; wait until it ends, or give another path") from None
+    except OSError as error:
+        raise MachineError(f"{path.parent} cannot be written ({error.strerror}); give another path") from error
+    try:
+        _write_holder(holder)
+        yield
+    finally:
+        holder.unlink(missing_ok=True)
+        held.release()
+
+
+def _write_holder(path: Path) -> None:
+    started = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    content = dict(pid=os.getpid(), host=socket.gethostname(), command=" ".join(sys.argv), since=started)
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def _described(path: Path) -> str:
+    try:
+        holder = json.loads(path.read_text(encoding="utf-8"))
+        return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
+    except (OSError, ValueError, KeyError, TypeError):  # it has just begun, or has just ended
+        return "another process"

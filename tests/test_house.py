@@ -1,0 +1,66 @@
+"""The order of the packages is kept by a check that can fail; functions and files stay small enough to be read."""
+
+import ast
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+PACKAGES = ("manifeel_ms3", "baselines")
+MAX_FUNCTION_LINES, MAX_FILE_LINES = 60, 400
+
+
+def check_imports(folder: Path) -> subprocess.CompletedProcess:
+    command = [str(Path(sys.executable).parent / "lint-imports"), "--no-cache"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory) -> Path:
+    """The packages, and the contracts that they keep."""
+    folder = tmp_path_factory.mktemp("house")
+    for package in PACKAGES:
+        shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(REPOSITORY / "pyproject.toml", folder)
+    return folder
+
+
+def test_the_order_of_the_packages_is_kept(copy):
+    done = check_imports(copy)
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "contract"),
+    [
+        ("manifeel_ms3/tasks/registry.py", "import baselines.registry", "The pack never imports the baselines"),
+        ("manifeel_ms3/sensors/config.py", "import manifeel_ms3.tasks.registry", "The rooms of the pack"),
+        ("baselines/common/policy.py", "import baselines.flow_matching.policy", "The rooms of the baselines"),
+    ],
+)
+def test_a_forbidden_import_is_found(copy, file, line, contract):
+    path = copy / file
+    before = path.read_text()
+    path.write_text(f"{before}\n{line}\n")
+    try:
+        done = check_imports(copy)
+    finally:
+        path.write_text(before)
+    assert done.returncode != 0
+    (verdict,) = [said for said in done.stdout.splitlines() if said.startswith(contract) and said.endswith(("KEPT", "BROKEN"))]
+    assert verdict.endswith("BROKEN"), done.stdout
+
+
+def test_functions_and_files_can_be_read():
+    long = []
+    for path in (path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")):
+        source = path.read_text()
+        if (lines := source.count("\n")) > MAX_FILE_LINES:
+            long.append(f"{path.name}: {lines} lines")
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.FunctionDef) and (lines := node.end_lineno - node.lineno + 1) > MAX_FUNCTION_LINES:
+                long.append(f"{path.name}: {node.name}: {lines} lines")
+    assert not long

@@ -1,0 +1,50 @@
+"""One process at a time owns a file; whoever comes second is told who does, and a killed process leaves nothing that blocks."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+from manifeel_ms3.errors import InUseError, MachineError
+from manifeel_ms3.ownership import owned
+
+HOLD = "import sys, time; from manifeel_ms3.ownership import owned\nwith owned(sys.argv[1]): print('held', flush=True); time.sleep(60)"
+PATIENCE = 60  # s
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """Another process that holds `tmp_path / "file.h5"`."""
+    process = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path / "file.h5")], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.wait(PATIENCE)
+
+
+def test_the_second_process_is_told_who_holds_the_file(holder, tmp_path):
+    with pytest.raises(InUseError, match=f"process {holder.pid} on .* since 20"), owned(tmp_path / "file.h5"):
+        pass
+    with owned(tmp_path / "other.h5"):  # another file is free
+        pass
+
+
+def test_a_killed_process_leaves_nothing_that_blocks(holder, tmp_path):
+    holder.kill()
+    holder.wait(PATIENCE)
+    begin = time.monotonic()
+    with owned(tmp_path / "file.h5"):
+        assert time.monotonic() - begin < 1.0
+
+
+def test_a_process_may_hold_a_file_again(tmp_path):
+    for _ in range(2):
+        with owned(tmp_path / "new folder/Übung.h5"):
+            assert not (tmp_path / "new folder/Übung.h5").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MachineError, match="file cannot be written"), owned(tmp_path / "file/inside.h5"):
+        pass
