@@ -1,7 +1,7 @@
-"""Evaluate a policy on fixed seeds.
+r"""Evaluate a policy on fixed seeds.
 
     python -m manifeel_ms3.evaluation.evaluate --checkpoint runs/x/checkpoints/last
-    python -m manifeel_ms3.evaluation.evaluate --policy my_module:MyPolicy --env-id ManiFeel-PegInsertion-v1 \\
+    python -m manifeel_ms3.evaluation.evaluate --policy my_module:MyPolicy --env-id ManiFeel-PegInsertion-v1 \
         --obs-mode rgb+tacff
 
 The result is one json file whose form `data/evaluation_schema.json` defines: versions, git commit, the policy's configuration,

@@ -80,8 +80,8 @@ def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:
     config = checkpoint_config(checkpoint)
     if "policy_name" not in config:
         raise CheckpointError(
-            f"{checkpoint} does not name a registered policy: its config.json has no policy_name, because it was written before "
-            "policies were registered by name, or by another program; train the policy again"
+            f"{checkpoint} does not name a registered policy: its config.json has no policy_name, because it was written "
+            "before policies were registered by name, or by another program; train the policy again"
         )
     try:
         plugin = plugins.load(plugins.POLICIES, str(config["policy_name"]))

@@ -124,7 +124,8 @@ def check_result(result: Any, source: Path) -> None:
         )
     if given != SCHEMA:
         raise ResultError(
-            f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate the policy again, or update manifeel-ms3"
+            f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate the policy again, or update "
+            "manifeel-ms3"
         )
     schema = json.loads((data_dir() / "evaluation_schema.json").read_text())
     for error in jsonschema.Draft202012Validator(schema).iter_errors(result):
