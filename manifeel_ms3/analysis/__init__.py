@@ -1,1 +1,1 @@
-"""What many results and recordings say together: the paper's protocol and claims, the information audit, similarity to real touch."""
+"""What many results and recordings say together: the paper's protocol and claims, information audit, similarity of touch."""
