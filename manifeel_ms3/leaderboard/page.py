@@ -80,8 +80,8 @@ def leaderboard_table(rows: list[Row]) -> str:
     """The leaderboard in Markdown."""
     head = (
         f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
-        f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of 95 %; where "
-        'there are fewer, "of" says how many.\n\n'
+        f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
+        '95 %; where there are fewer, "of" says how many.\n\n'
     )
     cells = []
     for row in rows:
