@@ -1,7 +1,7 @@
 """The paper's conditions and the numbers that it reports of them.
 
 A success rate is the mean over the last 10 checkpoints, 50 evaluation episodes and 3 training seeds. Which tasks a table
-reports is said by the tasks themselves (`TaskSpec.paper_tables`); the numbers are here, by the tasks' short names.
+reports stands in the tasks themselves (`TaskSpec.paper_tables`); the numbers are here, by the tasks' short names.
 """
 
 from collections.abc import Iterator

@@ -143,7 +143,8 @@ def fid(sim: np.ndarray, real: np.ndarray) -> float:
     # R of the QR decomposition is a root of a covariance, R'R; tr (R'R S'S)^1/2 is the sum of the singular values of R S'
     roots: list[Any] = [np.linalg.qr((side - side.mean(0)) / np.sqrt(len(side) - 1), mode="r") for side in (sim, real)]
     spread = sum((root**2).sum() for root in roots)
-    return float(gap @ gap + spread - 2 * linalg.svdvals(roots[0] @ roots[1].T).sum())
+    singular_values = np.asarray(linalg.svdvals(roots[0] @ roots[1].T))
+    return float(gap @ gap + spread - 2 * singular_values.sum())
 
 
 def kid(sim: np.ndarray, real: np.ndarray) -> float:
