@@ -1,4 +1,4 @@
-"""Serve a policy over HTTP, from any Python that has numpy: nothing of ManiFeel is needed here.
+"""Serve a policy over HTTP, from any Python that has numpy; nothing of ManiFeel needs to be installed there.
 
 python examples/policy_server.py --port 8000
 python -m manifeel_ms3.evaluation.evaluate --policy http://localhost:8000 --env-id ManiFeel-PegInsertion-v1 --obs-mode rgb+tacff
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class MyPolicy:
-    """Yours."""
+    """Replace this policy, which only moves downwards, by your own."""
 
     def reset(self):
         self.steps = 0
@@ -32,17 +32,17 @@ class Handler(BaseHTTPRequestHandler):
                 self.policy.reset()
             else:
                 np.savez(answer, action=self.policy.act(dict(np.load(io.BytesIO(body), allow_pickle=False))))
-        except Exception as error:  # the evaluation notes it, and goes on
+        except Exception as error:  # the evaluation records the message, and goes on with the next episode
             answer, status = io.BytesIO(f"{type(error).__name__}: {error}".encode()), 500
         self.send_response(status)
         self.end_headers()
         self.wfile.write(answer.getvalue())
 
     def log_message(self, format, *args):
-        pass
+        """Keep silent about requests."""
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--port", type=int, default=8000)
+    parser = argparse.ArgumentParser(description="Serve a policy over HTTP.")
+    parser.add_argument("--port", type=int, default=8000, help="Port that the server listens on.")
     HTTPServer(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()

@@ -1,0 +1,1 @@
+"""What many results and recordings say together: the paper's protocol and claims, information audit, similarity of touch."""

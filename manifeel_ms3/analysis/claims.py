@@ -1,14 +1,14 @@
-"""What the paper claims, against what has been run: `python -m manifeel_ms3.analysis.claims --results runs --out claims.md`.
+"""Test the paper's claims on results: `python -m manifeel_ms3.analysis.claims --results runs --out claims.md`.
 
-Each claim is a difference of two set-ups on the same starts, with its interval of 95 % and a verdict: it holds where the whole
-interval is above zero, does not where all of it is below, and is undecided otherwise.
+Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
+holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise.
 """
 
 import logging
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import permutations
+from itertools import chain, permutations
 from pathlib import Path
 from typing import Literal
 
@@ -18,96 +18,127 @@ from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.result import results_in
 
 from .markdown import markdown_table
-from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
-from .protocol import PAPER_NETWORK, Estimate, Runs, Setup, collect, difference
+from .paper import ENCODERS, EQUIDP, FM, MODES, TACFF, TACRGB, VISION, paper_condition, tasks_in_table
+from .protocol import PAPER_NETWORK, Condition, ConditionResults, Estimate, collect, difference
 
 log = logging.getLogger(__name__)
 Verdict = Literal["holds", "does not hold", "undecided"]
-MARGIN = 0.05  # of success: a gain that is smaller counts for none, where a claim says that there is none
-FORCE_TASKS = ("PegInsertion", "USBInsertion", "PowerPlugInsertion", "GearAssembly", "NutBoltAssembly", "BulbInstallation")
-EXPLORATION = ("PegReorientation", "ObjectSearch", "BallSortingDim")
+MARGIN = 0.05
+"""Largest gain in success that counts as none where a claim says that there is no gain: five points, our choice."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A claim about two set-ups of one task: the first succeeds more often, or, with `gain=False`, not more often."""
+    """A claim about two conditions of one task."""
 
     claim: str
-    first: Setup
-    second: Setup
+    """Number of the claim, and its text."""
+    first: Condition
+    second: Condition
     gain: bool = True
+    """Whether the claim is that the first condition succeeds more often; otherwise, that it does not."""
 
 
 @dataclass(frozen=True)
-class Answer:
+class ClaimResult:
+    """Outcome of a comparison."""
+
     comparison: Comparison
     difference: Estimate
+    """How much more often the first condition succeeds."""
     p_value: float
+    """Probability of such a difference if there is none (paired permutation test)."""
     verdict: Verdict
     network: str
+    """Encoder of camera images that both conditions were run with."""
 
 
 def comparisons() -> Iterator[Comparison]:
-    """The paper's claims. `num_demos` is left open where a claim does not speak of it."""
-    for task in FORCE_TASKS:
-        yield Comparison("1. TacFF beats vision where parts fit", setup(task, TACFF), setup(task, VISION))
-    for task in EXPLORATION:
-        yield Comparison("2. TacRGB beats vision where it explores", setup(task, TACRGB), setup(task, VISION))
+    """All comparisons of the paper's claims; `num_demos` is left open where a claim does not speak of it."""
+    return chain(_touch_claims(), _policy_claims(), _encoder_claims(), _demonstration_claims(), _camera_claims())
+
+
+def _touch_claims() -> Iterator[Comparison]:
+    for task in tasks_in_table("I", "insertion", "screwing"):
+        claim = "1. TacFF beats vision where parts fit"
+        yield Comparison(claim, paper_condition(task, TACFF), paper_condition(task, VISION))
+    for task in tasks_in_table("I", "exploration"):
+        claim = "2. TacRGB beats vision where the task is to explore"
+        yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION))
     for task in ("GearAssembly", "NutBoltAssembly", "BulbInstallation"):
         claim = "3. TacRGB does not beat vision on gear, nut and bulb"
-        yield Comparison(claim, setup(task, TACRGB), setup(task, VISION), gain=False)
-    for task in ("GearAssembly", "BulbInstallation", "ObjectSearch", "BallSorting"):
-        for mode in (VISION, TACRGB, TACFF):
-            yield Comparison("4. Flow Matching is below Diffusion Policy", setup(task, mode), setup(task, mode, FM))
-    for task in ("GearAssembly", "BulbInstallation"):
-        for mode in (VISION, TACRGB, TACFF):
+        yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION), gain=False)
+
+
+def _policy_claims() -> Iterator[Comparison]:
+    for task in tasks_in_table("II"):
+        for mode in MODES:
+            claim = "4. Flow Matching is below Diffusion Policy"
+            yield Comparison(claim, paper_condition(task, mode), paper_condition(task, mode, FM))
+    for task in tasks_in_table("II", "insertion", "screwing"):
+        for mode in MODES:
             claim = "5. The equivariant policy is above on gear and bulb"
-            yield Comparison(claim, setup(task, mode, EQUIDP), setup(task, mode))
-    for task in ("ObjectSearch", "BallSorting"):
-        for mode in (VISION, TACRGB, TACFF):
+            yield Comparison(claim, paper_condition(task, mode, EQUIDP), paper_condition(task, mode))
+    for task in tasks_in_table("II", "exploration"):
+        for mode in MODES:
             claim = "5. The equivariant policy is below on search and sorting"
-            yield Comparison(claim, setup(task, mode), setup(task, mode, EQUIDP))
-    for task in ("GearAssembly", "ObjectSearch", "BallSorting"):
-        for one, other in permutations(ENCODERS[task], 2):
-            first, second = (setup(task, TACRGB, encoder=name) for name in (one, other))
+            yield Comparison(claim, paper_condition(task, mode), paper_condition(task, mode, EQUIDP))
+
+
+def _encoder_claims() -> Iterator[Comparison]:
+    for task in tasks_in_table("III"):
+        for pair in permutations(ENCODERS[task], 2):
+            first, second = (paper_condition(task, TACRGB, encoder=name) for name in pair)
             yield Comparison("6. Tactile encoders differ by task", first, second)
-    gear = {count: setup("GearAssembly", TACFF, num_demos=count) for count in (40, 80, 100)}
+
+
+def _demonstration_claims() -> Iterator[Comparison]:
+    gear = {count: paper_condition("GearAssembly", TACFF, num_demos=count) for count in (40, 80, 100)}
     yield Comparison("7. Success grows up to about 80 demonstrations", gear[80], gear[40])
     yield Comparison("7. Success saturates near 80 demonstrations", gear[100], gear[80], gain=False)
+
+
+def _camera_claims() -> Iterator[Comparison]:
     for mode in (VISION, TACRGB):
-        wrist, front = (setup("ObjectSearch", mode, camera=camera) for camera in ("wrist", "front"))
+        wrist, front = (paper_condition("ObjectSearch", mode, camera=camera) for camera in ("wrist", "front"))
         yield Comparison("8. The wrist camera is above the front camera in object search", wrist, front)
     for camera in ("wrist", "front"):
-        with_touch, without = (setup("ObjectSearch", mode, camera=camera) for mode in (TACRGB, VISION))
+        with_touch, without = (paper_condition("ObjectSearch", mode, camera=camera) for mode in (TACRGB, VISION))
         yield Comparison("8. TacRGB helps from both viewpoints", with_touch, without)
 
 
-def answer(comparison: Comparison, found: dict[Setup, Runs]) -> Answer | None:
-    """What was run says; None where it was not."""
-    runs, network = find_alike([comparison.first, comparison.second], found)
-    if not runs:
+def result_of_claim(comparison: Comparison, found: dict[Condition, ConditionResults]) -> ClaimResult | None:
+    """The outcome of a comparison; None where one of its conditions was not run."""
+    results, network = find_with_one_network([comparison.first, comparison.second], found)
+    if not results:
         return None
-    gap, p_value = difference(*runs)
-    return Answer(comparison, gap, p_value, _verdict(comparison, gap), network)
+    gap, p_value = difference(*results)
+    return ClaimResult(comparison, gap, p_value, _verdict(comparison, gap), network)
 
 
-def answers_of(found: dict[Setup, Runs]) -> dict[Comparison, Answer | None]:
-    return {comparison: answer(comparison, found) for comparison in comparisons()}
+def results_of_claims(found: dict[Condition, ConditionResults]) -> dict[Comparison, ClaimResult | None]:
+    """The outcomes of all comparisons; None for those that were not run."""
+    return {comparison: result_of_claim(comparison, found) for comparison in comparisons()}
 
 
-def find(wanted: Setup, found: dict[Setup, Runs]) -> Runs | None:
-    """The runs of a set-up; where it leaves the number of demonstrations open, those with the most."""
-    alike = [other for other in found if wanted == (other if wanted.num_demos else replace(other, num_demos=None))]
-    return found[max(alike, key=lambda other: other.num_demos or 0)] if alike else None
+def find(wanted: Condition, found: dict[Condition, ConditionResults]) -> ConditionResults | None:
+    """The results of a condition; where it leaves the number of demonstrations open, those with the most demonstrations."""
+    fitting = [other for other in found if wanted == (other if wanted.num_demos else replace(other, num_demos=None))]
+    return found[max(fitting, key=lambda other: other.num_demos or 0)] if fitting else None
 
 
-def find_alike(wanted: list[Setup], found: dict[Setup, Runs]) -> tuple[list[Runs], str]:
-    """The runs of set-ups with one network, and which: the paper's, or else another that all of them were run with; none if
-    there is no such."""
+def find_with_one_network(
+    wanted: list[Condition], found: dict[Condition, ConditionResults]
+) -> tuple[list[ConditionResults], str]:
+    """The results of conditions that were all run with the same network, and its name.
+
+    The network is the paper's if all conditions were run with it, else another one. Without such a network the list is empty.
+    """
     for network in sorted({other.network for other in found}, key=lambda network: (network != PAPER_NETWORK, network)):
-        runs = [find(replace(side, network=network), found) for side in wanted]
-        if None not in runs:
-            return runs, network
+        results = [find(replace(side, network=network), found) for side in wanted]
+        complete = [side for side in results if side is not None]
+        if len(complete) == len(wanted):
+            return complete, network
     return [], ""
 
 
@@ -117,46 +148,47 @@ def _verdict(comparison: Comparison, gap: Estimate) -> Verdict:
     return "holds" if gap.high < MARGIN else "does not hold" if gap.low > 0 else "undecided"
 
 
-def table(answers: dict[Comparison, Answer | None]) -> str:
-    """Markdown: a row a comparison; those not run say so."""
+def claims_table(results: dict[Comparison, ClaimResult | None]) -> str:
+    """A Markdown table with a row for each comparison, those that were not run included."""
     rows = []
-    for comparison, found in answers.items():
-        said = (None, None, "not run", None)
+    for comparison, found in results.items():
+        outcome = (None, None, "not run", None)
         if found:
-            said = (found.difference.signed, f"{found.p_value:.3f}", found.verdict, found.network)
-        rows.append((comparison.claim, comparison.first.task, _named(comparison), *said))
+            outcome = (found.difference.signed, f"{found.p_value:.3f}", found.verdict, found.network)
+        rows.append((comparison.claim, comparison.first.task, _compared(comparison), *outcome))
     return markdown_table(("claim", "task", "compared", "difference", "p", "verdict", "network"), rows)
 
 
-def _named(comparison: Comparison) -> str:
-    """What differs between the two."""
+def _compared(comparison: Comparison) -> str:
+    """The first property in which the two conditions differ, and what they share."""
     pairs = zip(vars(comparison.first).values(), vars(comparison.second).values(), strict=True)
     shared = " ".join(filter(None, (comparison.first.policy, comparison.first.obs_mode)))
-    differing = [(a, b) for a, b in pairs if a != b and a and b]
-    a, b = differing[0]
-    named = [", ".join(x) if isinstance(x, tuple) else str(x) for x in (a, b)]
-    return f"{named[0]} over {named[1]} ({shared})"
+    differing = [pair for pair in pairs if pair[0] != pair[1] and all(pair)]
+    first, second = (", ".join(value) if isinstance(value, tuple) else str(value) for value in differing[0])
+    return f"{first} over {second} ({shared})"
 
 
 @dataclass
 class Args:
+    """Arguments of the test of claims."""
+
     results: tuple[Path, ...]
-    """folders with result files"""
+    """Folders with result files."""
     out: Path | None = None
-    """Markdown to write; default: shown only"""
+    """Path of a Markdown file for the table; the table is only shown if not given."""
 
 
-def main(args: Args) -> dict[Comparison, Answer | None]:
-    """Answer every claim that has been run.
+def main(args: Args) -> dict[Comparison, ClaimResult | None]:
+    """Test every claim whose conditions have been run.
 
     Raises:
-        ResultError: there is no result, or one is broken.
+        ResultError: There is no result, or one is broken.
     """
-    answers = answers_of(collect(results_in(*args.results)))
-    log.info("%s", table(answers))
+    results = results_of_claims(collect(results_in(*args.results)))
+    log.info("%s", claims_table(results))
     if args.out:
-        args.out.write_text(table(answers))
-    return answers
+        args.out.write_text(claims_table(results))
+    return results
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""What vision and touch carry: `python -m manifeel_ms3.analysis.information_audit --demos data/demos --out runs/audit`.
+"""Measure what vision and touch carry: `python -m manifeel_ms3.analysis.information_audit --demos data/demos --out runs/audit`.
 
-Small probes, trained on recorded observations of one camera or one pad at one moment, tell what a policy would need to know:
-which ball is held, where the battery is, at what angle the peg lies in the hand. What a probe cannot tell from a modality, a
-policy that has that modality alone will hardly know. Answers are cross-validated over episodes.
+Small predictors, fitted to recorded observations of one camera or one pad at one moment, answer the questions of
+`manifeel_ms3.analysis.probes`, which a policy would need to answer. Where they cannot answer from a modality, a policy that
+has that modality alone will hardly know. Predictions are cross-validated over episodes.
+
+The table and the figure go into the documentation, so the figure is a static image that matplotlib draws.
 """
 
 import json
@@ -10,353 +12,333 @@ import logging
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
-from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
-from manifeel_ms3.tasks.registry import short_name, task_spec
+from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
+
+from .markdown import markdown_table
+from .probes import Episode, Probe
 
 log = logging.getLogger(__name__)
-MODALITIES = ("camera", "tacrgb", "tacff")
+MODALITIES = {"camera": "camera", "tacrgb": "TacRGB", "tacff": "TacFF"}
+"""Names of the modalities, and their titles in the table and the figure."""
 FOLDS = 5
-COMPONENTS = 64  # principal components of the features that a probe sees
-GRID, SCALES = 16, (1.0, 2.0, 4.0, 8.0)  # cells a side; pixels
-TOUCHES, FREE = 1.5, 0.5  # N: of a held part on the world
-Recorded = Any  # an episode's group in a trajectory file
-Samples = Iterator[tuple[int, float]]
-
-
-# -------------------------------------------------------------------- questions
-
-
-@dataclass(frozen=True)
-class Question:
-    """Something that an observation may tell: `samples(episode)` yields (index of the observation, answer)."""
-
-    name: str
-    env_id: str
-    samples: Callable[[Recorded], Samples]
-    unit: str = ""
-    """of a number to estimate; "" where the answer is one of two classes"""
-
-
-def _position(episode: Recorded, name: str) -> np.ndarray:
-    return episode[f"env_states/actors/{name}"][:, :3]
-
-
-def _closings(episode: Recorded) -> list[int]:
-    """Observations at which the fingers have just closed."""
-    closed = episode["actions"][:, -1] < 0.5
-    starts = np.flatnonzero(closed & ~np.r_[False, closed[:-1]])
-    return [int(start) + 6 for start in starts if start + 6 < len(closed)]
-
-
-def _which_ball(episode: Recorded) -> Samples:
-    tool = episode["obs/extra/tcp_pose"][:, :3]
-    for t in _closings(episode)[:1]:  # the first guess is right as often as wrong
-        away = [np.linalg.norm(_position(episode, f"{ball}_ball")[t] - tool[t]) for ball in ("golf", "tennis")]
-        yield t, float(away[0] < away[1])
-
-
-def _battery_place(episode: Recorded) -> Samples:
-    far = float(_position(episode, "battery")[0, 0] > CONTAINER_XY[0])
-    for t in (1, 4, 7):
-        yield t, far
-
-
-def _battery_in_hand(episode: Recorded) -> Samples:
-    tool = episode["obs/extra/tcp_pose"][:, :3]
-    for t in _closings(episode)[:1]:
-        yield t, float(np.linalg.norm((_position(episode, "battery")[t] - tool[t])[:2]) < 0.04)
-
-
-def _pitch_in_hand(episode: Recorded) -> Samples:
-    (name,) = [name for name in episode["env_states/actors"] if name.endswith("peg")]
-    plug = episode[f"env_states/actors/{name}"][:, 3:7]
-    tool = episode["obs/extra/tcp_pose"][:, 3:7]
-    for t in (1, 4, 7):
-        held = Rotation.from_quat(tool[t][[1, 2, 3, 0]]).inv() * Rotation.from_quat(plug[t][[1, 2, 3, 0]])
-        yield t, float(np.rad2deg(held.as_rotvec()[1]))
-
-
-def _in_contact(episode: Recorded) -> Samples:
-    force = episode["contact_force"][()]
-    for t in range(0, len(force), 4):
-        if force[t] > TOUCHES or force[t] < FREE:
-            yield t + 1, float(force[t] > TOUCHES)
-
-
-def _descent(episode: Recorded, held: str, fixed: str, engaged: float) -> np.ndarray:
-    return engaged - (_position(episode, held)[:, 2] - _position(episode, fixed)[:, 2])
-
-
-def _touching(episode: Recorded, every: int) -> Iterator[int]:
-    """Observations of a held part that touches the world."""
-    force = episode["contact_force"][()]
-    return (t + 1 for t in range(0, len(force), every) if force[t] > TOUCHES)
-
-
-def _thread_engaged(episode: Recorded) -> Samples:
-    screw = nut_and_bolt()
-    descent = _descent(episode, "nut", "bolt", screw.engaged)
-    for t in _touching(episode, 4):
-        if abs(descent[t]) < screw.pitch:
-            yield t, float(descent[t] > 0)
-
-
-def _tightened(episode: Recorded) -> Samples:
-    screw = bulb_and_holder()
-    gap = screw.engaged - screw.seated - _descent(episode, "bulb", "holder", screw.engaged)
-    for t in _touching(episode, 3):
-        if gap[t] < 0.5 * screw.pitch:
-            yield t, float(gap[t] < -2e-4)  # the contact's spring is pressed in
-
-
-QUESTIONS = (
-    Question("ball in the hand: golf or table tennis", "ManiFeel-BallSorting-v1", _which_ball),
-    Question("ball in the hand: golf or table tennis", "ManiFeel-BallSortingDim-v1", _which_ball),
-    Question("battery's place, before contact", "ManiFeel-ObjectSearch-v1", _battery_place),
-    Question("battery between the fingers or not, once closed", "ManiFeel-ObjectSearch-v1", _battery_in_hand),
-    Question("peg's pitch in the hand", "ManiFeel-PegInsertion-v1", _pitch_in_hand, "degrees"),
-    Question("peg's pitch in the hand", "ManiFeel-PegReorientation-v1", _pitch_in_hand, "degrees"),
-    Question("peg touches or not", "ManiFeel-PegInsertion-v1", _in_contact),
-    Question("peg touches or not", "ManiFeel-PegReorientation-v1", _in_contact),
-    Question("thread engaged or resting on it", "ManiFeel-NutBoltAssembly-v1", _thread_engaged),
-    Question("bulb tight or not yet", "ManiFeel-BulbInstallation-v1", _tightened),
-)
-
-
-# -------------------------------------------------------------------- features and probes
-
-
-def image_features(image: np.ndarray) -> np.ndarray:
-    """Features (1792,) of a picture (H, W, 3) uint8: colours on a grid, and how much it varies there at four scales."""
-    picture = image.astype(np.float32) / 255
-
-    def pooled(values: np.ndarray) -> np.ndarray:
-        return cv2.resize(values, (GRID, GRID), interpolation=cv2.INTER_AREA).ravel()
-
-    grey = picture.mean(-1)
-    blurred = [grey] + [cv2.GaussianBlur(grey, (0, 0), scale) for scale in SCALES]
-    bands = [np.abs(fine - coarse) for fine, coarse in zip(blurred, blurred[1:], strict=False)]
-    return np.concatenate([pooled(picture), *(pooled(band) for band in bands)])
-
-
-def _sensor(env_id: str, modality: str) -> str:
-    """What a probe sees: the task's policy camera, or the right pad."""
-    return task_spec(env_id).policy_camera if modality == "camera" else "tactile_right"
-
-
-def _features(episode: Recorded, sensor: str, modality: str, t: int) -> np.ndarray:
-    seen = episode[f"obs/sensor_data/{sensor}"]
-    return seen["force_field"][t].ravel() if modality == "tacff" else image_features(seen["rgb"][t])
+"""Number of parts that the episodes are split into; each part is predicted from a fit to the others."""
+FEWEST_EPISODES = 2 * FOLDS
+"""Number of episodes that a question needs: two in each part."""
+COMPONENTS = 64
+"""Number of principal components of the features that a predictor is fitted to; fewer than there are samples."""
+GRID = 16
+"""Number of cells of the features' grid along each side of an image."""
+SCALES = (1.0, 2.0, 4.0, 8.0)
+"""Standard deviations of the blurs between which an image's detail is measured, in pixels: an octave apart."""
+RESAMPLES = 1000
+"""Number of resamples of the bootstrap."""
+TAILS = (0.025, 0.975)
+"""Quantiles at the ends of an interval of 95 %."""
+SVM_PENALTY = 10.0
+"""Penalty C of the support vector machine; ten times scikit-learn's default, for a closer fit to few samples."""
+LENGTH_SCALE, NOISE = 10.0, 0.1
+"""Initial values of the Gaussian process's kernel: length in units of the principal components, and variance of the noise as a
+share of the answers'. Its fit replaces both."""
+PANEL = (2.1, 3.4)
+"""Width and height of one question's panel in the figure, in inches."""
+FONT_SIZE, TITLE_WIDTH = 7, 28
+"""Size of the figure's letters in points, and letters in a line of a title, which then fits a panel."""
+COLOURS = ("#8a8f98", "#c7793a", "#3a74c7")
+"""Colours of the bars, in the order of MODALITIES."""
+HEADROOM = 1.05
+"""Upper end of an axis of shares, so that the line of an interval at 100 % is visible."""
+DPI = 130
+"""Resolution of the figure, in pixels per inch."""
 
 
 @dataclass
-class Answer:
-    """How well one modality answers a question. `score`: share of right answers, each class weighing the same, or root mean
-    square error in `unit`; `interval`: 95 %, from a bootstrap over episodes; `chance`: the score of an answer that never looks.
-    """
+class ProbeResult:
+    """How well one modality answers a question."""
 
     question: str
     env_id: str
     modality: str
+    """"camera", "tacrgb" or "tacff"."""
     unit: str
+    """Unit of the score if the answer is a number; empty if it is one of two classes."""
     score: float
+    """Share of right answers, each class weighing the same; or root mean square error in `unit`."""
     interval: tuple[float, float]
+    """Interval of 95 % of the score, from a bootstrap over episodes."""
     chance: float
+    """Score of the best constant answer."""
     episodes: int
+    """Number of episodes that answer the question."""
     samples: int
+    """Number of moments at which it was asked."""
     sensor: str
+    """Camera or pad that was observed."""
 
 
-def ask(question: Question, path: Path) -> list[Answer]:
-    """Answers of every modality, from one trajectory file.
+# -------------------------------------------------------------------- features
+
+
+def image_features(image: np.ndarray) -> np.ndarray:
+    """Features (1792,) of an image (H, W, 3) uint8: the colours on a grid, and the amount of detail there at four scales."""
+    image = image.astype(np.float32) / 255
+
+    def pooled(values: np.ndarray) -> np.ndarray:
+        return cv2.resize(values, (GRID, GRID), interpolation=cv2.INTER_AREA).ravel()
+
+    grey = image.mean(-1)
+    blurred = [grey] + [cv2.GaussianBlur(grey, (0, 0), scale) for scale in SCALES]
+    bands = [np.abs(fine - coarse) for fine, coarse in pairwise(blurred)]
+    return np.concatenate([pooled(image), *(pooled(band) for band in bands)])
+
+
+def _sensor(env_id: str, modality: str) -> str:
+    """The sensor of a modality: the task's policy camera, or the right pad."""
+    return task_spec(env_id).policy_camera if modality == "camera" else "tactile_right"
+
+
+def _features(episode: Episode, sensor: str, modality: str, t: int) -> np.ndarray:
+    observed = episode[f"obs/sensor_data/{sensor}"]
+    return observed["force_field"][t].ravel() if modality == "tacff" else image_features(observed["rgb"][t])
+
+
+# -------------------------------------------------------------------- measurement
+
+
+@dataclass
+class _Data:
+    """What a question is answered from: n moments of recorded episodes."""
+
+    truth: np.ndarray
+    """True answers (n,)."""
+    episodes: np.ndarray
+    """Numbers of the episodes (n,)."""
+    features: dict[str, np.ndarray]
+    """Features (n, d) by modality."""
+
+
+def run_probe(probe: Probe, env_id: str, path: Path) -> list[ProbeResult]:
+    """Ask a question of every modality.
+
+    Args:
+        probe: The question.
+        env_id: Id of the task.
+        path: Trajectory file of the task.
 
     Raises:
-        DemonstrationError: the file lacks what is asked of, or has too few episodes to cross-validate.
+        DemonstrationError: The file lacks an observation, or has too few episodes to cross-validate.
     """
-    header = read_header(path)
-    if len(header["episodes"]) < 2 * FOLDS:
-        raise DemonstrationError(
-            f"{path} holds {len(header['episodes'])} episodes, at least {2 * FOLDS} are needed; record more"
-        )
-    answers, groups = [], []
+    data = _read(probe, env_id, path)
+    numeric = bool(probe.unit)
+    constant = data.truth.mean() if numeric else float(data.truth.mean() > 0.5)
+    chance = _score(data.truth, np.full_like(data.truth, constant), data.episodes, numeric)[0]
+    results = []
+    for modality, features in data.features.items():
+        predicted = cross_validated(features, data.truth, data.episodes, numeric)
+        score, low, high = _score(data.truth, predicted, data.episodes, numeric)
+        counts = (len(set(data.episodes)), len(data.truth), _sensor(env_id, modality))
+        results.append(ProbeResult(probe.question, env_id, modality, probe.unit, score, (low, high), chance, *counts))
+    return results
+
+
+def _read(probe: Probe, env_id: str, path: Path) -> _Data:
+    recorded = len(read_header(path)["episodes"])
+    if recorded < FEWEST_EPISODES:
+        raise DemonstrationError(f"{path} holds {recorded} episodes, at least {FEWEST_EPISODES} are needed; record more")
+    truth, episodes = [], []
     features: dict[str, list[np.ndarray]] = {modality: [] for modality in MODALITIES}
     with open_trajectories(path) as file:
-        for i in range(len(header["episodes"])):
-            episode = file[f"traj_{i}"]
-            for t, answer in question.samples(episode):
-                answers.append(answer)
-                groups.append(i)
+        for i in range(recorded):
+            for t, answer in probe.samples(file[f"traj_{i}"]):
+                truth.append(answer)
+                episodes.append(i)
                 for modality, rows in features.items():
+                    sensor = _sensor(env_id, modality)
                     try:
-                        rows.append(_features(episode, _sensor(question.env_id, modality), modality, t))
+                        rows.append(_features(file[f"traj_{i}"], sensor, modality, t))
                     except KeyError as error:
                         raise DemonstrationError(
-                            f"{path} lacks {modality} of {_sensor(question.env_id, modality)} ({error}); record it with "
-                            "obs_mode rgb+tacrgb+tacff, the task's policy camera and the right pad"
+                            f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode rgb+tacrgb+tacff, the "
+                            "task's policy camera and the right pad"
                         ) from error
-    if len(set(groups)) < 2 * FOLDS:
+    if len(set(episodes)) < FEWEST_EPISODES:
         raise DemonstrationError(
-            f"{path}: {len(set(groups))} episodes answer {question.name!r}, {2 * FOLDS} are needed; record more"
+            f"{path}: {len(set(episodes))} episodes answer {probe.question!r}, {FEWEST_EPISODES} are needed; record more"
         )
-    truth, episodes = np.array(answers), np.array(groups)
-    out = []
-    for modality, rows in features.items():
-        guess = probe(np.stack(rows), truth, episodes, numeric=bool(question.unit))
-        score, low, high = _score(truth, guess, episodes, bool(question.unit))
-        usual = np.full_like(truth, truth.mean() if question.unit else float(truth.mean() > 0.5))
-        chance = _score(truth, usual, episodes, bool(question.unit))[0]
-        seen = (len(set(groups)), len(truth), _sensor(question.env_id, modality))
-        out.append(Answer(question.name, question.env_id, modality, question.unit, score, (low, high), chance, *seen))
-    return out
+    stacked = {modality: np.stack(rows) for modality, rows in features.items()}
+    return _Data(np.array(truth), np.array(episodes), stacked)
 
 
-def probe(features: np.ndarray, truth: np.ndarray, episodes: np.ndarray, numeric: bool) -> np.ndarray:
-    """Answers (n,) of a small machine on features (n, d), each from a fit without that episode.
+def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarray, numeric: bool) -> np.ndarray:
+    """Predicted answers (n,), each from a fit to other episodes.
 
-    A class by a support vector machine, a number by a Gaussian process; both on principal components.
+    Classes are predicted by a support vector machine, numbers by a Gaussian process, both on principal components.
+
+    Args:
+        features: Features (n, d) of the observations.
+        truth: True answers (n,).
+        episodes: Numbers (n,) of the episodes that the observations are from.
+        numeric: Whether the answers are numbers; otherwise they are two classes.
+
+    Raises:
+        MissingExtraError: The extra `audit`, which brings scikit-learn, is not installed.
     """
-    from sklearn.decomposition import PCA
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    from sklearn.model_selection import GroupKFold, cross_val_predict
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-    from sklearn.svm import SVC
+    with missing_extras_named():
+        from sklearn.decomposition import PCA
+        from sklearn.exceptions import ConvergenceWarning
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+        from sklearn.model_selection import GroupKFold, cross_val_predict
+        from sklearn.pipeline import make_pipeline
+        from sklearn.preprocessing import StandardScaler
+        from sklearn.svm import SVC
 
     features = features[:, features.std(0) > 0]
     if not features.size:  # the sensor shows the same at all times
         features = np.zeros((len(truth), 1))
     components = PCA(min(COMPONENTS, features.shape[1], len(truth) // 2), random_state=0)
     if numeric:
-        kernel = ConstantKernel(1.0) * RBF(10.0) + WhiteKernel(0.1)
+        kernel = ConstantKernel(1.0) * RBF(LENGTH_SCALE) + WhiteKernel(NOISE)
         pipeline = make_pipeline(components, GaussianProcessRegressor(kernel, normalize_y=True))
     else:
-        pipeline = make_pipeline(StandardScaler(), components, SVC(C=10.0, class_weight="balanced"))
-    # no fault: a picture without change has no variance to share out, and a fit may end at its kernel's bounds
+        pipeline = make_pipeline(StandardScaler(), components, SVC(C=SVM_PENALTY, class_weight="balanced"))
+    # neither is a fault: an image without change has no variance to share out, and a fit may end at its kernel's bounds
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS))
+        return np.asarray(cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS)))
 
 
-def _score(truth: np.ndarray, guess: np.ndarray, episodes: np.ndarray, numeric: bool, resamples: int = 1000):
-    """Score and its 95 % interval, from a bootstrap over episodes."""
-    right = (guess - truth) ** 2 if numeric else (guess == truth).astype(float)
-    kinds = np.zeros(len(truth)) if numeric else truth
-    own = (episodes[:, None] == np.unique(episodes)).T[:, None] & (
-        kinds[:, None] == np.unique(kinds)
-    ).T  # episode, class, sample
-    sums, counts = own @ right, own.sum(-1)
-    drawn = np.random.default_rng(0).integers(len(own), size=(resamples, len(own)))
-    drawn = np.concatenate([np.arange(len(own))[None], drawn])  # the first is the recording itself
-    with np.errstate(invalid="ignore"):  # a class that was not drawn
-        values = np.nanmean(sums[drawn].sum(1) / counts[drawn].sum(1), axis=1)
-    values = np.sqrt(values) if numeric else values
-    return float(values[0]), *(float(x) for x in np.quantile(values[1:], [0.025, 0.975]))
+def _score(truth: np.ndarray, predicted: np.ndarray, episodes: np.ndarray, numeric: bool) -> tuple[float, float, float]:
+    """Score and the ends of its 95 % interval, from a bootstrap over episodes."""
+    value = (predicted - truth) ** 2 if numeric else (predicted == truth).astype(float)
+    classes = np.zeros(len(truth)) if numeric else truth
+    in_episode = (episodes[:, None] == np.unique(episodes)).T[:, None]
+    of_class = (classes[:, None] == np.unique(classes)).T
+    members = in_episode & of_class  # (episodes, classes, n)
+    sums, counts = members @ value, members.sum(-1)
+    drawn = np.random.default_rng(0).integers(len(members), size=(RESAMPLES, len(members)))
+    drawn = np.concatenate([np.arange(len(members))[None], drawn])  # the first is the recording itself
+    with np.errstate(invalid="ignore"):  # a class may be missing from a resample
+        scores = np.nanmean(sums[drawn].sum(1) / counts[drawn].sum(1), axis=1)
+    scores = np.sqrt(scores) if numeric else scores
+    low, high = np.quantile(scores[1:], TAILS)
+    return float(scores[0]), float(low), float(high)
 
 
 # -------------------------------------------------------------------- table and figure
 
 
-def table(answers: list[Answer]) -> str:
-    """Markdown: a row a question, a column a modality."""
-    lines = ["| task | question | chance | camera | TacRGB | TacFF |", "|---|---|---|---|---|---|"]
-    for rows in _by_question(answers):
-        cells = {answer.modality: _cell(answer) for answer in rows}
-        first = rows[0]
-        chance = f"{first.chance:.1f}°" if first.unit else f"{first.chance:.0%}"
-        task = short_name(first.env_id)
-        scores = f"{cells['camera']} ({first.sensor}) | {cells['tacrgb']} | {cells['tacff']}"
-        lines.append(f"| {task} | {first.question} | {chance} | {scores} |")
-    return "\n".join(lines) + "\n"
+def audit_table(results: list[ProbeResult]) -> str:
+    """A Markdown table with a row for each question and a column for each modality."""
+    rows = []
+    for group in _by_question(results):
+        first = group[0]
+        chance = f"{first.chance:.1f}{_suffix(first)}" if first.unit else f"{first.chance:.0%}"
+        cells = [f"{_cell(first)} ({first.sensor})", *(_cell(result) for result in group[1:])]
+        rows.append((short_name(first.env_id), first.question, chance, *cells))
+    return markdown_table(("task", "question", "chance", *MODALITIES.values()), rows)
 
 
-def _cell(answer: Answer) -> str:
-    low, high = answer.interval
-    if answer.unit:
-        return f"{answer.score:.1f}° [{low:.1f}, {high:.1f}]"
-    return f"{answer.score:.0%} [{100 * low:.0f}, {100 * high:.0f}]"
+def _cell(result: ProbeResult) -> str:
+    low, high = result.interval
+    if result.unit:
+        return f"{result.score:.1f}{_suffix(result)} [{low:.1f}, {high:.1f}]"
+    return f"{result.score:.0%} [{100 * low:.0f}, {100 * high:.0f}]"
 
 
-def _by_question(answers: list[Answer]) -> list[list[Answer]]:
-    return [answers[k : k + len(MODALITIES)] for k in range(0, len(answers), len(MODALITIES))]
+def _suffix(result: ProbeResult) -> str:
+    return "°" if result.unit == "degrees" else f" {result.unit}"
 
 
-def figure(answers: list[Answer], path: Path) -> None:
-    """Bars of every question's scores, with their intervals, and chance."""
-    from matplotlib.figure import Figure
+def _by_question(results: list[ProbeResult]) -> Iterator[list[ProbeResult]]:
+    return (results[k : k + len(MODALITIES)] for k in range(0, len(results), len(MODALITIES)))
 
-    rows = _by_question(answers)
-    fig = Figure(figsize=(2.1 * len(rows), 3.4), layout="constrained")
-    axes = fig.subplots(1, len(rows))
-    for ax, group in zip(np.atleast_1d(axes), rows, strict=True):
+
+def draw_figure(results: list[ProbeResult], path: Path) -> None:
+    """Draw every question's scores as bars, with their intervals and chance.
+
+    Raises:
+        MissingExtraError: The extra `audit`, which brings matplotlib, is not installed.
+    """
+    with missing_extras_named():
+        from matplotlib.figure import Figure
+
+    groups = list(_by_question(results))
+    fig = Figure(figsize=(PANEL[0] * len(groups), PANEL[1]), layout="constrained")
+    axes = fig.subplots(1, len(groups))
+    places = range(len(MODALITIES))
+    for ax, group in zip(np.atleast_1d(axes), groups, strict=True):
         factor = 1 if group[0].unit else 100
-        score = np.array([answer.score for answer in group]) * factor
-        spread = np.array([answer.interval for answer in group]).T * factor
-        ax.bar(range(3), score, color=["#8a8f98", "#c7793a", "#3a74c7"])
-        ax.errorbar(range(3), score, np.abs(spread - score), fmt="none", ecolor="black", capsize=3, lw=1)
+        score = np.array([result.score for result in group]) * factor
+        ends = np.array([result.interval for result in group]).T * factor
+        ax.bar(places, score, color=COLOURS)
+        ax.errorbar(places, score, np.abs(ends - score), fmt="none", ecolor="black", capsize=3, lw=1)
         ax.axhline(group[0].chance * factor, color="black", ls=":", lw=1)
-        ax.set_xticks(range(3), ["camera", "TacRGB", "TacFF"], fontsize=7)
-        ax.set_ylabel("RMSE, degrees" if group[0].unit else "right answers, %", fontsize=7)
-        ax.tick_params(axis="y", labelsize=7)
+        ax.set_xticks(places, list(MODALITIES.values()), fontsize=FONT_SIZE)
+        ax.set_ylabel(f"RMSE, {group[0].unit}" if group[0].unit else "right answers, %", fontsize=FONT_SIZE)
+        ax.tick_params(axis="y", labelsize=FONT_SIZE)
         if not group[0].unit:
-            ax.set_ylim(0, 105)
-        task = short_name(group[0].env_id)
-        ax.set_title(f"{task}\n{textwrap.fill(group[0].question, 28)}", fontsize=7)
-    fig.savefig(path, dpi=130)
+            ax.set_ylim(0, 100 * HEADROOM)
+        ax.set_title(f"{short_name(group[0].env_id)}\n{textwrap.fill(group[0].question, TITLE_WIDTH)}", fontsize=FONT_SIZE)
+    fig.savefig(path, dpi=DPI)
 
 
 @dataclass
 class Args:
+    """Arguments of the information audit."""
+
     demos: Path = Path("data/demos")
-    """folder that `manifeel_ms3.demonstrations.dataset` has written"""
+    """Folder with the recordings of `manifeel dataset`, one trajectory.h5 in a folder of each task."""
     out: Path = Path("runs/audit")
-    """folder for audit.json, audit.md and audit.png"""
+    """Folder for audit.json, audit.md and audit.png."""
 
 
-def main(args: Args) -> list[Answer]:
+def main(args: Args) -> list[ProbeResult]:
     """Ask every question whose task has been recorded.
 
     Raises:
-        DemonstrationError: there is no recording of any.
-        ModuleNotFoundError: the extra is not installed.
+        DemonstrationError: No task with a question has been recorded.
+        MissingExtraError: The extra `audit` is not installed.
     """
-    try:
-        import sklearn  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{error}; the audit needs `pip install manifeel_ms3[audit]`") from error
-    paths = {question: args.demos / question.env_id / "trajectory.h5" for question in QUESTIONS}
-    asked = {question: path for question, path in paths.items() if path.is_file()}
-    for question in set(QUESTIONS) - set(asked):
-        log.warning("%s has not been recorded in %s: left out", question.env_id, args.demos)
-    if not asked:
+    with missing_extras_named():
+        import sklearn  # noqa: F401  (asked for before the recordings are read)
+    recorded = dict(_recorded_tasks(args.demos))
+    if not recorded:
         raise DemonstrationError(
             f"{args.demos} holds no <task>/trajectory.h5; record with `python -m manifeel_ms3.demonstrations.dataset`"
         )
-    answers: list[Answer] = []
+    asked = [(probe, spec.env_id, path) for path, spec in recorded.items() for probe in spec.probes]
+    results: list[ProbeResult] = []
     with progress_bar() as bar:
-        for question, path in bar.track(asked.items(), description="asking"):
-            answers += ask(question, path)
+        for probe, env_id, path in bar.track(asked, description="asking"):
+            results += run_probe(probe, env_id, path)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "audit.json").write_text(json.dumps([asdict(answer) for answer in answers], indent=1))
-    (args.out / "audit.md").write_text(table(answers))
-    figure(answers, args.out / "audit.png")
-    log.info("%s", table(answers))
-    return answers
+    (args.out / "audit.json").write_text(json.dumps([asdict(result) for result in results], indent=1))
+    (args.out / "audit.md").write_text(audit_table(results))
+    draw_figure(results, args.out / "audit.png")
+    log.info("%s", audit_table(results))
+    return results
+
+
+def _recorded_tasks(demos: Path) -> Iterator[tuple[Path, TaskSpec]]:
+    """Trajectory files of the tasks that have questions and were recorded; the others are named in the log."""
+    for spec in all_tasks().values():
+        path = demos / spec.env_id / "trajectory.h5"
+        if spec.probes and path.is_file():
+            yield path, spec
+        elif spec.probes:
+            log.warning("%s is left out: %s does not exist", spec.env_id, path)
 
 
 if __name__ == "__main__":

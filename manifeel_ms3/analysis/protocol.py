@@ -1,11 +1,11 @@
-"""The paper's protocol: a set-up's success is the mean over the last ten checkpoints, all starts and all training seeds.
+"""The paper's protocol: the success of a condition is the mean over the last ten checkpoints, all episodes and training seeds.
 
-What is compared is a `Setup`; what was run of it, its `Runs`, is collected from result files. A difference of two set-ups is
-taken start by start, since both are evaluated on the same ones.
+A `Condition` is what is compared: a task, its observations and a policy. The results of a condition are collected from result
+files. The difference of two conditions is taken episode by episode, since both are evaluated on the same initial states.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,37 +16,48 @@ from manifeel_ms3.evaluation.result import ResultError
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.tasks.registry import short_name
 
-LAST = 10  # checkpoints
+LAST = 10
+"""Number of checkpoints at the end of training that a mean is taken over (the paper's protocol)."""
 PAPER_NETWORK = "resnet18"
+"""Encoder of camera images in the paper's policies."""
 RESAMPLES = 4000
+"""Number of resamples of a bootstrap or permutation test; the ends of intervals then vary by less than half a point."""
 CONFIDENCE = 0.95
-SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend")  # arguments that do not change the task
+"""Confidence of every interval."""
+SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend", "render_backend", "sensor_configs")
+"""Arguments of an environment that do not change the task: what is observed, and what computes it."""
 
 
 @dataclass(frozen=True)
-class Setup:
-    """What a policy is: everything but its training seed."""
+class Condition:
+    """A task, its observations and a policy: everything but the training seed."""
 
     env_id: str
+    """Id of the task."""
     obs_mode: str
+    """Observation mode, such as "rgb+tacff"."""
     policy: str
-    """the class's name"""
+    """Registered name of the policy, or the name of its class."""
     encoder: str = ""
-    """of TacRGB"""
+    """Encoder of TacRGB images; empty without them."""
     cameras: tuple[str, ...] = ()
+    """Cameras that the policy observes."""
     num_demos: int | None = None
+    """Number of training episodes; None where any number will do."""
     variant: str = ""
-    """arguments of the task other than its defaults, as json"""
+    """Arguments of the task other than its defaults, as json."""
     network: str = PAPER_NETWORK
-    """encoder of cameras, which tells the paper's networks from smaller ones; "" for a policy that is no baseline"""
+    """Encoder of camera images, by which the paper's networks differ from smaller ones; empty for a policy that is no
+    baseline."""
 
     @property
     def task(self) -> str:
-        """The task's short name."""
+        """Short name of the task."""
         return short_name(self.env_id)
 
     @property
     def sensing(self) -> str:
+        """Observation mode and cameras, as a page shows them."""
         return " ".join((self.obs_mode, *self.cameras))
 
 
@@ -55,32 +66,38 @@ class Estimate:
     """A number with its interval of 95 %."""
 
     value: float
+    """The number itself."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
 
     def __str__(self) -> str:
         return f"{self.value:.0%} [{self.low:.0%}, {self.high:.0%}]"
 
     @property
     def signed(self) -> str:
-        """As a difference is told."""
+        """Text of a difference, with its sign."""
         return f"{self.value:+.0%} [{self.low:+.0%}, {self.high:+.0%}]"
 
 
 @dataclass
-class Runs:
-    """Success of a set-up: (training seeds, checkpoints, starts), in [0, 1]."""
+class ConditionResults:
+    """Success of one condition in every evaluated episode."""
 
     success: np.ndarray
-    starts: list[int]
-    """their seeds"""
+    """1 where an episode succeeded, else 0: (training seeds, checkpoints, episodes)."""
+    episode_seeds: list[int]
+    """Seeds of the episodes, which set their initial states; the same for all checkpoints."""
 
     @property
     def size(self) -> str:
+        """Numbers of training seeds, checkpoints and episodes, such as "3 x 10 x 50"."""
         return " x ".join(map(str, self.success.shape))
 
 
-def setup_of(result: dict[str, Any]) -> Setup:
+def condition_of(result: dict[str, Any]) -> Condition:
+    """The condition that a result belongs to."""
     config = result["config"]
     encoders = config.get("policy", {}).get("encoder", {})
     encoder = encoders.get("tacrgb", "") if "tacrgb" in result["obs_mode"] else ""
@@ -89,71 +106,87 @@ def setup_of(result: dict[str, Any]) -> Setup:
     other = {name: value for name, value in result["env_kwargs"].items() if name not in SENSING}
     variant = json.dumps(other, sort_keys=True) if other else ""
     network = encoders.get("image", "")
-    return Setup(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant, network)
+    return Condition(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant, network)
 
 
-def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Setup, Runs]:
-    """Results, one a checkpoint, by set-up.
+def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Condition, ConditionResults]:
+    """The results of each condition.
+
+    Args:
+        results: Contents of result files, one for each checkpoint.
+        last: Largest number of checkpoints at the end of training that count.
 
     Raises:
-        ResultError: those of a set-up were evaluated on different starts.
+        ResultError: The results of a condition are of different episodes.
     """
-    found: dict[Setup, dict[int | None, dict[int, dict[int, bool]]]] = {}
+    found: dict[Condition, dict[int | None, dict[int, dict[int, bool]]]] = {}
     for result in results:
         outcomes = {episode["seed"]: episode["success_once"] for episode in result["episodes"]}
-        runs = found.setdefault(setup_of(result), {})
-        runs.setdefault(result["training_seed"], {})[result["config"].get("step", 0)] = outcomes
-    return {setup: _runs(setup, by_seed, last) for setup, by_seed in found.items()}
+        by_seed = found.setdefault(condition_of(result), {})
+        by_seed.setdefault(result["training_seed"], {})[result["config"].get("step", 0)] = outcomes
+    return {condition: _stacked(condition, by_seed, last) for condition, by_seed in found.items()}
 
 
-def _runs(setup: Setup, by_seed: dict[int | None, dict[int, dict[int, bool]]], last: int) -> Runs:
+def _stacked(condition: Condition, by_seed: dict[int | None, dict[int, dict[int, bool]]], last: int) -> ConditionResults:
     checkpoints = min(last, *(len(steps) for steps in by_seed.values()))
     evaluated = [[steps[step] for step in sorted(steps)[-checkpoints:]] for steps in by_seed.values()]
-    starts = sorted(evaluated[0][0])
+    seeds = sorted(evaluated[0][0])
     for outcomes in (outcomes for run in evaluated for outcomes in run):
-        if sorted(outcomes) != starts:
-            raise ResultError(f"results of {setup} are of different starts; evaluate all of them with as many --episodes")
-    return Runs(np.array([[[outcomes[start] for start in starts] for outcomes in run] for run in evaluated], float), starts)
+        if sorted(outcomes) != seeds:
+            raise ResultError(
+                f"the results of {condition} are of different initial states; evaluate all of them with as many --episodes"
+            )
+    success = np.array([[[outcomes[seed] for seed in seeds] for outcomes in run] for run in evaluated], float)
+    return ConditionResults(success, seeds)
 
 
-def success(*tasks: Runs) -> Estimate:
-    """Mean success over tasks, each weighing the same; interval from a bootstrap over training seeds within each task
-    (stratified, as in Agarwal et al. 2021), or over starts where one was trained only. That of one checkpoint is Wilson's."""
+def mean_success(*tasks: ConditionResults) -> Estimate:
+    """Mean success over conditions, each weighing the same.
+
+    Its interval is from a bootstrap over the training seeds within each condition (stratified, as in Agarwal et al. 2021), or
+    over episodes where only one seed was trained. A single checkpoint has Wilson's interval.
+    """
     if len(tasks) == 1 and tasks[0].success.shape[:2] == (1, 1):
-        won, starts = int(tasks[0].success.sum()), len(tasks[0].starts)
-        return Estimate(won / starts, *wilson_interval(won, starts))
-    samples = [runs.success.mean((1, 2)) if len(runs.success) > 1 else runs.success.mean((0, 1)) for runs in tasks]
+        succeeded, episodes = int(tasks[0].success.sum()), len(tasks[0].episode_seeds)
+        return Estimate(succeeded / episodes, *wilson_interval(succeeded, episodes))
+    samples = [task.success.mean((1, 2)) if len(task.success) > 1 else task.success.mean((0, 1)) for task in tasks]
 
-    def mean(*samples, axis=-1):
+    def mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
         return np.mean([sample.mean(axis) for sample in samples], axis=0)
 
     return _estimate(samples, mean, tasks, paired=False)
 
 
-def difference(better: Runs, worse: Runs) -> tuple[Estimate, float]:
-    """How much more often the first succeeds, with an interval from a bootstrap over starts, and the p-value of a paired
-    permutation test of no difference.
+def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estimate, float]:
+    """How much more often the first condition succeeds than the second, and the p-value of no difference.
+
+    The interval is from a bootstrap over episodes, the p-value from a paired permutation test.
 
     Raises:
-        ResultError: they were evaluated on different starts.
+        ResultError: The two were evaluated on different episodes.
     """
-    if better.starts != worse.starts:
-        raise ResultError("the two were evaluated on different starts; evaluate both with as many --episodes")
-    samples = [runs.success.mean((0, 1)) for runs in (better, worse)]
+    if first.episode_seeds != second.episode_seeds:
+        raise ResultError(
+            "the two conditions were evaluated on different initial states; evaluate both with as many --episodes"
+        )
+    samples = [results.success.mean((0, 1)) for results in (first, second)]
 
-    def gap(first, second, axis=-1):
+    def gap(first: np.ndarray, second: np.ndarray, axis: int = -1) -> np.ndarray:
         return first.mean(axis) - second.mean(axis)
 
     test = stats.permutation_test(
         samples, gap, permutation_type="samples", vectorized=True, n_resamples=RESAMPLES, rng=np.random.default_rng(0)
     )
-    return _estimate(samples, gap, (better, worse), paired=True), float(test.pvalue)
+    return _estimate(samples, gap, (first, second), paired=True), float(test.pvalue)
 
 
-def _estimate(samples: list[np.ndarray], statistic, of: tuple[Runs, ...], paired: bool) -> Estimate:
+def _estimate(
+    samples: list[np.ndarray], statistic: Callable[..., Any], of: tuple[ConditionResults, ...], paired: bool
+) -> Estimate:
     value = float(statistic(*samples))
-    if all(np.ptp(sample) == 0 for sample in samples):  # nothing varies: the bootstrap has nothing to draw from
-        unseen = wilson_interval(0, min(len(runs.starts) for runs in of))[1]  # what none of so many starts has shown
+    if all(np.ptp(sample) == 0 for sample in samples):  # nothing varies, so that a bootstrap has nothing to draw from:
+        fewest = min(len(results.episode_seeds) for results in of)
+        unseen = wilson_interval(0, fewest)[1]  # the rate that an outcome may have which none of so many episodes has shown
         return Estimate(value, max(value - unseen, -1.0 if paired else 0.0), min(value + unseen, 1.0))
     drawn = stats.bootstrap(
         samples,

@@ -1,10 +1,11 @@
-"""How near simulated touch is to real.
+"""Measure how near simulated touch is to real touch.
 
     python -m manifeel_ms3.analysis.sim_real_similarity --sim trajectory.h5 --real DIR --features inception
 
-Two sets of tactile pictures are told apart by the features of a network that was trained on photographs: FID is the Fréchet
-distance of the normal distributions nearest to theirs (Heusel et al. 2017), KID the squared maximum mean discrepancy under a
-cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so which are used is always asked and told.
+Two sets of tactile images are compared by the features of a network that was trained on photographs. FID is the Fréchet
+distance between the normal distributions that fit the two sets of features (Heusel et al. 2017), KID the squared maximum mean
+discrepancy under a cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so these are always asked for,
+and the result names them.
 """
 
 import json
@@ -21,8 +22,9 @@ import torch
 import tyro
 from scipy import linalg
 
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import import_name
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -32,83 +34,104 @@ from .protocol import Estimate
 log = logging.getLogger(__name__)
 Features = Callable[[np.ndarray], np.ndarray]
 Distance = Callable[[np.ndarray, np.ndarray], float]
-PICTURES, FIELDS, RECORDINGS = (".png", ".jpg", ".jpeg"), (".npy", ".npz"), (".h5",)
+IMAGES, FIELDS, RECORDINGS = (".png", ".jpg", ".jpeg"), (".npy", ".npz"), (".h5",)
+"""Suffixes of files with an image, a force field, or recorded episodes."""
 BATCH = 32
-FEWEST = 10  # pictures a side
-PAIRS = 8  # shown
-CONTACT = 0.05  # N: a recorded field of less is not of a contact
+"""Number of images that a network takes at once."""
+FEWEST = 10
+"""Least number of images in each set."""
+PAIRS, PAIR_SIDE = 8, 160
+"""Number of pairs in nearest.png, and the width and height of an image there, in pixels."""
+IN_CONTACT = 0.05
+"""Sum of the absolute forces of a recorded field in N above which the pad is in contact."""
+TAILS = (0.025, 0.975)
+"""Quantiles at the ends of an interval of 95 %."""
+INCEPTION_FEATURES = "2048"
+"""Name that torch-fidelity gives to the features which FID is defined on: the 2048 after Inception's last pooling."""
 
 
-class SimilarityError(ValueError):
-    """Pictures or features that cannot be used."""
+class SimilarityError(InvalidArgumentError):
+    """Images or features cannot be used."""
 
 
 @dataclass
 class Args:
+    """Arguments of the comparison."""
+
     sim: Path
-    """folder of pictures (TacRGB: png, jpg) or force fields (TacFF: npy or npz of (10, 14, 3), N), or a trajectory file"""
+    """Simulated touch: a folder of images (TacRGB: png, jpg) or force fields (TacFF: npy or npz of (10, 14, 3), N), or a
+    trajectory file."""
     real: Path
-    """the same, of the real sensor"""
+    """Real touch, in one of the same forms."""
     features: str
-    """"inception" (FID's own; needs the extra `similarity`), a ResNet of transformers ("microsoft/resnet-18", or a folder),
-    or a function of your own, "module:function", from (N, H, W, 3) uint8 to (N, D)"""
+    """Features that images are compared by: "inception" (FID's own; needs the extra `similarity`), a ResNet of transformers
+    ("microsoft/resnet-18", or a folder), or your own function ("module:function") from (N, H, W, 3) uint8 to (N, D)."""
     modality: str = "tacrgb"
-    """"tacrgb" or "tacff": what is taken from trajectory files"""
+    """Modality that is read from trajectory files: "tacrgb" or "tacff"."""
     pad: str = "tactile_right"
-    """of trajectory files"""
+    """Finger pad that is read from trajectory files: "tactile_left" or "tactile_right"."""
     limit: int = 2000
-    """pictures a side, drawn at random from what there is"""
+    """Largest number of images in each set; if there are more, so many are drawn at random."""
     resamples: int = 100
-    """of the bootstrap"""
+    """Number of resamples of the bootstrap."""
     out: Path = Path("runs/similarity")
-    """folder for similarity.json and nearest.png"""
+    """Folder for similarity.json and nearest.png."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """Distances, with intervals of 95 % from a bootstrap over pictures."""
+    """Distances between simulated and real touch, with intervals of 95 % from a bootstrap over images."""
 
     fid: Estimate
     kid: Estimate
     features: str
+    """Name of the features, as it was asked for."""
     dimensions: int
+    """Number of features of an image."""
     sim_count: int
+    """Number of simulated images."""
     real_count: int
+    """Number of real images."""
 
 
 def main(args: Args) -> Similarity:
-    """Compare, and write similarity.json and nearest.png.
+    """Compare two sets of images, and write similarity.json and nearest.png.
 
     Raises:
-        SimilarityError: a folder has too few pictures, one is broken, or the features cannot be had.
+        SimilarityError: A set has too few images, one is broken, or the features are not available.
+        MissingExtraError: An extra that the features need is not installed.
     """
-    sim, real = (pictures_of(folder, args) for folder in (args.sim, args.real))
-    extract = features_by_name(args.features)
-    with progress_bar() as bar:
-        task = bar.add_task("features", total=len(sim) + len(real))
-        sides = []
-        for pictures in (sim, real):
-            parts = []
-            for k in range(0, len(pictures), BATCH):
-                parts.append(np.asarray(extract(np.stack(pictures[k : k + BATCH])), np.float64))
-                bar.advance(task, len(parts[-1]))
-            sides.append(np.concatenate(parts))
-    told, true = sides
+    sim_images, real_images = (images_of(folder, args) for folder in (args.sim, args.real))
+    sim, real = _features_of([sim_images, real_images], features_by_name(args.features))
     result = Similarity(
-        bootstrapped(fid, told, true, args.resamples),
-        bootstrapped(kid, told, true, args.resamples),
+        bootstrapped(fid, sim, real, args.resamples),
+        bootstrapped(kid, sim, real, args.resamples),
         args.features,
-        told.shape[1],
-        len(told),
-        len(true),
+        sim.shape[1],
+        len(sim),
+        len(real),
     )
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "similarity.json").write_text(json.dumps(asdict(result), indent=1))
-    cv2.imwrite(str(args.out / "nearest.png"), nearest_pairs(sim, real, told, true)[..., ::-1])
+    cv2.imwrite(str(args.out / "nearest.png"), nearest_pairs(sim_images, real_images, sim, real)[..., ::-1])
     for name, found in (("FID", result.fid), ("KID", result.kid)):
         log.info("%s %.4g [%.4g, %.4g]", name, found.value, found.low, found.high)
-    log.info("features %s (%d), %d simulated, %d real", args.features, result.dimensions, len(told), len(true))
+    log.info("features %s (%d), %d simulated, %d real", args.features, result.dimensions, len(sim), len(real))
     return result
+
+
+def _features_of(sets: list[list[np.ndarray]], extract: Features) -> list[np.ndarray]:
+    """Features (N, D) of each set of images."""
+    features = []
+    with progress_bar() as bar:
+        task = bar.add_task("features", total=sum(map(len, sets)))
+        for images in sets:
+            parts = []
+            for k in range(0, len(images), BATCH):
+                parts.append(np.asarray(extract(np.stack(images[k : k + BATCH])), np.float64))
+                bar.advance(task, len(parts[-1]))
+            features.append(np.concatenate(parts))
+    return features
 
 
 # -------------------------------------------------------------------- distances
@@ -117,10 +140,11 @@ def main(args: Args) -> Similarity:
 def fid(sim: np.ndarray, real: np.ndarray) -> float:
     """Fréchet distance of normal distributions with the means and covariances of features (N, D) and (M, D)."""
     gap = sim.mean(0) - real.mean(0)
-    # R of a side's deviations is a root of its covariance, R'R; tr (R'R S'S)^1/2 is the sum of the singular values of R S'
-    roots = [np.linalg.qr((side - side.mean(0)) / np.sqrt(len(side) - 1), mode="r") for side in (sim, real)]
+    # R of the QR decomposition is a root of a covariance, R'R; tr (R'R S'S)^1/2 is the sum of the singular values of R S'
+    roots: list[Any] = [np.linalg.qr((side - side.mean(0)) / np.sqrt(len(side) - 1), mode="r") for side in (sim, real)]
     spread = sum((root**2).sum() for root in roots)
-    return float(gap @ gap + spread - 2 * linalg.svdvals(roots[0] @ roots[1].T).sum())
+    singular_values = np.asarray(linalg.svdvals(roots[0] @ roots[1].T))
+    return float(gap @ gap + spread - 2 * singular_values.sum())
 
 
 def kid(sim: np.ndarray, real: np.ndarray) -> float:
@@ -137,7 +161,16 @@ def kid(sim: np.ndarray, real: np.ndarray) -> float:
 
 
 def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resamples: int) -> Estimate:
-    """A distance; its interval from halves of both sides, drawn without repeats (which would look like modes of their own)."""
+    """A distance, with its interval of 95 % from halves of both sets.
+
+    The halves are drawn without replacement, since repeated images would look like modes of their own.
+
+    Args:
+        distance: Function of the two sets of features.
+        sim: Features (N, D) of simulated images.
+        real: Features (M, D) of real images.
+        resamples: Number of halves that are drawn.
+    """
     rng = np.random.default_rng(0)
 
     def half(side: np.ndarray) -> np.ndarray:
@@ -145,38 +178,40 @@ def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resample
 
     value = distance(sim, real)
     drawn = np.array([distance(half(sim), half(real)) for _ in range(resamples)])
-    low, high = np.quantile(drawn - drawn.mean(), [0.025, 0.975])  # halves of a sample vary as samples do
+    low, high = np.quantile(drawn - drawn.mean(), TAILS)  # halves of a sample vary as samples do
     return Estimate(value, value + float(low), value + float(high))
 
 
-# -------------------------------------------------------------------- pictures
+# -------------------------------------------------------------------- images
 
 
-def pictures_of(source: Path, args: Args) -> list[np.ndarray]:
-    """Pictures (H, W, 3) uint8 of a folder or trajectory file, all of one size; force fields drawn as they are for people.
+def images_of(source: Path, args: Args) -> list[np.ndarray]:
+    """Images (H, W, 3) uint8 of a folder or trajectory file, all of one size.
+
+    Force fields become images in the way that they are drawn for people.
 
     Raises:
-        SimilarityError: there are too few, or one is broken.
+        SimilarityError: There are too few images, or one is broken.
     """
     if source.suffix in RECORDINGS:
         found = _recorded(source, args)
     else:
-        files = sorted(path for path in source.rglob("*") if path.suffix.lower() in PICTURES + FIELDS)
+        files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGES + FIELDS)
         if len(files) > args.limit:
             files = [files[k] for k in np.random.default_rng(0).choice(len(files), args.limit, replace=False)]
-        found = [_picture(path) for path in files]
+        found = [_image(path) for path in files]
     if len(found) < FEWEST:
-        raise SimilarityError(f"{source} holds {len(found)} of {PICTURES + FIELDS}; at least {FEWEST} are needed")
+        raise SimilarityError(f"{source} holds {len(found)} of {IMAGES + FIELDS}; at least {FEWEST} are needed")
     height, width = found[0].shape[:2]
-    return [cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA) for picture in found]
+    return [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in found]
 
 
-def _picture(path: Path) -> np.ndarray:
-    if path.suffix.lower() in PICTURES:
-        picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise SimilarityError(f"{path} cannot be read as a picture; mend it or take it out")
-        return picture[..., ::-1]
+def _image(path: Path) -> np.ndarray:
+    if path.suffix.lower() in IMAGES:
+        image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+        if image is None:
+            raise SimilarityError(f"{path} cannot be read as an image; repair or remove it")
+        return image[..., ::-1]
     loaded = np.load(path)
     field = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
     if field.ndim != 3 or field.shape[-1] != 3:
@@ -189,82 +224,102 @@ def _drawn(field: np.ndarray) -> np.ndarray:
 
 
 def _recorded(path: Path, args: Args) -> list[np.ndarray]:
-    """What a pad saw of contacts, at random moments."""
+    """Images of a pad in contact, at random moments."""
     kind = "rgb" if args.modality == "tacrgb" else "force_field"
     with open_trajectories(path) as file:
-        seen: dict[Any, Any] = {name: file[name].get(f"obs/sensor_data/{args.pad}", {}) for name in file}
-        if not all("force_field" in pad and kind in pad for pad in seen.values()):
+        episodes: dict[str, Any] = dict(file.items())
+        pads = {name: episode.get(f"obs/sensor_data/{args.pad}", {}) for name, episode in episodes.items()}
+        if not all("force_field" in pad and kind in pad for pad in pads.values()):
             raise SimilarityError(f"{path} lacks {args.modality} of {args.pad}; record it with --obs-mode tacrgb+tacff")
         touched = [
             (name, int(t))
-            for name, pad in seen.items()
-            for t in np.flatnonzero(np.abs(pad["force_field"][()]).sum((1, 2, 3)) > CONTACT)
+            for name, pad in pads.items()
+            for t in np.flatnonzero(np.abs(pad["force_field"][()]).sum((1, 2, 3)) > IN_CONTACT)
         ]
         chosen = sorted(np.random.default_rng(0).permutation(len(touched))[: args.limit])
-        found = [seen[name][kind][t] for name, t in (touched[k] for k in chosen)]
+        found = [pads[name][kind][t] for name, t in (touched[k] for k in chosen)]
     return found if kind == "rgb" else [_drawn(field) for field in found]
 
 
-def nearest_pairs(sim: list[np.ndarray], real: list[np.ndarray], told: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """A picture: above, some real ones; below, the simulated one nearest to each in features (N, D) and (M, D)."""
-    chosen = np.linspace(0, len(real) - 1, min(PAIRS, len(real))).round().astype(int)
-    nearest = [int(np.linalg.norm(told - true[k], axis=1).argmin()) for k in chosen]
+def nearest_pairs(sim_images: list[np.ndarray], real_images: list[np.ndarray], sim: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """An image with some real images above, and the simulated image nearest to each of them below.
 
-    def row(pictures: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate([cv2.resize(picture, (160, 160), interpolation=cv2.INTER_AREA) for picture in pictures], axis=1)
+    Args:
+        sim_images: Simulated images.
+        real_images: Real images.
+        sim: Features (N, D) of the simulated images.
+        real: Features (M, D) of the real images.
+    """
+    chosen = np.linspace(0, len(real_images) - 1, min(PAIRS, len(real_images))).round().astype(int)
+    nearest = [int(np.linalg.norm(sim - real[k], axis=1).argmin()) for k in chosen]
 
-    return np.concatenate([row([real[k] for k in chosen]), row([sim[k] for k in nearest])])
+    def row(images: list[np.ndarray]) -> np.ndarray:
+        tiles = [cv2.resize(image, (PAIR_SIDE, PAIR_SIDE), interpolation=cv2.INTER_AREA) for image in images]
+        return np.concatenate(tiles, axis=1)
+
+    return np.concatenate([row([real_images[k] for k in chosen]), row([sim_images[k] for k in nearest])])
 
 
 # -------------------------------------------------------------------- features
 
 
 def features_by_name(name: str) -> Features:
-    """What makes features (N, D) of pictures (N, H, W, 3) uint8. Never another than was asked for.
+    """The function that makes features (N, D) of images (N, H, W, 3) uint8; always the one that was asked for.
+
+    Args:
+        name: "inception", name or folder of a ResNet, or "module:function", as the command line gives it.
 
     Raises:
-        SimilarityError: it cannot be had.
+        SimilarityError: The features are not available.
+        MissingExtraError: An extra that the features need is not installed.
     """
     if name == "inception":
         return _inception()
-    if ":" in name:
+    if ":" not in name:
+        return _resnet(name)
+    try:
         return import_name(name)
-    return _resnet(name)
+    except (ImportError, AttributeError) as error:
+        raise SimilarityError(
+            f"--features {name} cannot be imported ({error}); give module:function, importable from here"
+        ) from error
 
 
 def _inception() -> Features:
-    try:
-        from torch_fidelity.feature_extractor_inceptionv3 import FeatureExtractorInceptionV3  # pyright: ignore
+    with missing_extras_named():
+        from torch_fidelity.feature_extractor_inceptionv3 import FeatureExtractorInceptionV3  # pyright: ignore[reportMissingImports]
 
-        network = FeatureExtractorInceptionV3("inception", ["2048"])
-    except (ImportError, OSError) as error:
+    try:
+        network = FeatureExtractorInceptionV3("inception", [INCEPTION_FEATURES])
+    except OSError as error:
         raise SimilarityError(
-            f"FID's Inception network cannot be had ({error}); `pip install manifeel_ms3[similarity]` (it is then downloaded), "
-            'or choose other --features: a ResNet such as "microsoft/resnet-18", or "module:function"'
+            f"FID's Inception network cannot be downloaded ({error}); choose other --features: a ResNet such as "
+            '"microsoft/resnet-18", or "module:function"'
         ) from error
 
     @torch.inference_mode()
-    def extract(pictures: np.ndarray) -> np.ndarray:
-        return network(torch.as_tensor(pictures.copy()).movedim(-1, 1))[0].numpy()
+    def extract(images: np.ndarray) -> np.ndarray:
+        return network(torch.as_tensor(images.copy()).movedim(-1, 1))[0].numpy()
 
     return extract
 
 
 def _resnet(name: str) -> Features:
-    from transformers import AutoImageProcessor, ResNetModel
+    with missing_extras_named():
+        from transformers import AutoImageProcessor, ResNetModel
 
     try:
         processor, network = AutoImageProcessor.from_pretrained(name), ResNetModel.from_pretrained(name)
     except (OSError, ValueError) as error:
         raise SimilarityError(
-            f"{name} cannot be had as a ResNet ({error}); give the name of one that can be downloaded, its folder, "
-            '"inception", or a function of your own, "module:function"'
+            f"{name} cannot be loaded as a ResNet ({error}); give the name of one that can be downloaded, its folder, "
+            '"inception", or your own function, "module:function"'
         ) from error
     network.eval()
 
     @torch.inference_mode()
-    def extract(pictures: np.ndarray) -> np.ndarray:
-        inputs = processor(list(pictures), return_tensors="pt")
+    def extract(images: np.ndarray) -> np.ndarray:
+        inputs = processor(list(images), return_tensors="pt")
         return network(**inputs).pooler_output.flatten(1).numpy()
 
     return extract

@@ -1,3 +1,6 @@
-from .policy import Policy as Policy
-from .rollout import EpisodeOutcome as EpisodeOutcome
-from .rollout import evaluate_episode as evaluate_episode
+"""Run one policy on fixed seeds, and write one result file."""
+
+from .policy import Policy
+from .rollout import EpisodeOutcome, evaluate_episode
+
+__all__ = ["EpisodeOutcome", "Policy", "evaluate_episode"]

@@ -1,4 +1,4 @@
-"""What a checkpoint says of itself."""
+"""The configuration that a checkpoint folder holds."""
 
 import json
 from pathlib import Path
@@ -8,14 +8,14 @@ from manifeel_ms3.errors import InvalidFileError
 
 
 class CheckpointError(InvalidFileError):
-    """A checkpoint that cannot be used as asked."""
+    """A checkpoint folder is missing, broken or of an older version."""
 
 
 def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
-    """config.json of a checkpoint folder.
+    """The content of config.json in a checkpoint folder.
 
     Raises:
-        CheckpointError: there is none, or it is broken.
+        CheckpointError: There is no config.json, or it is broken.
     """
     path = Path(checkpoint) / "config.json"
     if not path.is_file():
@@ -25,7 +25,9 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
     try:
         config = json.loads(path.read_text())
     except ValueError as error:
-        raise CheckpointError(f"{path} is not json ({error}); the checkpoint is broken, use another") from error
+        raise CheckpointError(f"{path} is not json ({error}); the checkpoint is broken, use another one") from error
     if not isinstance(config, dict):
-        raise CheckpointError(f"{path} holds {type(config).__name__}, not a config; the checkpoint is broken, use another")
+        raise CheckpointError(
+            f"{path} holds a {type(config).__name__} instead of an object; the checkpoint is broken, use another one"
+        )
     return config

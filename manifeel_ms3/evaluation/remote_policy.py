@@ -1,7 +1,8 @@
-"""A policy that lives in another process, Python or machine, asked over HTTP; `examples/policy_server.py` is the other end.
+"""A policy in another process or on another machine, asked over HTTP; `examples/policy_server.py` is a server for it.
 
-`POST /reset`: nothing in, nothing out. `POST /act`: an npz with an array for every observation, named by its path
-("sensor_data/wrist/rgb", uint8 (H, W, 3)); out an npz with "action", (A,). An error is a status other than 200 and its text.
+`POST /reset` has an empty body and an empty answer. The body of `POST /act` is an npz with one array for each observation,
+named by its path ("sensor_data/wrist/rgb", uint8 (H, W, 3)); the answer is an npz with the array "action", (A,). An error is a
+status other than 200, with the message as text.
 """
 
 import io
@@ -13,42 +14,51 @@ from urllib.request import urlopen
 import numpy as np
 from mani_skill.utils import common
 
+from manifeel_ms3.errors import ServerError
+
+LONGEST_MESSAGE = 500
+"""Characters of a server's error message that are shown; the rest, often a page of HTML, is cut off."""
+
 
 class RemotePolicy:
-    """Asks a server.
+    """A policy that asks a server for its actions; a missing or failing server raises a `ServerError`.
 
     Args:
-        address: such as "http://localhost:8000".
-        timeout: s, of an answer.
-
-    Raises:
-        ConnectionError: there is no server, or it answers with an error.
+        address: Address of the server, such as "http://localhost:8000".
+        timeout: Longest time to wait for an answer, in s.
     """
 
     def __init__(self, address: str, timeout: float = 60.0):
         self.address, self.timeout = address.rstrip("/"), timeout
 
     def reset(self) -> None:
-        self._ask("reset", b"")
+        self._post("reset", b"")
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         buffer = io.BytesIO()
-        np.savez(buffer, **dict(flat_observation(obs)))
-        with np.load(io.BytesIO(self._ask("act", buffer.getvalue())), allow_pickle=False) as answer:
+        arrays: dict[str, Any] = dict(flat_observation(obs))
+        np.savez(buffer, **arrays)
+        with np.load(io.BytesIO(self._post("act", buffer.getvalue())), allow_pickle=False) as answer:
             return answer["action"]
 
-    def _ask(self, what: str, body: bytes) -> bytes:
+    def _post(self, endpoint: str, body: bytes) -> bytes:
         try:
-            with urlopen(f"{self.address}/{what}", body, self.timeout) as answer:
+            with urlopen(f"{self.address}/{endpoint}", body, self.timeout) as answer:
                 return answer.read()
         except HTTPError as error:
-            raise ConnectionError(f"{self.address} answers {what} with {error.code}: {error.read().decode()[:500]}") from error
+            message = error.read().decode(errors="replace")[:LONGEST_MESSAGE]
+            raise ServerError(f"{self.address} answers {endpoint} with {error.code}: {message}") from error
         except URLError as error:
-            raise ConnectionError(f"{self.address} cannot be reached ({error.reason}); start the server first") from error
+            raise ServerError(f"{self.address} cannot be reached ({error.reason}); start the server first") from error
 
 
 def flat_observation(obs: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
-    """Every observation by its path, without the environments' axis."""
+    """Pairs of an observation's path ("extra/tcp_pose") and its array, without the leading axis of environments.
+
+    Args:
+        obs: Tree of observations of one environment.
+        prefix: Path of the tree itself, with a slash at its end; empty at the root.
+    """
     for name, value in obs.items():
         if isinstance(value, dict):
             yield from flat_observation(value, f"{prefix}{name}/")

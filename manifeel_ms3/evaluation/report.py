@@ -1,7 +1,8 @@
-"""An HTML page about one run: `python -m manifeel_ms3.evaluation.report --run-dir runs/demo`.
+"""An HTML page about one training run: `python -m manifeel_ms3.evaluation.report --run-dir runs/demo`.
 
-Reads evaluation.json and log.jsonl, rolls one evaluated episode out again with every sensor on, and writes report.html: one
-file that needs nothing else.
+The page is made from evaluation.json and log.jsonl, and from one evaluated episode that is run again with every sensor. It is
+one file, report.html, that needs nothing else. Its curve can be zoomed and hovered over, which plotly does in a page; the
+figures of the documentation are static images, which matplotlib draws (`manifeel_ms3.analysis.results_page`).
 """
 
 import base64
@@ -14,83 +15,103 @@ from typing import Any
 
 import cv2
 import gymnasium as gym
-import jinja2
 import numpy as np
-import plotly.graph_objects as go
 import tyro
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.tasks.registry import task_spec
 
 from .policy import load_policy
 from .result import read_result
-from .video import Frame, record_episode, video
+
+with missing_extras_named():
+    import jinja2
+    import plotly.graph_objects as go
+    from markupsafe import Markup
+
+    from .video import Frame, encode_video, record_episode
 
 log = logging.getLogger(__name__)
 STRIP_FRAMES = 8
+"""Number of steps that the strip of images shows."""
+STRIP_SIDE = 160
+"""Width and height of an image in the strip, in pixels; report.html.j2 has the same height for the names of the rows."""
+CURVE_HEIGHT = 340
+"""Height of the figure with the training loss, in pixels."""
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 
 
 @dataclass
 class Args:
+    """Arguments of the report."""
+
     run_dir: Path
-    """folder with evaluation.json, log.jsonl and checkpoints/last"""
+    """Folder of the training run, with evaluation.json, log.jsonl and checkpoints/last."""
     out: Path | None = None
-    """page to write; default: report.html in run_dir"""
+    """Path of the page; report.html in the run's folder if not given."""
 
 
-def strip(frames: list[Frame]) -> tuple[list[str], bytes]:
-    """A PNG of some frames: time runs to the right, a row per sensor; and the rows' names."""
+def image_strip(frames: list[Frame]) -> tuple[list[str], bytes]:
+    """The names of the sensors, and a PNG with one row of images for each; time runs to the right."""
     chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, min(STRIP_FRAMES, len(frames))).round().astype(int)]
-    names = list(chosen[0].pictures)
-    rows = [np.concatenate([_square(frame.pictures[name]) for frame in chosen], axis=1) for name in names]
+    names = list(chosen[0].images)
+    rows = [np.concatenate([_square(frame.images[name]) for frame in chosen], axis=1) for name in names]
     png = cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1].tobytes()
     return names, png
 
 
-def _square(picture: np.ndarray) -> np.ndarray:
-    side = min(picture.shape[:2])
-    top, left = ((n - side) // 2 for n in picture.shape[:2])
-    return cv2.resize(picture[top : top + side, left : left + side], (160, 160), interpolation=cv2.INTER_AREA)
+def _square(image: np.ndarray) -> np.ndarray:
+    side = min(image.shape[:2])
+    top, left = ((n - side) // 2 for n in image.shape[:2])
+    return cv2.resize(image[top : top + side, left : left + side], (STRIP_SIDE, STRIP_SIDE), interpolation=cv2.INTER_AREA)
 
 
 def training_curve(log_file: Path) -> str:
-    """The loss over gradient steps, as a plotly figure that needs no network."""
+    """HTML of a plotly figure with the loss over gradient steps; it needs no network."""
     entries = [entry for line in log_file.read_text().splitlines() if "loss" in (entry := json.loads(line))]
     figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e["loss"] for e in entries], mode="lines"))
     figure.update_layout(
         xaxis_title="gradient step",
         yaxis_title="loss",
         yaxis_type="log",
-        height=340,
+        height=CURVE_HEIGHT,
         margin=dict(l=60, r=20, t=20, b=50),
     )
     return figure.to_html(full_html=False, include_plotlyjs=True)
 
 
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    """The task's randomisation in this evaluation: {name: (value, the task's default)}."""
-    env = gym.make(result["env_id"], **result["env_kwargs"] | dict(obs_mode="none", render_backend="none"))
-    used, default = env.unwrapped.randomization, env.unwrapped.Randomization()
+    """The task's randomisation in an evaluation: pairs of its value there and the task's default, by its name."""
+    kwargs: dict[str, Any] = result["env_kwargs"] | dict(obs_mode="none", render_backend="none")
+    env = gym.make(task_spec(result["env_id"]).env_id, **kwargs)
+    task: Any = env.unwrapped
+    used, default = task.randomization, task.Randomization()
     env.close()
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
 def main(args: Args) -> Path:
+    """Write the page, and return its path.
+
+    Raises:
+        ResultError: The run's evaluation.json is missing or broken.
+        CheckpointError: The run's last checkpoint is missing or broken.
+    """
     result = read_result(args.run_dir / "evaluation.json")
-    won = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
-    seed = (won or [result["episodes"][0]["seed"]])[0]
+    succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
+    seed = (succeeded or [result["episodes"][0]["seed"]])[0]
     policy = load_policy(args.run_dir / "checkpoints/last")
-    outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
-    rows, picture = strip(frames)
+    outcome, frames = record_episode(task_spec(result["env_id"]).env_id, result["env_kwargs"], policy, seed)
+    rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         result=result,
         outcome=outcome,
         randomization=randomization_of(result),
         rows=rows,
-        strip=base64.b64encode(picture).decode(),
-        video=base64.b64encode(video(frames)).decode(),
-        curve=jinja2.utils.markupsafe.Markup(training_curve(args.run_dir / "log.jsonl")),
+        strip=base64.b64encode(strip).decode(),
+        video=base64.b64encode(encode_video(frames)).decode(),
+        curve=Markup(training_curve(args.run_dir / "log.jsonl")),
     )
     out = args.out or args.run_dir / "report.html"
     out.write_text(page)

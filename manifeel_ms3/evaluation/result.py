@@ -1,9 +1,7 @@
-"""Result files: what an evaluation writes, and leaderboard and report read."""
+"""Result files: an evaluation writes one, the leaderboard and the pages of results read them."""
 
 import json
-import subprocess
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,22 +12,35 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
-from .provenance import machine
+from .provenance import git_commit, machine, package_versions
 from .rollout import EpisodeOutcome
 from .statistics import wilson_interval
 
 SCHEMA = "manifeel-evaluation-2"
-PATHS = ("demos", "run_dir", "tacrgb_weights")  # a config's, on the machine it was trained on
+"""Version of the form of result files; data/evaluation_schema.json defines it."""
+SCHEMA_BEFORE = "manifeel-evaluation-1"
+"""Version that identified a task by a hash of its code, which cannot be translated into a revision of the task."""
+PATHS = ("demos", "run_dir", "tacrgb_weights")
+"""Entries of a policy's configuration that are paths on the machine where it was trained."""
+LONGEST_MESSAGE = 300
+"""Characters of a message of jsonschema that are shown; the rest repeats the faulty data."""
 
 
 class ResultError(InvalidFileError):
-    """A file that is not a result."""
+    """A file is not a result, is broken, or cannot be compared with other results."""
 
 
 def result_of(
     env_id: str, env_kwargs: dict[str, Any], config: dict[str, Any], outcomes: list[EpisodeOutcome]
 ) -> dict[str, Any]:
-    """The content of a result file; `config`: the policy's, of whose paths the last part is kept: results are published."""
+    """The content of a result file.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make`.
+        config: Configuration of the policy. Only the last part of its paths is kept, since results are published.
+        outcomes: Outcomes of all episodes.
+    """
     config = {name: _last_part(value) if name in PATHS else value for name, value in config.items()}
     rates = {}
     for name in ("success_once", "success_at_end"):
@@ -44,8 +55,8 @@ def result_of(
         policy=config["policy_name"],
         training_seed=config.get("seed"),
         config=config,
-        versions={name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")},
-        git_commit=_git_commit(),
+        versions=package_versions(),
+        git_commit=git_commit(),
         revision=task_spec(env_id).revision,
         machine=machine(),
         **rates,
@@ -55,7 +66,11 @@ def result_of(
 
 
 def write_result(result: dict[str, Any], path: Path) -> None:
-    """Write a result that is of the published form."""
+    """Check that a result has the published form, and write it.
+
+    Raises:
+        ResultError: It does not have the published form.
+    """
     result = json.loads(json.dumps(result, default=str))
     check_result(result, path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,21 +81,21 @@ def read_result(path: Path) -> dict[str, Any]:
     """The content of a result file.
 
     Raises:
-        ResultError: it is missing, no json, of another version, or not of the published form.
+        ResultError: The file is missing, is not json, is of another version, or does not have the published form.
     """
     try:
         result = json.loads(path.read_text())
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise ResultError(f"{path} cannot be read as a result ({error}); give one that evaluation.run wrote") from error
+        raise ResultError(f"{path} cannot be read as a result ({error}); give a file that `manifeel eval` wrote") from error
     check_result(result, path)
     return result
 
 
 def results_in(*folders: Path) -> list[dict[str, Any]]:
-    """Every checkpoint's result under some folders: files named by its gradient step, as 00002000.json.
+    """The results of all checkpoints in some folders: files named by the gradient step, such as 00002000.json.
 
     Raises:
-        ResultError: there is none, or one is broken.
+        ResultError: There is no result, or one is broken.
     """
     found = [path for folder in folders for path in sorted(folder.rglob("*.json")) if path.stem.isdigit()]
     if not found:
@@ -92,28 +107,33 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
 
 
 def check_result(result: Any, source: Path) -> None:
-    """See that a result is of the published form.
+    """Check that a result has the published form.
+
+    Args:
+        result: The content of a result file.
+        source: Path of the file, for messages.
 
     Raises:
-        ResultError: it is not; the message names the place.
+        ResultError: It does not have the form; the message names the place.
     """
     given = result.get("schema") if isinstance(result, dict) else None
+    if given == SCHEMA_BEFORE:
+        raise ResultError(
+            f"{source} has the schema {given!r}, which does not say the revision of the task; this version reads {SCHEMA!r}: "
+            "evaluate the policy again, after training it again if its checkpoint is refused, too"
+        )
     if given != SCHEMA:
-        raise ResultError(f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate again, or update")
+        raise ResultError(
+            f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate the policy again, or update "
+            "manifeel-ms3"
+        )
     schema = json.loads((data_dir() / "evaluation_schema.json").read_text())
     for error in jsonschema.Draft202012Validator(schema).iter_errors(result):
         place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
-        raise ResultError(f"{source} is not a result: {place}: {error.message[:300]}")
+        raise ResultError(f"{source} is not a result: {place}: {error.message[:LONGEST_MESSAGE]}")
 
 
 def _last_part(path: Any) -> Any:
     if isinstance(path, (list, tuple)):
         return [_last_part(one) for one in path]
     return Path(path).name if path else path
-
-
-def _git_commit() -> str | None:
-    answer = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    )
-    return answer.stdout.strip() or None

@@ -1,4 +1,4 @@
-"""Roll a policy out, one episode a seed; whatever the policy does, there is an outcome."""
+"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome."""
 
 import faulthandler
 import signal
@@ -13,28 +13,32 @@ import numpy as np
 
 from .policy import Policy
 
-HANGS_FOR_GOOD = 10.0  # s after the time-out, until a policy that does not even notice it takes its process down
+HANGS_FOR_GOOD = 10.0
+"""Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
 
 
 @dataclass
 class EpisodeOutcome:
-    """How an episode went."""
+    """Outcome of one episode."""
 
     seed: int
+    """Seed of the episode, which sets its initial state."""
     success_once: bool
+    """Whether the task succeeded at any step."""
     success_at_end: bool
+    """Whether the task had succeeded at the last step."""
     length: int
-    """steps"""
+    """Number of control steps."""
     peak_contact_force: float
-    """N"""
+    """Largest contact force of the episode, in N."""
     inference_ms: float
-    """mean time of `act`"""
+    """Mean time of `Policy.act`, in ms."""
     error: str | None = None
-    """what the policy did wrong; the episode then counts as failed"""
+    """What the policy did wrong, if anything; the episode then counts as failed."""
 
 
-class PolicyFault(Exception):
-    """The policy raised, answered nonsense, or did not answer."""
+class PolicyFault(Exception):  # noqa: N818  (a fault of the policy, which the outcome records, and no error of this program)
+    """The policy raised an error, returned something that is not an action, or did not answer in time."""
 
 
 def evaluate_episode(
@@ -44,13 +48,19 @@ def evaluate_episode(
     on_step: Callable[[dict[str, Any]], None] | None = None,
     step_timeout: float | None = None,
 ) -> EpisodeOutcome:
-    """One episode, ended by success, failure, the time limit or a fault of the policy; `on_step` sees every observation.
+    """Run one episode until success, failure, the time limit of the task, or a fault of the policy.
 
     Args:
-        step_timeout: s that a policy may take for an action; None: as long as it likes. Needs the process's main thread.
+        env: Environment with one episode at a time (`num_envs=1`).
+        policy: The policy.
+        seed: Seed of the episode.
+        on_step: Function that is called with every observation, the last one included.
+        step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
+            in the main thread of a process.
     """
     obs, _ = env.reset(seed=seed)
-    shape = env.unwrapped.single_action_space.shape
+    task: Any = env.unwrapped
+    shape = task.single_action_space.shape
     once, at_end, peak, thinking, length, over, fault = False, False, 0.0, 0.0, 0, False, None
     try:
         _answer(policy.reset, step_timeout)
@@ -58,7 +68,7 @@ def evaluate_episode(
             if on_step is not None:
                 on_step(obs)
             begin = time.perf_counter()
-            action = _checked(_answer(lambda seen=obs: policy.act(seen), step_timeout), shape)
+            action = _checked(_answer(lambda obs=obs: policy.act(obs), step_timeout), shape)
             thinking += time.perf_counter() - begin
             obs, _, terminated, truncated, info = env.step(action)
             length += 1
@@ -75,10 +85,10 @@ def evaluate_episode(
 
 
 def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
-    """What the policy answers.
+    """The return value of one of the policy's methods.
 
     Raises:
-        PolicyFault: it raised, or took too long.
+        PolicyFault: The method raised an error, or took too long.
     """
     try:
         with _time_limit(step_timeout):
@@ -103,7 +113,7 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 @contextmanager
 def _time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise PolicyFault after so many seconds; what cannot be interrupted, ends the process a little later."""
+    """Raise a PolicyFault after so many seconds; code that cannot be interrupted ends the process a little later."""
     if seconds is None:
         yield
         return

@@ -4,6 +4,12 @@ from scipy.stats import binomtest
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson score interval of a success rate (Wilson 1927)."""
+    """Wilson score interval of a success rate (Wilson 1927).
+
+    Args:
+        successes: Number of episodes that succeeded.
+        trials: Number of episodes.
+        confidence: Share of intervals that hold the true rate.
+    """
     interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)

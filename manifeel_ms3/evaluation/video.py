@@ -1,4 +1,4 @@
-"""Film an episode: what every camera and pad sees, side by side."""
+"""Videos of an episode, with the images of every camera and finger pad side by side."""
 
 import tempfile
 from dataclasses import dataclass
@@ -17,21 +17,37 @@ from manifeel_ms3.sensors.visualisation import pictures_of
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
 
-TILE = 240  # pixels, height of a tile
+TILE_HEIGHT = 240
+"""Height of each image in a video, in pixels: that of a TacRGB image."""
+CONTROL_RATE = 10
+"""Frames per second of a video: the tasks' control rate, in Hz, so that a video runs in real time."""
+BLOCK = 8
+"""Widths and heights of a video are made multiples of this number of pixels; H.264 needs an even number."""
+QUALITY = 7
+"""Quality of the encoding from 0 to 10, as imageio has it; text and touch stay sharp."""
 
 
 @dataclass
 class Frame:
-    """What was seen at one step, uint8 RGB pictures by name."""
+    """All images of one step."""
 
-    pictures: dict[str, np.ndarray]
+    images: dict[str, np.ndarray]
+    """RGB images (H, W, 3) uint8 by the names of their sensors."""
 
 
 def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[Frame]]:
-    """Roll an evaluated episode out again, with every picture."""
-    torch.set_num_threads(1)  # as in the evaluation: sums, and with them a rollout, depend on it
+    """Run an evaluated episode again, and keep the images of every step.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make` in the evaluation; cameras and touch are added.
+        policy: The policy.
+        seed: Seed of the episode.
+    """
+    torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
     cameras = tuple(dict.fromkeys([*env_kwargs.get("cameras", ()), "wrist", "front"]))
-    env = gym.make(env_id, **env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras))
+    kwargs: dict[str, Any] = env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras)
+    env = gym.make(env_id, **kwargs)
     frames: list[Frame] = []
 
     def keep(obs: dict[str, Any]) -> None:
@@ -42,16 +58,22 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     return outcome, frames
 
 
-def _tile(picture: np.ndarray) -> np.ndarray:
-    height, width = picture.shape[:2]
-    return cv2.resize(picture, (round(TILE * width / height), TILE), interpolation=cv2.INTER_AREA)
+def encode_video(frames: list[Frame], fps: int = CONTROL_RATE) -> bytes:
+    """An MP4 file with the images of each step side by side.
 
-
-def video(frames: list[Frame], fps: int = 10) -> bytes:
-    """An MP4 with all pictures side by side."""
+    Args:
+        frames: Images of every step.
+        fps: Frames per second.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "episode.mp4"
-        with imageio.get_writer(path, fps=fps, macro_block_size=8, quality=7) as writer:
+        writer: Any  # the stubs of imageio do not know `append_data`
+        with imageio.get_writer(path, fps=fps, macro_block_size=BLOCK, quality=QUALITY) as writer:
             for frame in frames:
-                writer.append_data(np.concatenate([_tile(picture) for picture in frame.pictures.values()], axis=1))
+                writer.append_data(np.concatenate([_tile(image) for image in frame.images.values()], axis=1))
         return path.read_bytes()
+
+
+def _tile(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    return cv2.resize(image, (round(TILE_HEIGHT * width / height), TILE_HEIGHT), interpolation=cv2.INTER_AREA)

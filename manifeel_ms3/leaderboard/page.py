@@ -1,4 +1,7 @@
-"""The leaderboard as one HTML file that needs nothing else, and as a Markdown table."""
+"""The leaderboard as one HTML file that needs nothing else, and as a Markdown table.
+
+The page has plotly's figures, which a reader can zoom and hover over in a browser.
+"""
 
 import base64
 import json
@@ -6,102 +9,117 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
-import plotly.offline
 
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.protocol import LAST, Estimate, Runs, Setup, collect, setup_of, success
+from manifeel_ms3.analysis.protocol import (
+    LAST,
+    Condition,
+    ConditionResults,
+    Estimate,
+    collect,
+    condition_of,
+    mean_success,
+)
+from manifeel_ms3.command_line import missing_extras_named
 
-from .submission import Submission
+from .submission import EPISODES, Submission
+
+with missing_extras_named():
+    import jinja2
+    import plotly.offline
+    from markupsafe import Markup
 
 PAGE, TABLE = "index.html", "README.md"
 TEMPLATE = Path(__file__).with_name("page.html.j2")
-FULL = (3, LAST, 50)  # the protocol's training seeds, checkpoints, starts
+FULL = (3, LAST, EPISODES)
+"""Numbers of training seeds, checkpoints and evaluation episodes in the paper's protocol."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One set-up of one submission."""
+    """One condition of one submission."""
 
     submission: Submission
-    setup: Setup
+    condition: Condition
     success: Estimate
-    runs: Runs
+    results: ConditionResults
     inference_ms: float
+    """Median over episodes of the mean time of an inference, in ms."""
     force: float
-    """N: the median episode's peak"""
+    """Median over episodes of the largest contact force, in N."""
 
     @property
     def is_full(self) -> bool:
-        return all(have >= want for have, want in zip(self.runs.success.shape, FULL, strict=True))
+        """Whether there are as many training seeds, checkpoints and episodes as in the paper's protocol."""
+        return all(have >= want for have, want in zip(self.results.success.shape, FULL, strict=True))
 
 
 def rows_of(submission: Submission) -> list[Row]:
-    """Each set-up's success by the protocol."""
+    """The success of each condition of a submission, by the paper's protocol."""
     rows = []
-    for setup, runs in collect(submission.results.values()).items():
-        episodes = [episode for result in _results(submission, setup) for episode in result["episodes"]]
+    for condition, results in collect(submission.results.values()).items():
+        episodes = [episode for result in _results(submission, condition) for episode in result["episodes"]]
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
-        rows.append(Row(submission, setup, success(runs), runs, latency, force))
+        rows.append(Row(submission, condition, mean_success(results), results, latency, force))
     return rows
 
 
-def _results(submission: Submission, setup: Setup) -> list[dict[str, Any]]:
-    return [result for result in submission.results.values() if setup_of(result) == setup]
+def _results(submission: Submission, condition: Condition) -> list[dict[str, Any]]:
+    return [result for result in submission.results.values() if condition_of(result) == condition]
 
 
 def ranked(submissions: list[Submission]) -> list[Row]:
-    """Task by task, the best first."""
+    """The rows of all submissions, sorted by task, and by success within a task, the highest first."""
     rows = [row for submission in submissions for row in rows_of(submission)]
-    return sorted(rows, key=lambda row: (row.setup.task, row.setup.variant, -row.success.value))
+    return sorted(rows, key=lambda row: (row.condition.task, row.condition.variant, -row.success.value))
 
 
-def table(rows: list[Row]) -> str:
-    """Markdown."""
+def leaderboard_table(rows: list[Row]) -> str:
+    """The leaderboard in Markdown."""
     head = (
-        f"# Leaderboard\n\n`{PAGE}` is the same with filters, curves and films. Success is the mean over {FULL[0]} training "
-        f"seeds, the last {FULL[1]} checkpoints and {FULL[2]} starts, with its interval of 95 %; what has fewer says so "
-        'under "of".\n\n'
+        f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
+        f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
+        '95 %; where there are fewer, "of" says how many.\n\n'
     )
     cells = []
     for row in rows:
-        about, setup = row.submission.about, row.setup
+        about, condition = row.submission.about, row.condition
         name = f"[{about.name}]({about.link})" if about.link else about.name
-        task = f"{setup.task} {setup.variant}".strip()
-        what = (setup.sensing, setup.policy, setup.network, setup.encoder, setup.num_demos)
-        cells.append((task, *what, row.success, row.runs.size, name))
+        task = f"{condition.task} {condition.variant}".strip()
+        what = (condition.sensing, condition.policy, condition.network, condition.encoder, condition.num_demos)
+        cells.append((task, *what, row.success, row.results.size, name))
     names = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations", "success", "of", "submission")
     return head + markdown_table(names, cells)
 
 
-def write(submissions: list[Submission], board: Path) -> Path:
-    """Write the page and the table; returns the page."""
+def write_page(submissions: list[Submission], board: Path) -> Path:
+    """Write the page and the table into the leaderboard's folder, and return the path of the page."""
     rows = ranked(submissions)
-    (board / TABLE).write_text(table(rows))
+    (board / TABLE).write_text(leaderboard_table(rows))
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
-        rows=[_for_page(row) for row in rows], full=FULL, plotly=jinja2.utils.markupsafe.Markup(plotly.offline.get_plotlyjs())
+        rows=[_for_page(row) for row in rows], full=FULL, plotly=Markup(plotly.offline.get_plotlyjs())
     )
     (board / PAGE).write_text(page)
     return board / PAGE
 
 
 def _for_page(row: Row) -> dict[str, Any]:
-    results = _results(row.submission, row.setup)
+    results = _results(row.submission, row.condition)
     config = dict(sorted(results[-1]["config"].items()))
     link = row.submission.about.link
     return dict(
-        task=row.setup.task,
-        variant=row.setup.variant,
-        sensing=row.setup.obs_mode,
-        cameras=", ".join(row.setup.cameras),
-        policy=row.setup.policy,
-        network=row.setup.network,
-        encoder=row.setup.encoder,
-        demos=row.setup.num_demos or "",
+        task=row.condition.task,
+        variant=row.condition.variant,
+        sensing=row.condition.obs_mode,
+        cameras=", ".join(row.condition.cameras),
+        policy=row.condition.policy,
+        network=row.condition.network,
+        encoder=row.condition.encoder,
+        demos=row.condition.num_demos or "",
         success=row.success,
-        ran=row.runs.size,
+        size=row.results.size,
         full=row.is_full,
         latency=row.inference_ms,
         force=row.force,
@@ -110,12 +128,12 @@ def _for_page(row: Row) -> dict[str, Any]:
         link=link if link.startswith(("https://", "http://")) else "",
         config=json.dumps(config, indent=1),
         curves=json.dumps(_curves(row, results)),
-        films=[base64.b64encode(path.read_bytes()).decode() for path in sorted(row.submission.folder.glob("videos/*.mp4"))],
+        videos=[base64.b64encode(path.read_bytes()).decode() for path in sorted(row.submission.folder.glob("videos/*.mp4"))],
     )
 
 
 def _curves(row: Row, results: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Success over gradient steps, one line a training seed, as plotly's traces."""
+    """Success over gradient steps as plotly's traces, one line for each training seed."""
     traces = []
     for seed in sorted({result["training_seed"] for result in results}, key=str):
         points = sorted(

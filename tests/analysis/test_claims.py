@@ -13,11 +13,11 @@ from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
 
 
-def write_run(folder, mode: str, rate: float, seed: int, policy="DiffusionPolicy", network="resnet18") -> None:
+def write_run(folder, mode: str, rate: float, seed: int, policy="diffusion_policy", network="resnet18") -> None:
     """Ten checkpoints of a policy on PegInsertion."""
     rng = np.random.default_rng([seed, len(mode)])
     for step in range(10):
-        config = dict(kind=f"m:{policy}", obs_mode=mode, seed=seed, step=step, num_demos=50)
+        config = dict(policy_name=policy, obs_mode=mode, seed=seed, step=step, num_demos=50)
         config |= dict(policy=dict(encoder=dict(image=network)))
         won = rng.random(50) < rate
         outcomes = [EpisodeOutcome(k, bool(win), bool(win), 9, 1.0, 1.0) for k, win in enumerate(won)]
@@ -37,7 +37,7 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     assert answered[0].verdict == "holds"
     assert answered[0].difference.value == pytest.approx(0.3, abs=0.05)
     page = (tmp_path / "claims.md").read_text()
-    assert "| PegInsertion | rgb+tacff over rgb (DiffusionPolicy rgb+tacff) | +3" in page
+    assert "| PegInsertion | rgb+tacff over rgb (diffusion_policy rgb+tacff) | +3" in page
     assert page.count("not run") == len(answers) - 1
 
 
@@ -45,23 +45,23 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     write_run(tmp_path, "rgb", 0.2, 0)
     page = results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md")).read_text()
     ran, reported = (line for line in page.splitlines() if "1 x 10 x 50" in line)
-    assert ran.startswith("| PegInsertion | rgb wrist | DiffusionPolicy |")
-    assert reported.startswith("| I | PegInsertion | rgb | DiffusionPolicy |  | 14% |")
-    assert "| I | USBInsertion | rgb | DiffusionPolicy |  | 49% | not run |" in page
+    assert ran.startswith("| PegInsertion | rgb wrist | diffusion_policy |")
+    assert reported.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 14% |")
+    assert "| I | USBInsertion | rgb | diffusion_policy |  | 49% | not run |" in page
     assert "learnt nothing" not in page
 
 
-def test_gains_over_policies_that_learnt_nothing_are_told(tmp_path):
+def test_gains_over_policies_that_learnt_nothing_are_shown(tmp_path):
     write_run(tmp_path, "rgb", 0.6, 0)
     write_run(tmp_path, "none", 0.0, 0, policy="MeanAction", network="")
     page = results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md")).read_text()
-    assert "| PegInsertion | rgb wrist | DiffusionPolicy | MeanAction | +6" in page
+    assert "| PegInsertion | rgb wrist | diffusion_policy | MeanAction | +6" in page
 
 
 def test_small_networks_are_named_and_never_compared_with_the_papers(tmp_path):
     write_run(tmp_path, "rgb", 0.2, 0)
     write_run(tmp_path, "rgb+tacff", 0.5, 0, network="small_cnn")
-    assert not any(claims.answers_of(collect(results_in(tmp_path))).values())
+    assert not any(claims.results_of_claims(collect(results_in(tmp_path))).values())
     write_run(tmp_path, "rgb", 0.2, 0, network="small_cnn")
     page = results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md")).read_text()
     assert re.search(r"\| I \| PegInsertion \| rgb\+tacff .* 40% .* small_cnn \|", page)

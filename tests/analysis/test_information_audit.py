@@ -7,28 +7,31 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.analysis import information_audit
+from manifeel_ms3.analysis.probes import register_probe
 from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
 pytest.importorskip("sklearn")
 RNG = np.random.default_rng(0)
 EPISODES = 24
 
 
-def test_probe_tells_a_class_that_shows_and_not_one_that_does_not():
+def test_a_prediction_knows_a_class_that_shows_and_not_one_that_does_not():
     truth = np.repeat(RNG.integers(2, size=60), 3).astype(float)
     episodes = np.repeat(np.arange(60), 3)
     noise = RNG.normal(size=(len(truth), 40))
     shown = noise + 2.0 * truth[:, None]
-    assert (information_audit.probe(shown, truth, episodes, numeric=False) == truth).mean() > 0.95
-    assert 0.3 < (information_audit.probe(noise, truth, episodes, numeric=False) == truth).mean() < 0.7
+    assert (information_audit.cross_validated(shown, truth, episodes, numeric=False) == truth).mean() > 0.95
+    assert 0.3 < (information_audit.cross_validated(noise, truth, episodes, numeric=False) == truth).mean() < 0.7
 
 
-def test_probe_does_not_learn_an_episode_by_heart():
+def test_a_prediction_does_not_learn_an_episode_by_heart():
     """Features that name the episode say nothing of episodes that it has not seen."""
     truth = np.repeat(RNG.integers(2, size=40), 5).astype(float)
     episodes = np.repeat(np.arange(40), 5)
     names = np.eye(40)[episodes]
-    assert (information_audit.probe(names, truth, episodes, numeric=False) == truth).mean() < 0.75
+    assert (information_audit.cross_validated(names, truth, episodes, numeric=False) == truth).mean() < 0.75
 
 
 def test_an_answer_that_never_looks_scores_a_half_however_rare_a_class():
@@ -37,18 +40,18 @@ def test_an_answer_that_never_looks_scores_a_half_however_rare_a_class():
     assert information_audit._score(truth, truth, episodes, numeric=False) == (1.0, 1.0, 1.0)
 
 
-def test_probe_estimates_a_number():
+def test_a_prediction_estimates_a_number():
     angle = RNG.uniform(-30, 30, 80)
     features = np.stack([np.sin(np.deg2rad(angle + k)) for k in range(0, 90, 5)], axis=1)
-    assert np.abs(information_audit.probe(features, angle, np.arange(80), numeric=True) - angle).max() < 1.0
+    assert np.abs(information_audit.cross_validated(features, angle, np.arange(80), numeric=True) - angle).max() < 1.0
 
 
 @pytest.mark.parametrize("numeric", [False, True])
 @pytest.mark.filterwarnings("error")
 def test_a_sensor_that_never_changes_is_no_better_than_chance_and_no_fault(numeric):
     truth = np.tile([0.0, 1.0], 30)
-    guess = information_audit.probe(np.ones((60, 5)), truth, np.arange(60) // 2, numeric)
-    assert np.abs(guess - truth).mean() == pytest.approx(0.5, abs=0.01)
+    predicted = information_audit.cross_validated(np.ones((60, 5)), truth, np.arange(60) // 2, numeric)
+    assert np.abs(predicted - truth).mean() == pytest.approx(0.5, abs=0.01)
 
 
 def test_texture_shows_in_the_features():
@@ -95,13 +98,36 @@ def test_audit_writes_table_figure_and_numbers(recorded, tmp_path):
     assert len(json.loads((tmp_path / "out/audit.json").read_text())) == len(answers)
 
 
+def test_a_task_gets_another_question_with_one_decorator(recorded, tmp_path, monkeypatch):
+    spec = task_spec("ManiFeel-ObjectSearch-v1")
+    monkeypatch.setattr(spec, "probes", list(spec.probes))
+
+    @register_probe(spec.env_id, question="which half, in metres", unit="m")
+    def half(episode):
+        yield 2, float(episode["env_states/actors/battery"][2, 0])
+
+    results = information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+    added = {result.modality: result for result in results if result.question == "which half, in metres"}
+    assert added["tacff"].score < 0.01 < added["tacff"].chance
+    assert "which half, in metres | 0.1 m |" in (tmp_path / "out/audit.md").read_text()
+    with pytest.raises(UnknownNameError, match="'Nothing-v1' is not registered"):
+        register_probe("Nothing-v1", question="?")(half)
+
+
+def test_questions_are_asked_where_the_paper_says_that_touch_decides():
+    questions = {spec.name: [probe.question for probe in spec.probes] for spec in all_tasks().values() if spec.probes}
+    assert len(questions) == 7
+    assert sum(map(len, questions.values())) == 10
+    assert questions["PegInsertion"] == ["peg's pitch in the hand", "peg touches or not"]
+
+
 def test_audit_says_what_is_missing(recorded, tmp_path):
-    with pytest.raises(DemonstrationError, match="demonstrations.dataset"):
+    with pytest.raises(DemonstrationError, match=r"demonstrations\.dataset"):
         information_audit.main(information_audit.Args(tmp_path / "nothing"))
     path = recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5"
     with h5py.File(path, "r+") as file:
         del file["traj_3/obs/sensor_data/tactile_right/rgb"]
-    with pytest.raises(DemonstrationError, match="lacks tacrgb"):
+    with pytest.raises(DemonstrationError, match="lacks tacrgb of tactile_right"):
         information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
     header = json.loads(path.with_suffix(".json").read_text())
     path.with_suffix(".json").write_text(json.dumps(header | dict(episodes=header["episodes"][:3])))

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from manifeel_ms3.analysis.protocol import Runs, Setup, collect, difference, success
+from manifeel_ms3.analysis.protocol import Condition, ConditionResults, collect, condition_of, difference, mean_success
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
@@ -13,12 +13,12 @@ from tests.conftest import PEG
 RNG = np.random.default_rng(0)
 
 
-def runs(rate: float, seeds: int = 3, starts: int = 50) -> Runs:
-    return Runs((RNG.random((seeds, 10, starts)) < rate).astype(float), list(range(starts)))
+def runs(rate: float, seeds: int = 3, episodes: int = 50) -> ConditionResults:
+    return ConditionResults((RNG.random((seeds, 10, episodes)) < rate).astype(float), list(range(episodes)))
 
 
 def write(folder, seed: int, step: int, won: list[bool], **changes) -> None:
-    config = dict(kind="m:DiffusionPolicy", obs_mode="rgb+tacrgb", seed=seed, step=step, num_demos=50)
+    config = dict(policy_name="diffusion_policy", obs_mode="rgb+tacrgb", seed=seed, step=step, num_demos=50)
     config |= dict(policy=dict(encoder=dict(image="resnet18", tacrgb="t3")))
     outcomes = [EpisodeOutcome(100 + k, win, win, 9, 1.0, 1.0) for k, win in enumerate(won)]
     result = result_of(PEG, dict(cameras=["wrist"]), config, outcomes) | changes
@@ -27,31 +27,46 @@ def write(folder, seed: int, step: int, won: list[bool], **changes) -> None:
     path.write_text(json.dumps(result))
 
 
-def test_runs_are_collected_by_setup_and_the_last_checkpoints_count(tmp_path):
+def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path):
     for seed in (0, 1):
         for step in (10, 20, 30):
             write(tmp_path, seed, step, [step == 30, step >= 20, seed == 1])
     collected = collect(results_in(tmp_path), last=2)
-    (setup,) = collected
-    assert setup == Setup(PEG, "rgb+tacrgb", "DiffusionPolicy", "t3", ("wrist",), 50)
-    assert collected[setup].starts == [100, 101, 102]
-    assert collected[setup].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
-    assert success(collected[setup]).value == pytest.approx(8 / 12)
+    (condition,) = collected
+    assert condition == Condition(PEG, "rgb+tacrgb", "diffusion_policy", "t3", ("wrist",), 50)
+    assert collected[condition].episode_seeds == [100, 101, 102]
+    assert collected[condition].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
+    assert mean_success(collected[condition]).value == pytest.approx(8 / 12)
 
 
-def test_results_of_different_starts_are_not_mixed(tmp_path):
+def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
+    config = dict(policy_name="diffusion_policy", obs_mode="tacff")
+    plain, rendered, changed = (
+        condition_of(result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
+        for env_kwargs in (
+            dict(sim_backend="physx_cpu"),
+            dict(render_backend="none", sensor_configs=dict(width=128), tactile_sensors=["left"]),
+            dict(fit="loose"),
+        )
+    )
+    assert rendered == plain
+    assert plain.variant == ""
+    assert changed.variant == '{"fit": "loose"}'
+
+
+def test_results_of_different_initial_states_are_not_mixed(tmp_path):
     write(tmp_path, 0, 10, [True, False])
     write(tmp_path, 1, 10, [True])
-    with pytest.raises(ResultError, match="different starts"):
+    with pytest.raises(ResultError, match="different initial states"):
         collect(results_in(tmp_path))
-    with pytest.raises(ResultError, match="different starts"):
-        difference(runs(0.5, starts=10), runs(0.5, starts=12))
+    with pytest.raises(ResultError, match="different initial states"):
+        difference(runs(0.5, episodes=10), runs(0.5, episodes=12))
 
 
 def test_one_checkpoint_has_wilsons_interval():
-    never = Runs(np.zeros((1, 1, 50)), list(range(50)))
-    assert success(never).low == 0.0
-    assert success(never).high == pytest.approx(1.96**2 / (50 + 1.96**2), rel=1e-3)  # Wilson (1927), at no success
+    never = ConditionResults(np.zeros((1, 1, 50)), list(range(50)))
+    assert mean_success(never).low == 0.0
+    assert mean_success(never).high == pytest.approx(1.96**2 / (50 + 1.96**2), rel=1e-3)  # Wilson (1927), at no success
 
 
 def test_interval_is_that_of_the_mean_over_seeds():
@@ -59,14 +74,14 @@ def test_interval_is_that_of_the_mean_over_seeds():
     many = runs(0.4, seeds=200)
     means = many.success.mean((1, 2))
     half = 1.96 * means.std(ddof=1) / np.sqrt(len(means))
-    estimate = success(many)
+    estimate = mean_success(many)
     assert estimate.value == pytest.approx(means.mean())
     assert estimate.low == pytest.approx(means.mean() - half, abs=0.15 * half)
     assert estimate.high == pytest.approx(means.mean() + half, abs=0.15 * half)
 
 
 def test_tasks_weigh_the_same_however_many_seeds_they_have():
-    assert success(runs(0.2, seeds=30), runs(0.8, seeds=3)).value == pytest.approx(0.5, abs=0.03)
+    assert mean_success(runs(0.2, seeds=30), runs(0.8, seeds=3)).value == pytest.approx(0.5, abs=0.03)
 
 
 def test_a_difference_is_found_where_there_is_one():
@@ -79,26 +94,28 @@ def test_a_difference_is_found_where_there_is_one():
     assert p > 0.05
 
 
-def test_starts_are_compared_one_by_one():
-    """Starts differ far more than set-ups do; what is paired still sees a small difference."""
+def test_initial_states_are_compared_one_by_one():
+    """Initial states differ far more than conditions do; what is paired still sees a small difference."""
     hard = RNG.random(50)
     base = np.tile(hard, (3, 10, 1))
-    first, second = (Runs((RNG.random(base.shape) < base + shift).astype(float), list(range(50))) for shift in (0.06, -0.06))
+    first, second = (
+        ConditionResults((RNG.random(base.shape) < base + shift).astype(float), list(range(50))) for shift in (0.06, -0.06)
+    )
     found, p = difference(first, second)
     assert found.low > 0
     assert p < 0.01
 
 
-def test_what_never_varied_in_a_few_starts_may_yet():
-    """Nothing of n starts bounds what is unseen by Wilson's upper limit at no success, z^2 / (n + z^2)."""
+def test_what_never_varied_in_a_few_episodes_may_yet():
+    """Nothing in n episodes bounds what is unseen by Wilson's upper limit at no success, z^2 / (n + z^2)."""
 
-    def always(starts: int, won: int = 1) -> Runs:
-        return Runs(np.full((3, 10, starts), float(won)), list(range(starts)))
+    def always(episodes: int, won: int = 1) -> ConditionResults:
+        return ConditionResults(np.full((3, 10, episodes), float(won)), list(range(episodes)))
 
     unseen = 1.96**2 / (50 + 1.96**2)
-    assert success(always(50)) == success(always(50), always(50))
-    assert (success(always(50)).low, success(always(50)).high) == (pytest.approx(1 - unseen, rel=1e-3), 1.0)
+    assert mean_success(always(50)) == mean_success(always(50), always(50))
+    assert (mean_success(always(50)).low, mean_success(always(50)).high) == (pytest.approx(1 - unseen, rel=1e-3), 1.0)
     same, p = difference(always(50, 0), always(50, 0))
     assert (same.value, same.low, same.high) == (0.0, pytest.approx(-unseen, rel=1e-3), pytest.approx(unseen, rel=1e-3))
     assert p == 1.0
-    assert success(always(2, 0)).high > 0.6
+    assert mean_success(always(2, 0)).high > 0.6

@@ -1,4 +1,4 @@
-"""Distances between sets of tactile pictures, against cases whose answer is known."""
+"""Distances between sets of tactile images, against cases whose answer is known."""
 
 import json
 from math import comb
@@ -11,15 +11,16 @@ from transformers import ConvNextImageProcessor, ResNetConfig, ResNetModel
 
 from manifeel_ms3.analysis import sim_real_similarity
 from manifeel_ms3.analysis.sim_real_similarity import Args, SimilarityError, fid, kid
+from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.paths import data_dir
 
 RNG = np.random.default_rng(0)
 OWN = "tests.analysis.test_sim_real_similarity:brightness"
 
 
-def brightness(pictures: np.ndarray) -> np.ndarray:
+def brightness(images: np.ndarray) -> np.ndarray:
     """Features of one's own: mean of each colour."""
-    return pictures.mean((1, 2))
+    return images.mean((1, 2))
 
 
 def test_fid_of_normal_distributions_is_the_closed_form():
@@ -58,7 +59,7 @@ def test_the_interval_covers_what_is_true():
 
 @pytest.fixture
 def folders(tmp_path):
-    """Pictures that differ by 20 grey levels, and fields."""
+    """Images that differ by 20 grey levels, and fields."""
     for side, level in (("sim", 100), ("real", 120)):
         (tmp_path / side).mkdir()
         (tmp_path / f"{side}_fields").mkdir()
@@ -121,11 +122,13 @@ def test_what_cannot_be_used_is_named(folders, monkeypatch):
     args = dict(out=folders / "out", resamples=2)
     with pytest.raises(SimilarityError, match="holds 0 of"):
         sim_real_similarity.main(Args(folders / "nowhere", folders / "real", OWN, **args))
-    with pytest.raises(SimilarityError, match="cannot be had as a ResNet"):
+    with pytest.raises(SimilarityError, match="cannot be loaded as a ResNet"):
         sim_real_similarity.main(Args(folders / "sim", folders / "real", str(folders / "sim"), **args))
     monkeypatch.setitem(__import__("sys").modules, "torch_fidelity.feature_extractor_inceptionv3", None)
-    with pytest.raises(SimilarityError, match="Inception network cannot be had"):
+    with pytest.raises(MissingExtraError, match=r"torch_fidelity.* is not installed: pip install 'manifeel-ms3\[similarity\]'"):
         sim_real_similarity.main(Args(folders / "sim", folders / "real", "inception", **args))
+    with pytest.raises(SimilarityError, match="nowhere:nothing cannot be imported"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", "nowhere:nothing", **args))
     (folders / "sim/3.png").write_bytes(b"no picture")
     with pytest.raises(SimilarityError, match=r"3\.png cannot be read"):
         sim_real_similarity.main(Args(folders / "sim", folders / "real", OWN, **args))

@@ -10,26 +10,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.evaluation import evaluate as evaluate_command
-from manifeel_ms3.evaluation.evaluate import Args
+from manifeel_ms3.errors import ServerError, UnknownNameError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result
+from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.conftest import PEG
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=12))
 SERVER = Path(__file__).parents[2] / "examples/policy_server.py"
 
 
-def evaluate(policy: str, out: Path, **changes) -> dict:
+def evaluated(policy: str, out: Path, **changes) -> dict:
     settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=2, env_kwargs=BARE, out=out / "evaluation.json")
     name = policy if "://" in policy else f"tests.evaluation.policies:{policy}"
-    return read_result(evaluate_command.main(Args(policy=name, **settings | changes)))
+    return read_result(main(Args(policy=name, **settings | changes)))
 
 
 def test_a_policy_of_ones_own_is_evaluated(tmp_path):
-    result = evaluate("StandStill", tmp_path)
-    assert [episode["seed"] for episode in result["episodes"]] == evaluate_command.evaluation_seeds(PEG, 2)
+    result = evaluated("StandStill", tmp_path)
+    assert [episode["seed"] for episode in result["episodes"]] == evaluation_seeds(2)
     assert [(e["length"], e["success_once"], e["error"]) for e in result["episodes"]] == [(12, False, None)] * 2
     assert result["policy"] == "tests.evaluation.policies:StandStill"
     assert result["success_once"]["rate"] == 0.0
@@ -47,7 +49,7 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     ],
 )
 def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_path):
-    result = evaluate(policy, tmp_path, step_timeout=1.0)
+    result = evaluated(policy, tmp_path, step_timeout=1.0)
     assert len(result["episodes"]) == 2
     for episode in result["episodes"]:
         assert reason in episode["error"]
@@ -55,15 +57,15 @@ def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_pat
 
 
 def test_a_wrong_number_of_actions_is_named(tmp_path):
-    result = evaluate("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
+    result = evaluated("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
     assert "shape (9,), the task takes (6,)" in result["episodes"][0]["error"]
 
 
 def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
-    with pytest.raises(PolicyError, match="OSError: no weights.*--policy-kwargs"):
-        evaluate("CannotBeMade", tmp_path)
+    with pytest.raises(PolicyError, match=r"OSError: no weights.*--policy-kwargs"):
+        evaluated("CannotBeMade", tmp_path)
     with pytest.raises(PolicyError, match="give module:Class"):
-        evaluate("Nobody", tmp_path)
+        evaluated("Nobody", tmp_path)
     assert not (tmp_path / "evaluation.json").exists()
 
 
@@ -77,7 +79,23 @@ def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
 )
 def test_what_is_missing_is_named(settings, word):
     with pytest.raises(ValueError, match=word):
-        evaluate_command.main(Args(**settings))
+        main(Args(**settings))
+
+
+def test_an_unknown_task_is_named_before_anything_is_made(tmp_path):
+    with pytest.raises(UnknownNameError, match=r"'ManiFeel-Knitting-v1' is not registered; registered are .*PegInsertion"):
+        evaluated("CannotBeMade", tmp_path, env_id="ManiFeel-Knitting-v1")
+
+
+def test_a_checkpoint_whose_task_names_a_module_does_not_import_it(tmp_path):
+    config = dict(policy_name="diffusion_policy", obs_mode="rgb", cameras=[], tactile_sensors=[])
+    (tmp_path / "config.json").write_text(json.dumps(config | dict(env_id="this:ManiFeel-Knitting-v1")))
+    with pytest.raises(UnknownNameError, match="'ManiFeel-Knitting-v1' is not registered"):
+        main(Args(tmp_path))
+    assert "this" not in sys.modules
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match=r"lacks \['env_id'\]; train the policy again"):
+        main(Args(tmp_path))
 
 
 @pytest.fixture
@@ -97,15 +115,15 @@ def server():
 
 
 def test_a_policy_in_another_process_is_asked(server, tmp_path):
-    result = evaluate(server.address, tmp_path, episodes=1)
+    result = evaluated(server.address, tmp_path, episodes=1)
     assert result["episodes"][0]["length"] == 12
     assert result["episodes"][0]["error"] is None
     assert result["policy"] == server.address
 
 
-def test_a_servers_error_and_its_absence_are_told(server):
-    with pytest.raises(ConnectionError, match="500: ValueError"):
-        server._ask("act", b"nonsense")
+def test_a_servers_error_and_its_absence_are_named(server):
+    with pytest.raises(ServerError, match="500: ValueError"):
+        server._post("act", b"nonsense")
     with pytest.raises(ConnectionError, match="start the server first"):
         RemotePolicy("http://127.0.0.1:9").reset()
 
@@ -118,14 +136,15 @@ def test_observations_travel_by_their_paths():
 
 @pytest.fixture
 def result_file(tmp_path):
-    evaluate("StandStill", tmp_path, episodes=1)
+    evaluated("StandStill", tmp_path, episodes=1)
     return tmp_path / "evaluation.json"
 
 
 def test_results_that_are_not_of_the_published_form_are_refused(result_file):
     good = json.loads(result_file.read_text())
     for broken, word in (
-        (good | dict(schema="manifeel-evaluation-9"), "has the schema 'manifeel-evaluation-9'"),
+        (good | dict(schema="manifeel-evaluation-9"), "has the schema 'manifeel-evaluation-9'.*update"),
+        (good | dict(schema="manifeel-evaluation-1"), "does not say the revision of the task.*evaluate the policy again"),
         (good | dict(success_once=dict(rate=1.5, low=0, high=1)), "success_once/rate"),
         ({name: value for name, value in good.items() if name != "episodes"}, "'episodes' is a required property"),
         (good | dict(episodes=[good["episodes"][0] | dict(length="long")]), "episodes/0/length"),
@@ -146,6 +165,6 @@ def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=1, env_kwargs=BARE, policy_kwargs='{"gain": 0.3}')
-    result = read_result(evaluate_command.main(Args(policy="my_module:MyPolicy", out=tmp_path / "evaluation.json", **settings)))
+    result = read_result(main(Args(policy="my_module:MyPolicy", out=tmp_path / "evaluation.json", **settings)))
     assert result["episodes"][0]["error"] is None
     assert len([line for line in code.splitlines() if line.strip()]) <= 20

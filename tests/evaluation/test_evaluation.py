@@ -5,10 +5,10 @@ import pytest
 
 from manifeel_ms3.evaluation import evaluate_episode
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from manifeel_ms3.evaluation.evaluate import evaluation_seeds
 from manifeel_ms3.evaluation.policy import load_policy
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
+from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.conftest import PEG
 
 
@@ -50,6 +50,8 @@ def test_same_policy_and_seed_give_the_same_outcome(make_env):
     first = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
     evaluate_episode(env, ExpertPolicy(env, 3), seed=3)
     again = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
+    assert first.error is None
+    assert first.length > 0
     assert (first.length, first.peak_contact_force) == (again.length, again.peak_contact_force)
 
 
@@ -60,20 +62,30 @@ def test_wilson_interval_matches_published_values():
 
 
 def test_evaluation_seeds_are_fixed_and_counted():
-    seeds = evaluation_seeds(PEG, 50)
+    seeds = evaluation_seeds(50)
     assert len(set(seeds)) == 50
     assert min(seeds) > 10_000  # demonstrations start at 0
-    with pytest.raises(ValueError, match="has 50 seeds"):
-        evaluation_seeds(PEG, 51)
-    with pytest.raises(ValueError, match=PEG):
-        evaluation_seeds("ManiFeel-Juggling-v1", 1)
+    assert evaluation_seeds(10) == seeds[:10]
+    with pytest.raises(ValueError, match="0 evaluation episodes are asked for; at least 1"):
+        evaluation_seeds(0)
 
 
 @pytest.mark.parametrize(
-    ("config", "word"), [(None, "no config.json"), ("{", "not json"), ('{"kind": "nowhere:Policy"}', "module:Class")]
+    ("config", "word"),
+    [
+        (None, "no config.json"),
+        ("{", "not json"),
+        ("[]", "holds a list instead of an object"),
+        ('{"policy_name": "juggler"}', "'juggler' is not registered .*diffusion_policy.*install the package"),
+        (
+            '{"kind": "baselines.common.agent:PolicyAgent", "policy_class": "nowhere:Policy"}',  # as commit 721bfa4 wrote it
+            "no policy_name.*train the policy again",
+        ),
+    ],
 )
 def test_broken_checkpoints_say_what_is_wrong(tmp_path, config, word):
     if config is not None:
         (tmp_path / "config.json").write_text(config)
-    with pytest.raises(CheckpointError, match=word):
+    with pytest.raises(CheckpointError, match=word) as error:
         load_policy(tmp_path)
+    assert "\n" not in str(error.value)

@@ -5,15 +5,18 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.result import read_result, result_of, write_result
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
-from manifeel_ms3.leaderboard import __main__ as leaderboard
+from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.submission import SubmissionError, check, read_submission
+from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.browser import browser_program
 from tests.conftest import PEG
 
@@ -39,14 +42,14 @@ def submission(evaluated, tmp_path) -> Path:
 
 
 def submit(folder: Path, board: Path, **changes) -> Path:
-    return leaderboard.main(leaderboard.Submit(folder, policy=POLICY, board=board, **changes))
+    return main(Submit(folder, policy=POLICY, board=board, **changes))
 
 
-def test_a_submission_is_run_again_and_taken(submission, tmp_path):
+def test_a_submission_is_run_again_and_accepted(submission, tmp_path):
     board = tmp_path / "board"
     taken = submit(submission, board, rerun=2)
     assert read_result(taken / "00000000.json")["policy"] == POLICY
-    with pytest.raises(FileExistsError, match="rename"):
+    with pytest.raises(FileExistsAlreadyError, match="rename"):
         submit(submission, board, rerun=1)
 
 
@@ -60,9 +63,9 @@ def change(folder: Path, edit) -> None:
 @pytest.mark.parametrize(
     ("edit", "word"),
     [
-        (lambda r: r["episodes"].pop(), "its 49 starts are not the 50"),
+        (lambda r: r["episodes"].pop(), "its 49 episodes are not those of the 50"),
         (lambda r: r["episodes"][3].update(seed=7), r"foreign \[7\]"),
-        (lambda r: r.update(revision=99), "is of revision 99 of"),
+        (lambda r: r.update(revision=99), "is of revision 99 of .* but the task has revision 1 here; evaluate again"),
         (lambda r: r["versions"].update(sapien="2.2.0"), "run with sapien 2.2.0, the leaderboard takes 3"),
         (lambda r: r["success_once"].update(rate=0.9), "success_once says"),
         (lambda r: r["episodes"][0].update(length=301), "301 steps, the task ends after 300"),
@@ -102,8 +105,27 @@ def test_foreign_and_broken_files_are_all_named(submission, tmp_path):
 
 
 def test_a_result_of_another_policy_is_not_run_for_this_one(submission, tmp_path):
-    with pytest.raises(SubmissionError, match="no result is of tests.evaluation.policies:Raises"):
-        leaderboard.main(leaderboard.Submit(submission, policy="tests.evaluation.policies:Raises", board=tmp_path / "board"))
+    with pytest.raises(SubmissionError, match=r"no result is of tests\.evaluation\.policies:Raises"):
+        main(Submit(submission, policy="tests.evaluation.policies:Raises", board=tmp_path / "board"))
+
+
+def test_a_submission_needs_a_policy_from_the_command_line(submission, tmp_path):
+    with pytest.raises(InvalidArgumentError, match="either --checkpoint or --policy"):
+        main(Submit(submission, board=tmp_path / "board"))
+
+
+def test_the_policy_that_a_result_names_is_never_imported(submission, tmp_path):
+    change(submission, lambda result: result.update(policy="this:Policy"))
+    check(read_submission(submission))
+    with pytest.raises(SubmissionError, match=r"no result is of tests\.evaluation\.policies:StandStill"):
+        submit(submission, tmp_path / "board")
+    assert "this" not in sys.modules
+
+
+def test_a_result_of_version_1_is_refused_with_what_to_do(submission):
+    change(submission, lambda result: result.update(schema="manifeel-evaluation-1"))
+    with pytest.raises(SubmissionError, match=r"'manifeel-evaluation-1'.*evaluate the policy again"):
+        read_submission(submission)
 
 
 # -------------------------------------------------------------------- the page
@@ -116,11 +138,8 @@ def made_up(folder: Path, name: str, task: str, mode: str, won: int) -> None:
     env_id = f"ManiFeel-{task}-v1"
     for seed in (0, 1):
         for step in (100, 200):
-            config = dict(kind="m:DiffusionPolicy", obs_mode=mode, seed=seed, step=step, num_demos=50)
-            outcomes = [
-                EpisodeOutcome(start, k < won, k < won, 9, 1.0, 1.0)
-                for k, start in enumerate(evaluate.evaluation_seeds(env_id, 50))
-            ]
+            config = dict(policy_name="diffusion_policy", obs_mode=mode, seed=seed, step=step, num_demos=50)
+            outcomes = [EpisodeOutcome(start, k < won, k < won, 9, 1.0, 1.0) for k, start in enumerate(evaluation_seeds(50))]
             write_result(
                 result_of(env_id, dict(cameras=["wrist"]), config, outcomes), folder / f"results/{seed}/{step:08d}.json"
             )
@@ -135,7 +154,7 @@ def board(tmp_path_factory) -> Path:
         ("Gamma", "ObjectSearch", "rgb", 20),
     ):
         made_up(board / name[:2], name, task, mode, won)
-    leaderboard.main(leaderboard.Build(board))
+    main(Build(board))
     return board
 
 

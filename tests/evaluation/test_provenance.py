@@ -1,0 +1,48 @@
+"""A result says which code, which task and which machine it comes from."""
+
+from importlib.metadata import version
+
+import pytest
+
+from manifeel_ms3.evaluation.provenance import git_commit, machine, package_versions
+from manifeel_ms3.evaluation.result import ResultError, read_result, result_of, write_result
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.tasks.registry import task_spec
+from tests.conftest import PEG
+
+
+@pytest.fixture
+def result():
+    config = dict(policy_name="diffusion_policy", obs_mode="rgb", run_dir="/home/me/runs/x")
+    return result_of(PEG, dict(cameras=["wrist"]), config, [EpisodeOutcome(100_000, True, True, 9, 1.0, 1.0)])
+
+
+def test_a_result_carries_versions_commit_and_the_revision_of_its_task(result, monkeypatch):
+    assert result["versions"] == {name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")}
+    assert result["versions"] == package_versions()
+    assert result["git_commit"] == git_commit()
+    assert result["revision"] == task_spec(PEG).revision
+    monkeypatch.setattr(task_spec(PEG), "revision", 7)
+    again = result_of(PEG, {}, result["config"], [EpisodeOutcome(100_000, True, True, 9, 1.0, 1.0)])
+    assert again["revision"] == 7
+
+
+def test_the_commit_is_a_hash_of_git_or_unknown(result):
+    commit = result["git_commit"]
+    assert commit is None or (len(commit) == 40 and set(commit) <= set("0123456789abcdef"))
+
+
+def test_a_result_without_commit_or_revision(result, tmp_path):
+    """The commit may be unknown, as in a wheel; the revision may not."""
+    write_result(result | dict(git_commit=None), tmp_path / "result.json")
+    assert read_result(tmp_path / "result.json")["git_commit"] is None
+    with pytest.raises(ResultError, match="'revision' is a required property"):
+        write_result({name: value for name, value in result.items() if name != "revision"}, tmp_path / "result.json")
+
+
+def test_the_machine_is_named(result):
+    here = machine()
+    assert set(here) == {"cpu", "cores", "gpu", "system"}
+    assert here["cpu"]
+    assert here["cores"] >= 1
+    assert result["machine"] == here
