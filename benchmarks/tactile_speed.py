@@ -20,7 +20,7 @@ from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.optics.shader import KNOTS, Shader, fourier_terms, slope_terms
 from manifeel_ms3.sensors.touch_model import TouchModel
-from manifeel_ms3.sensors.warp_device import lend_torch_threads
+from manifeel_ms3.sensors.warp_device import use_torch_threads_for_warp
 
 MODES = {  # outputs and options
     "TacFF": (("force_field",), {}),
@@ -126,7 +126,7 @@ def main(args: Args) -> None:
     depth = rays.heights(model.pixels).clamp(min=0).unflatten(1, config.image_shape)
     surface = optics.surface(depth)
     background, plain = optics.background.numpy(), surface[0].double().numpy()
-    with lend_torch_threads():  # as the sensor runs it
+    with use_torch_threads_for_warp():  # as the sensor runs it
         ours = milliseconds(lambda: optics.shade(surface), args.seconds)
         skirted = milliseconds(lambda: optics.shade(optics.surface(depth)), args.seconds)
     theirs = milliseconds(lambda: table_lookup(plain, lookup, background, config.pixel_size), args.seconds)
