@@ -1,5 +1,6 @@
-"""Milliseconds per pad of the tactile sensor, alone and in batches, and of its optics beside a plain table look-up:
-`python benchmarks/tactile_speed.py`.
+"""Measures milliseconds per pad of the tactile sensor, alone and in batches, and its optics against a plain table look-up.
+
+Run `python benchmarks/tactile_speed.py` in the repository's root.
 """
 
 import time
@@ -20,9 +21,9 @@ from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.optics.shader import KNOTS, Shader, fourier_terms, slope_terms
 from manifeel_ms3.sensors.touch_model import TouchModel
-from manifeel_ms3.sensors.warp_device import lend_torch_threads
+from manifeel_ms3.sensors.warp_device import use_torch_threads_for_warp
 
-MODES = {  # outputs and options
+MODES = {  # name: outputs and options of the sensor
     "TacFF": (("force_field",), {}),
     "TacRGB": (("rgb",), {}),
     "TacRGB + TacFF": (("rgb", "force_field"), {}),
@@ -32,20 +33,21 @@ MODES = {  # outputs and options
     ),
 }
 PUSH = (0.5, 0.2, -5.0, 0.0, 0.0, 1e-3)  # N, N m
-TABLE_BINS = 125
+TABLE_BINS = 125  # as TacSL's tables have
 
 
 @dataclass
 class Args:
     batches: tuple[int, ...] = (1, 8, 64)
-    """pads at once"""
+    """Numbers of pads that are computed at once."""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
+    """Device on which the sensor runs."""
     seconds: float = 2.0
-    """per measurement"""
+    """Duration of each measurement, s."""
 
 
 def press(shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
-    """Pads, each with the shape half a millimetre in."""
+    """Rays of equal pads, each with the shape half a millimetre in its gel."""
     rays = MeshRays([[shape] * pads], gelsight_r15("touch", "gel_right").gel.size, device)
     deep = torch.tensor([0.0, 0, -5e-4, 0, 0, 0, 1], device=device)
     rays.move(deep.expand(pads, 1, 7), torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device).expand(pads, 7))
@@ -53,7 +55,7 @@ def press(shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
 
 
 def shapes() -> dict[str, trimesh.Trimesh]:
-    """Over the face, their lowest point at height zero."""
+    """Meshes over the face by name, their lowest point at height zero, m."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.008)
     plate = trimesh.creation.box([0.012, 0.024, 0.01])
     return {
@@ -63,7 +65,7 @@ def shapes() -> dict[str, trimesh.Trimesh]:
 
 
 def milliseconds(function: Callable, seconds: float) -> float:
-    """Mean time of a call."""
+    """Mean duration of a call."""
     synchronise = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     for _ in range(3):
         function()
@@ -77,7 +79,7 @@ def milliseconds(function: Callable, seconds: float) -> float:
 
 
 def table_lookup(surface: np.ndarray, table: np.ndarray, background: np.ndarray, pixel_size: float) -> np.ndarray:
-    """The plain method (Taxim; TacSL): blur, gradient, bins, six coefficients a channel and pixel, sum."""
+    """The plain method (Taxim, TacSL): blur, gradient, bins, and a sum over six coefficients per channel and pixel."""
     height = cv2.GaussianBlur(surface / pixel_size, (5, 5), 0)
     along_rows, along_cols = np.gradient(height)
     slope, direction = np.arctan(np.hypot(along_rows, along_cols)), np.arctan2(along_rows, along_cols)
@@ -90,7 +92,7 @@ def table_lookup(surface: np.ndarray, table: np.ndarray, background: np.ndarray,
 
 
 def any_table() -> np.ndarray:
-    """(3, bins, bins, 6): the size and content of a real one matter to the caches, its colours do not."""
+    """Look-up table (3, bins, bins, 6) of a realistic size; its colours do not matter for the speed."""
     shader = Shader.load(gelsight_r15("touch", "gel_right").optics.calibration)
     slope, phi = np.linspace(0, np.pi / 2, TABLE_BINS), np.linspace(-np.pi, np.pi, TABLE_BINS)
     gradient = np.tan(slope.clip(max=np.arctan(KNOTS[-1])))
@@ -126,7 +128,7 @@ def main(args: Args) -> None:
     depth = rays.heights(model.pixels).clamp(min=0).unflatten(1, config.image_shape)
     surface = optics.surface(depth)
     background, plain = optics.background.numpy(), surface[0].double().numpy()
-    with lend_torch_threads():  # as the sensor runs it
+    with use_torch_threads_for_warp():  # as the sensor runs it
         ours = milliseconds(lambda: optics.shade(surface), args.seconds)
         skirted = milliseconds(lambda: optics.shade(optics.surface(depth)), args.seconds)
     theirs = milliseconds(lambda: table_lookup(plain, lookup, background, config.pixel_size), args.seconds)

@@ -1,4 +1,4 @@
-"""The pictures of docs/sensor.md, made anew: `python -m docs.make_sensor_figures` in the repository's root."""
+"""Draws the figures of docs/sensor.md: run `python -m docs.make_sensor_figures` in the repository's root."""
 
 from pathlib import Path
 
@@ -20,12 +20,13 @@ from tests.sensors import shapes
 IMAGES = Path(__file__).parent / "images"
 CONFIG = gelsight_r15("touch", "gel_right")
 CPU = torch.device("cpu")
+MAX_ITERATIONS = 300  # of the conjugate gradients, which end earlier when they have converged
 AROUND_X = trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0])
 ON_EDGE = trimesh.transformations.rotation_matrix(np.pi / 4, [0, 1, 0])
 
 
 def indenters() -> dict[str, tuple[trimesh.Trimesh, float]]:
-    """Mesh, lowest point at height zero, and the load, N."""
+    """Mesh, with its lowest point at height zero, and load, N, by name."""
     return {
         "ball, 8 mm": (_lifted(trimesh.creation.icosphere(subdivisions=6, radius=8e-3)), 3.0),
         "rod, 6 mm": (_lifted(trimesh.creation.cylinder(6e-3, 0.02, sections=720).apply_transform(AROUND_X)), 5.0),
@@ -41,7 +42,7 @@ def _lifted(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def pressed(mesh: trimesh.Trimesh) -> MeshRays:
-    """One pad under one mesh."""
+    """Rays of one pad under one mesh."""
     return MeshRays([[mesh]], CONFIG.gel.size, CPU)
 
 
@@ -52,7 +53,7 @@ def touch(mesh: trimesh.Trimesh, load: float, shear: tuple[float, float] = (0.0,
 
 
 def gallery() -> None:
-    """Every indenter: how high it stands, TacRGB, force field under shear; then the options of the optics."""
+    """Draw height, TacRGB and force field under shear for every indenter, and the options of the optics for one."""
     rows = []
     for name, (mesh, load) in indenters().items():
         model = TouchModel(CONFIG, 1, CPU)
@@ -99,7 +100,7 @@ def bonded_layer_force(radius: float, depth: float, gel: GelConfig, cells: int =
 
     pressure = np.maximum(wanted, 0) * gel.normal_stiffness
     direction, last = np.zeros_like(pressure), 1.0
-    for _ in range(300):
+    for _ in range(MAX_ITERATIONS):
         residual = wanted - sunk(pressure)
         inside = pressure > 0
         squared = (residual[inside] ** 2).sum()
@@ -116,7 +117,7 @@ def bonded_layer_force(radius: float, depth: float, gel: GelConfig, cells: int =
 
 
 def layer_laws() -> None:
-    """Force against depth of a ball: the model's Winkler layer, Hertz's half-space, the bonded layer."""
+    """Draw force against depth of a ball for the model's Winkler layer, Hertz's half-space and the bonded layer."""
     gel, depths = CONFIG.gel, np.linspace(1e-4, 1.2e-3, 12)
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4), sharex=True)
     for axis, radius in zip(axes, (4e-3, 10e-3), strict=True):

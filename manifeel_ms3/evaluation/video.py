@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.sensors.visualisation import pictures_of
+from manifeel_ms3.sensors.visualisation import observation_images
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
@@ -51,7 +51,7 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     frames: list[Frame] = []
 
     def keep(obs: dict[str, Any]) -> None:
-        frames.append(Frame(pictures_of(obs)))
+        frames.append(Frame(observation_images(obs)))
 
     outcome = evaluate_episode(env, policy, seed, keep)
     env.close()

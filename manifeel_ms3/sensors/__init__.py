@@ -1,3 +1,5 @@
+"""Gel-based tactile sensor (GelSight) for ManiSkill scenes: depth, mechanics and optics of a pad."""
+
 from .config import GelConfig as GelConfig
 from .config import OpticsConfig as OpticsConfig
 from .config import TactileSensorConfig as TactileSensorConfig

@@ -1,10 +1,12 @@
-"""A gel-based tactile sensor (GelSight and its kin) for ManiSkill environments."""
+"""Gel-based tactile sensor (GelSight and similar ones) for ManiSkill environments."""
 
 import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.sensors.base_sensor import BaseSensor
 from mani_skill.utils.structs import Articulation
+
+from manifeel_ms3.errors import UnknownNameError
 
 from .config import TactileSensorConfig
 from .depth.depth_camera import CameraDepth
@@ -15,25 +17,27 @@ from .visualisation import force_field_images
 
 
 class TactileSensor(BaseSensor):
-    """One pad of a robot: wrench, shape of what presses, and from both a force field and an image.
+    """One pad of a robot: a force field and an image from the measured wrench and the shape of what presses.
 
     - Wrench: the force and moment that the engine carries through the pad's joint.
-    - Shape: height of whatever is near the pad, by rays or by a camera in the pad.
+    - Shape: the height of everything near the pad, by rays or by a camera in the pad.
     - Penetration: the depth and tilt at which the gel layer carries that wrench (`contact.solve_indentation`).
-    - Force field: pressure of the layer, and shear by bristles with memory (`contact.solve_shear`), N per taxel.
-    - RGB: the gel's surface under the compact shader (`optics`).
+    - Force field: the layer's normal force, and shear by bristles with memory (`contact.solve_shear`), N per taxel.
+    - RGB: the gel's surface under the compact shader (`optics.tacrgb`).
 
-    Call `capture` once per control step: shear has a history.
+    Call `capture` exactly once per control step, since shear has a history.
 
     Args:
-        config: the pad, gel, optics and taxels.
-        scene: everything in it can be felt, but for the finger that carries the pad.
-        articulation: the robot that has the link `config.link`.
-        outputs: what `get_obs` returns, of "rgb" and "force_field"; the rest is not computed.
+        config: Configuration of the pad, gel, optics and taxels.
+        scene: Scene that contains the robot; everything in it can be felt, except the finger that carries the pad.
+        articulation: Robot that has the link `config.link`.
+        outputs: Outputs of `get_obs`, of "rgb" and "force_field"; the rest is not computed.
 
     Raises:
-        ValueError: a link or output that does not exist.
-        RuntimeError: backend "sapien" without a renderer, or for units "tacsl"; a body with an empty mesh.
+        UnknownNameError: The link or an output does not exist.
+        InvalidArgumentError: Backend "sapien" is combined with units "tacsl", or a body has a shape that has no mesh.
+        InvalidFileError: A body has a mesh without triangles.
+        MachineError: Backend "sapien" needs a renderer, and the scene has none.
     """
 
     config: TactileSensorConfig
@@ -47,14 +51,13 @@ class TactileSensor(BaseSensor):
     ):
         super().__init__(config)
         if config.link not in articulation.links_map:
-            raise ValueError(
-                f"link={config.link!r} of tactile sensor {config.uid!r} is not one of {sorted(articulation.links_map)}"
-            )
+            known = sorted(articulation.links_map)
+            raise UnknownNameError(f"link={config.link!r} of tactile sensor {config.uid!r} does not exist; choose from {known}")
         if unknown := set(outputs) - set(OUTPUTS):
-            raise ValueError(f"outputs {sorted(unknown)} of tactile sensor {config.uid!r} are unknown; use {OUTPUTS}")
+            raise UnknownNameError(f"outputs {sorted(unknown)} of tactile sensor {config.uid!r} are unknown; use {OUTPUTS}")
         self.scene = scene
         self.pad = articulation.links_map[config.link]
-        self.model = TouchModel(config, scene.num_envs, scene.device, tuple(outputs))
+        self.model = TouchModel(config, scene.num_envs, torch.device(scene.device), tuple(outputs))
         self._gauge = WrenchGauge(articulation, self.pad, config.pad_pose)
         self._depth = self._make_depth()
         self._obs: dict[str, torch.Tensor] = {}
@@ -64,11 +67,11 @@ class TactileSensor(BaseSensor):
         config = self.config
         if config.backend == "sapien":
             return CameraDepth(config, self.scene, self.pad)
-        # "auto": rays are the faster ones on CPU and GPU
+        # "auto": rays are faster than the camera on the CPU, and need no renderer
         return RaycastDepth(self.scene, self.pad, config.pad_pose, config.gel.size, self._unfelt_links())
 
     def _unfelt_links(self) -> set[str]:
-        """Links that the gel cannot touch: its own finger, and what carries it as far as the robot's base."""
+        """Names of the links that the gel cannot touch: its own finger and all links between it and the robot's base."""
         names, link = set(), self.pad
         while link is not None:
             names.add(link.name)
@@ -77,11 +80,11 @@ class TactileSensor(BaseSensor):
 
     @property
     def needs_render(self) -> bool:
-        """Whether `scene.update_render` must precede `capture`."""
+        """Whether `scene.update_render` must be called before `capture`."""
         return isinstance(self._depth, CameraDepth)
 
     def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None) -> None:
-        """Begin an episode in these environments: no shear; noise and what is randomised as the seeds, one each, say (0)."""
+        """Begin an episode in these environments without shear; noise and randomization follow from the seeds (0)."""
         self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
 
     def wrench(self) -> torch.Tensor:
@@ -89,25 +92,25 @@ class TactileSensor(BaseSensor):
         return self._gauge.read()
 
     def capture(self) -> None:
-        """Sense what the scene is like now."""
+        """Sense the scene in its present state."""
         self._depth.look()
         self._obs = self.model.observe(self._depth, self.wrench())
 
     def get_obs(self, **kwargs) -> dict[str, torch.Tensor]:
-        """What the last `capture` saw.
+        """Observation of the last `capture`.
 
-        `rgb` uint8 (N, 240, 320, 3). `force_field` float32 (N, 10, 14, 3), N per taxel, pad frame, of the object on the gel:
-        normal (>= 0, into the gel), shear along increasing rows, shear along increasing columns. `penetration` float32
-        (N, 10, 14), m. With units "tacsl", the force field is what `taxels.tacsl_field` says.
+        `rgb`: uint8 (N, 240, 320, 3). `force_field`: float32 (N, 10, 14, 3), N per taxel, pad frame, force of the object on the
+        gel: normal (>= 0, into the gel), shear along increasing rows, shear along increasing columns. `penetration`: float32
+        (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`.
         """
         return dict(self._obs)
 
     def get_params(self) -> dict[str, torch.Tensor]:
-        """Pad pose in the world, (N, 7), m and wxyz."""
+        """Pose of the pad in the world, (N, 7), m and wxyz."""
         return dict(pose=(self.pad.pose * self.config.pad_pose).raw_pose)
 
     def get_images(self, obs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Pictures for people, uint8 (N, H, W, 3), of an observation."""
+        """Images of an observation for people, uint8 (N, H, W, 3)."""
         images = {}
         if "rgb" in obs:
             images["rgb"] = obs["rgb"]

@@ -1,55 +1,65 @@
-"""Warp, started quietly, on torch's devices."""
+"""Warp without its start-up messages, on torch's devices and with torch's number of threads."""
 
 import contextlib
 import functools
 import math
 import os
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import torch
 import warp as wp
 
-WORTH_SPLITTING = 4_000  # threads of a launch
+MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since handing them over takes longer (chosen)
 
-wp.config.quiet = True
+setattr(wp.config, "quiet", True)  # noqa: B010 (newer releases of warp no longer declare it)
 if hasattr(wp, "LOG_WARNING"):  # newer releases
     wp.config.log_level = wp.LOG_ERROR
 
-_lent_threads = 1
+_threads = 1  # that `launch_split` may use, changed by `use_torch_threads_for_warp`
 
 
 def warp_device(device: torch.device):
-    """Warp's device for torch's."""
+    """Warp's device that corresponds to torch's."""
     wp.init()
     return wp.device_from_torch(device)
 
 
 @contextlib.contextmanager
-def lend_torch_threads():
-    """Give torch's CPU threads to `launch_split`: torch's own spin on after an operation, and would be in its way."""
-    global _lent_threads
-    own = torch.get_num_threads()
-    _lent_threads = own
+def use_torch_threads_for_warp() -> Iterator[None]:
+    """Let `launch_split` use as many CPU threads as torch has, and torch only one.
+
+    Torch's own threads keep spinning for a while after an operation and would compete with warp's for the cores.
+    """
+    global _threads
+    _threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(own)
-        _lent_threads = 1
+        torch.set_num_threads(_threads)
+        _threads = 1
 
 
-def launch_split(kernel, dim: tuple[int, ...], inputs: list, outputs: list, device: torch.device) -> None:
-    """Launch a kernel whose first argument says where its second index starts.
+def launch_split(kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list, device: torch.device) -> None:
+    """Launch a kernel on several CPU threads, its second index divided among them.
 
-    Warp runs a CPU kernel on one thread: there, the second axis is split over the threads lent by torch. The calls into native
-    code let go of Python's lock.
+    Warp runs a CPU kernel on one thread, but its calls into native code release Python's lock. The first argument of the
+    kernel must be the offset of its second index. On a GPU this is an ordinary launch.
+
+    Args:
+        kernel: Kernel to launch.
+        dim: Size of the launch; 2 axes or more.
+        inputs: Arguments of the kernel after the offset.
+        outputs: Arrays that the kernel writes.
+        device: Device of all arrays.
     """
     on = warp_device(device)
 
     def launch(start: int, stop: int) -> None:
         wp.launch(kernel, dim=(dim[0], stop - start, *dim[2:]), inputs=[start, *inputs], outputs=outputs, device=on)
 
-    threads = 1 if on.is_cuda or math.prod(dim) < WORTH_SPLITTING else min(_lent_threads, dim[1])
+    threads = 1 if on.is_cuda or math.prod(dim) < MIN_SPLIT_SIZE else min(_threads, dim[1])
     kernel.module.load(on)
     bounds = [dim[1] * k // threads for k in range(threads + 1)]
     others = [_pool(threads - 1).submit(launch, *bounds[k : k + 2]) for k in range(1, threads)]

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 import viser.uplot
 
-from manifeel_ms3.sensors.visualisation import pictures_of
+from manifeel_ms3.sensors.visualisation import observation_images
 
 from .operator import Mode, Operator, Wish
 
@@ -57,7 +57,7 @@ class Page:
     # ---------------------------------------------------------------- for the session
 
     def show(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
-        self._server.scene.set_background_image(_mosaic(list(pictures_of(obs).values())), format="jpeg", jpeg_quality=80)
+        self._server.scene.set_background_image(_mosaic(list(observation_images(obs).values())), format="jpeg", jpeg_quality=80)
         self._forces.append(float(info.get("contact_force", 0.0)))
         self._plot.data = (np.arange(PLOTTED, dtype=float), np.array(self._forces))
         self._mode.content = f"**{self.operator.mode.value}**" + (" · success" if bool(info.get("success", False)) else "")

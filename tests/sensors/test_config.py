@@ -37,7 +37,7 @@ def test_options_by_dotted_name():
     for name in ("optics.nose", "gell", "units.metre"):
         with pytest.raises(ValueError, match=name):
             with_options(config, {name: 1})
-    with pytest.raises(ValueError, match="gel.thickness"):
+    with pytest.raises(ValueError, match=r"gel\.thickness"):
         with_options(config, {"gel.thickness": -1.0})
 
 

@@ -6,6 +6,7 @@ import sapien
 import trimesh
 from sapien.render import RenderMaterial
 
+from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.sensors import TactileSensor, gelsight_r15
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from tests.conftest import needs_renderer
@@ -141,12 +142,12 @@ def test_empty_mesh_is_named():
     body.attach(shape)
     entity.add_component(body)
     entity.name = "nothing"
-    with pytest.raises(RuntimeError, match="nothing.*without triangles"):
+    with pytest.raises(InvalidFileError, match=r"nothing.*without triangles"):
         entity_mesh(entity)
 
 
 def test_sapien_backend_without_renderer_says_what_to_do():
     env = PadBench(obs_mode="state", render_backend="none")
-    with pytest.raises(RuntimeError, match="backend='raycast'"):
+    with pytest.raises(MachineError, match="backend='raycast'"):
         TactileSensor(gelsight_r15("touch", "gel_right", backend="sapien"), env.scene, env.agent.robot)
     env.close()

@@ -1,0 +1,1 @@
+"""Height of the surfaces near a pad, by rays or by a camera."""

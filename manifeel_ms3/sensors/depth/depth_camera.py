@@ -1,22 +1,23 @@
-"""Depth from rendering: an orthographic SAPIEN camera inside the pad that looks out through the gel."""
+"""Depth by rendering: an orthographic SAPIEN camera inside the pad that looks out through the gel."""
 
 import math
 
 import sapien
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812 (torch's own usage)
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.render import ShaderConfig
 from mani_skill.sensors.camera import Camera, CameraConfig
-from mani_skill.utils.structs import Link
+from mani_skill.utils.structs import Link, Pose
 
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.sensors.config import TactileSensorConfig
 
 from .raycast import REACH, Window
 
-START = 2.5e-3  # m behind the face: within the drawn gel, whose back would hide what comes
-NEAR = 1e-4  # m
-# wxyz: the camera looks along the pad's z, and down in its picture is the pad's x; right is then -y
+START = 2.5e-3  # m behind the face: inside the drawn gel (chosen), whose back would otherwise hide the object
+NEAR = 1e-4  # m: near plane of the camera (chosen; less than any surface's distance)
+# wxyz: the camera looks along the pad's z; down in its image is the pad's x, and right is -y
 PAD_TO_CAMERA = [math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0]
 FLOAT_POSITION = ShaderConfig(
     shader_pack="default",
@@ -26,19 +27,25 @@ FLOAT_POSITION = ShaderConfig(
 
 
 class CameraDepth:
-    """Height of whatever is near one pad (N, C), m, over points of its face.
+    """Height of everything near one pad over points of its face.
 
     The gel and the housing do not hide the object: their back faces are culled, and the camera sits between them.
 
+    Args:
+        sensor: Configuration of the pad.
+        scene: Scene that is rendered.
+        pad: Link that carries the pad.
+
     Raises:
-        RuntimeError: the scene has no renderer, or the units ask for velocities.
+        MachineError: The scene has no renderer.
+        InvalidArgumentError: The units need velocities, which a camera does not give.
     """
 
     def __init__(self, sensor: TactileSensorConfig, scene: ManiSkillScene, pad: Link):
         if sensor.units == "tacsl":
-            raise RuntimeError(f"tactile sensor {sensor.uid!r}: units='tacsl' needs velocities; use backend='raycast'")
+            raise InvalidArgumentError(f"tactile sensor {sensor.uid!r}: units='tacsl' needs velocities; use backend='raycast'")
         if not scene.can_render():
-            raise RuntimeError(
+            raise MachineError(
                 f"tactile sensor {sensor.uid!r} has backend='sapien', which needs a renderer, and this scene has none; "
                 "use backend='raycast', or give gym.make a render_backend"
             )
@@ -46,7 +53,7 @@ class CameraDepth:
         rows, cols = (2 * math.ceil(extent / 2 / pixel) for extent in sensor.gel.size)
         config = CameraConfig(
             f"{sensor.uid}_depth",
-            pose=sensor.pad_pose * sapien.Pose([0, 0, -START], PAD_TO_CAMERA),
+            pose=Pose.create(sensor.pad_pose * sapien.Pose([0, 0, -START], PAD_TO_CAMERA)),
             width=cols,
             height=rows,
             fov=1.0,
@@ -63,13 +70,13 @@ class CameraDepth:
             component.set_orthographic_parameters(NEAR, START + REACH, -right, right, -top, top)
 
     def look(self) -> None:
-        """Take a picture; the scene's render state is expected to be up to date (`scene.update_render`)."""
+        """Render depth; the scene's render state must be up to date (`scene.update_render`)."""
         self.camera.capture()
         depth = -self.camera.get_obs(rgb=False, depth=False, position=True, segmentation=False)["position"][..., 2]
         self._height = torch.where(depth > 0, START - depth, torch.full_like(depth, -REACH))[:, None]  # (N, 1, rows, cols)
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
-        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH where none."""
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH if there is none."""
         row, column = (grid / self.half_size).unbind(-1)
         where = torch.stack([-column, row], dim=-1)[None, None]  # (right, down) in [-1, 1]
         where = where.expand(len(self._height), -1, -1, -1)

@@ -1,8 +1,10 @@
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
-# (warp reads a kernel's annotations as its own types)
-"""Depth from rays: the orthographic camera in the pad as warp rays against triangle meshes. Needs no renderer."""
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false
+# pyright: reportAttributeAccessIssue=false
+# (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
+"""Depth by rays: warp rays from the pad, parallel to its normal, against triangle meshes. Needs no renderer."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import sapien
@@ -17,24 +19,28 @@ from manifeel_ms3.sensors.warp_device import launch_split, warp_device
 
 from .surfaces import scene_surfaces
 
-START = 4.2e-3  # m behind the face, where the rays start: the gel's back, deeper than any object comes
-REACH = 5.0e-3  # m in front of the face, where they end
+START = 4.2e-3  # m behind the face, where rays start: about the gel's back (4.25 mm), deeper than any object gets
+REACH = 5.0e-3  # m in front of the face, where rays end (chosen; beyond `contact.MAX_GAP`)
 
 wp.set_module_options({"enable_backward": False})
 
 
 @dataclass
 class Window:
-    """Parts of a face worth looking at: `open` (N, rows, cols) bool, cells that cover a face of `size`, m."""
+    """Parts of a face in which depth is computed."""
 
     open: torch.Tensor
+    """(N, rows, cols) bool: cells, evenly spread over the face, in which depth is computed."""
     size: tuple[float, float]
+    """Size of the face, m."""
 
 
 @wp.struct
 class Hit:
-    distance: float
-    place: int  # of the body in the list of near ones, -1 for none
+    """First surface on a ray."""
+
+    distance: float  # m
+    place: int  # index in the list of near bodies, -1 for none
     normal: wp.vec3f  # body frame
 
 
@@ -73,13 +79,13 @@ def _approach(
     middle: wp.vec3f,  # of the box that the rays sweep, pad frame
     half: wp.vec3f,
     count: wp.array(dtype=wp.int32),  # (N,)
-    near: wp.array2d(dtype=wp.int32),  # (N, B), and from here on: of the `count` bodies near enough to matter
+    near: wp.array2d(dtype=wp.int32),  # (N, B); this and the next two describe the `count` bodies near the pad
     meshes: wp.array2d(dtype=wp.int64),
     pad_in_body: wp.array2d(dtype=wp.transformf),
 ):
-    """List the bodies whose box meets the swept box, boxed along the body's axes."""
+    """List the bodies whose bounding box meets that of the space swept by the rays, in the body's axes."""
     n = wp.tid()
-    found = int(0)
+    found = int(0)  # noqa: RUF046 (declares a variable)
     for b in range(ids.shape[1]):
         pose = wp.transform_multiply(wp.transform_inverse(body[n, b]), pad[n])
         centre = wp.transform_point(pose, middle)
@@ -131,7 +137,7 @@ def _cast_moving(
     near: wp.array2d(dtype=wp.int32),
     twist: wp.array2d(
         dtype=wp.spatial_vectorf
-    ),  # (N, B): velocity of the pad's origin, and spin, of pad against body, pad frame
+    ),  # (N, B): velocity of the pad's origin, and spin, relative to the body, pad frame
     grid: wp.array(dtype=wp.vec2f),
     start: float,
     end: float,
@@ -152,12 +158,12 @@ def _cast_moving(
 
 
 class MeshRays:
-    """Rays from N pads to B meshes each.
+    """Rays from N pads to B meshes each. Bodies and pads are at the origin until `move` is called.
 
     Args:
-        meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are kept once. Bodies and pads lie
-            at the origin until `move`.
-        size: of the pads' face, m.
+        meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are stored once.
+        size: Size of the pads' face, m.
+        device: Device on which rays are cast.
     """
 
     def __init__(self, meshes: Sequence[Sequence[trimesh.Trimesh | None]], size: tuple[float, float], device: torch.device):
@@ -192,14 +198,14 @@ class MeshRays:
         return self._meshes[key]
 
     def move(self, bodies: torch.Tensor, pads: torch.Tensor) -> None:
-        """Put the bodies (N, B, 7) and the pads (N, 7): world poses, m and xyzw."""
+        """Set the poses of the bodies (N, B, 7) and of the pads (N, 7) in the world, m and xyzw."""
         ids, low, high = self._boxes
         inputs = [_transforms(bodies), _transforms(pads), ids, _vectors(low), _vectors(high), *self._swept]
         outputs = [self._count, self._near, self._near_ids, _transforms(self._near_poses)]
         self._launch(_approach, self._count.shape, inputs, outputs)
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
-        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH where none."""
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH if there is none."""
         height = torch.empty(len(self._near), len(grid), device=self.device)
         where, size = (self._everywhere, (1.0, 1.0)) if window is None else (window.open, window.size)
         inputs = [*self._found(), wp.from_torch(grid, dtype=wp.vec2f), wp.from_torch(where), wp.vec2f(*size), START, REACH]
@@ -207,9 +213,11 @@ class MeshRays:
         return height
 
     def sliding(self, grid: torch.Tensor, twist: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Heights as above, and the pads' velocity (N, C, 2), m/s, along what they face there.
+        """Heights as `heights` returns, and velocity (N, C, 2), m/s, of the pads along the surfaces that they face.
 
-        `twist` (N, B, 6): velocity of the pad's origin and its spin, m/s and rad/s, against each body, in the pad's frame.
+        Args:
+            grid: (C, 2), m, points of the face.
+            twist: (N, B, 6), m/s and rad/s, velocity of the pad's origin and its spin relative to each body, pad frame.
         """
         height = torch.empty(len(self._near), len(grid), device=self.device)
         velocity = torch.empty(*height.shape, 2, device=self.device)
@@ -235,42 +243,45 @@ def _vectors(vectors: torch.Tensor) -> wp.array:
 
 
 class RaycastDepth:
-    """What is near one pad of a scene's robot: height over points of its face, and how it slides there.
+    """Height of everything near one pad of a robot over points of its face, and the pad's velocity along it.
 
     Args:
-        scene: all its actors and links are felt, but for `excluded` links.
-        pad: link that carries the pad.
-        pad_pose: the pad frame in that link's frame.
-        size: of the face, m.
+        scene: Scene whose actors and links are felt.
+        pad: Link that carries the pad.
+        pad_pose: Pose of the pad frame in that link's frame.
+        size: Size of the face, m.
+        excluded: Names of the links that are not felt.
     """
 
     def __init__(self, scene: ManiSkillScene, pad: Link, pad_pose: sapien.Pose, size: tuple[float, float], excluded: set[str]):
-        self.pad, self.device = pad, scene.device
+        self.pad, self.device = pad, torch.device(scene.device)
         self._pad_pose = pad_pose
         self.surfaces = scene_surfaces(scene, excluded)
-        self._rays = MeshRays([_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces], size, scene.device)
+        self._rays = MeshRays([_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces], size, self.device)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
         self._world[..., 3] = 1.0
         self._moving = [b for b, surface in enumerate(self.surfaces) if not _is_static(surface.body)]
         self._take_poses(range(len(self.surfaces)))
 
-    def _take_poses(self, indices) -> None:
+    def _take_poses(self, indices: Iterable[int]) -> None:
         for b in indices:
             self._world[self.surfaces[b].env_idx, b] = self.surfaces[b].body.pose.raw_pose
 
     def look(self) -> None:
-        """Take the poses of now."""
+        """Read the present poses."""
         self._take_poses(self._moving)
         self._pad_world = (self.pad.pose * self._pad_pose).raw_pose
         self._rays.move(_xyzw(self._world), _xyzw(self._pad_world))
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
-        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH where none is, or where
-        the window is not open."""
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2).
+
+        It is -REACH if there is none, and where the window is not open.
+        """
         return self._rays.heights(grid, window)
 
     def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Heights (N, C) everywhere, and the velocity (N, C, 2), m/s, pad frame, of the pad along what it faces."""
+        """Heights (N, C), m, and velocity (N, C, 2), m/s, pad frame, of the pad along the surface that it faces."""
         to_pad = quaternion_to_matrix(self._pad_world[:, 3:]).transpose(1, 2)[:, None]
         origin = self._pad_world[:, :3]
         pad_linear, pad_spin = _motion(self.pad, origin)
@@ -294,7 +305,7 @@ def _is_static(body: Actor | Link) -> bool:
 
 
 def _motion(body: Actor | Link, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Velocity of the body's point that is now at `at` (n, 3), and its spin: m/s and rad/s, (n, 3) each, world frame."""
+    """Velocity, m/s, of the body's point that is at `at` (n, 3), and its spin, rad/s; (n, 3) each, world frame."""
     if _is_static(body):
         return torch.zeros_like(at), torch.zeros_like(at)
     spin, pose = body.angular_velocity, body.pose.raw_pose
@@ -304,4 +315,5 @@ def _motion(body: Actor | Link, at: torch.Tensor) -> tuple[torch.Tensor, torch.T
 
 
 def _xyzw(pose: torch.Tensor) -> torch.Tensor:
+    """Poses (..., 7) with their quaternions in warp's order instead of SAPIEN's wxyz."""
     return pose[..., [0, 1, 2, 4, 5, 6, 3]]

@@ -1,11 +1,13 @@
 """The surfaces that a pad may touch: every body of a ManiSkill scene as one triangle mesh in its own frame.
 
-A body is taken as it is drawn; where nothing is drawn (`render_backend="none"`), as it collides. No registration: whatever the
-scene holds is found here. A body whose surface is finer than what is drawn, such as a golf ball's, can be given a relief.
+The mesh is the body's visual shape or, if nothing is drawn (`render_backend="none"`), its collision shape. Bodies need no
+registration: all bodies of the scene are found. A body whose surface is finer than its visual shape, such as a golf ball's,
+can be given a relief.
 """
 
 import functools
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import sapien
@@ -15,45 +17,55 @@ import trimesh
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor, Link
 
-SPHERE_SUBDIVISIONS = 6  # 81,920 triangles: 0.6 micrometres off on a 10 mm ball, and no facets in TacRGB
-PLANE_HALF_SIZE = 10.0  # m
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
+
+SPHERE_SUBDIVISIONS = 6  # 81,920 triangles: within 0.6 micrometres of a 10 mm ball, so that TacRGB shows no facets
+CAPSULE_SECTIONS = 128  # around and along a cap: within 3 micrometres of a 10 mm radius
+CYLINDER_SECTIONS = 256  # around the axis: within 1 micrometre of a 10 mm radius
+PLANE_HALF_SIZE = 10.0  # m: extent of the slab that stands for an infinite plane (chosen)
+PLANE_THICKNESS = 0.1  # m (chosen)
 RELIEF = "touch_relief"
 
 
 @dataclass
 class Surface:
-    """A body and its mesh in each environment that holds it."""
+    """A body and its mesh in each environment that contains it."""
 
     body: Actor | Link
+    """Body in the scene."""
     env_idx: torch.Tensor
+    """Indices (n,) of the environments that contain the body."""
     meshes: list[trimesh.Trimesh]
+    """Mesh in each of these environments, body frame, m."""
 
 
 def give_relief(actor: Actor, mesh: trimesh.Trimesh) -> None:
-    """Have pads, and pads alone, feel this surface, m, in the actor's frame, instead of what is drawn."""
+    """Make pads feel this surface, m, in the actor's frame, instead of the visual shape; nothing else changes."""
     setattr(actor, RELIEF, mesh)
 
 
 def scene_surfaces(scene: ManiSkillScene, excluded: set[str]) -> list[Surface]:
-    """Surfaces of all actors and links of the scene, but for the links named in `excluded`.
+    """Surfaces of all actors and links of the scene, except the links named in `excluded`.
 
     Raises:
-        RuntimeError: a body is drawn with a mesh that has no triangles.
+        InvalidFileError: A body has a mesh without triangles.
+        InvalidArgumentError: A body has a shape of a type that has no mesh.
     """
     links = [link for articulation in scene.articulations.values() for link in articulation.links]
     surfaces = []
     for body in [*scene.actors.values(), *(link for link in links if link.name not in excluded)]:
         entities = [obj if isinstance(obj, sapien.Entity) else obj.entity for obj in body._objs]
         relief = getattr(body, RELIEF, None)
-        meshes = [entity_mesh(entity) for entity in entities] if relief is None else [relief] * len(entities)
-        if all(mesh is not None for mesh in meshes):
+        found = [entity_mesh(entity) if relief is None else relief for entity in entities]
+        meshes = [mesh for mesh in found if mesh is not None]
+        if len(meshes) == len(entities):
             surfaces.append(Surface(body, body._scene_idxs, meshes))
     return surfaces
 
 
 def entity_mesh(entity: sapien.Entity) -> trimesh.Trimesh | None:
-    """All of an entity's shapes as one mesh in its frame, m; None where it has no shape."""
-    parts = []
+    """All shapes of an entity as one mesh in its frame, m; None if it has no shape."""
+    parts: list[trimesh.Trimesh] = []
     for component in entity.components:
         if isinstance(component, sapien.render.RenderBodyComponent):
             parts = [_placed(_drawn(shape), shape.local_pose) for shape in component.render_shapes]
@@ -62,20 +74,25 @@ def entity_mesh(entity: sapien.Entity) -> trimesh.Trimesh | None:
             parts = [_placed(_colliding(shape), shape.local_pose) for shape in component.collision_shapes]
     if not parts:
         return None
-    mesh = trimesh.util.concatenate(parts)
+    mesh = _joined(parts)
     if len(mesh.faces) == 0:
-        raise RuntimeError(f"body {entity.name!r} has a mesh without triangles; a tactile sensor cannot feel it: mend its file")
+        raise InvalidFileError(f"body {entity.name!r} has a mesh without triangles, which a pad cannot feel; mend its file")
     return mesh
 
 
+def _joined(parts: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(parts))
+
+
 def _placed(mesh: trimesh.Trimesh, pose: sapien.Pose) -> trimesh.Trimesh:
-    return mesh.apply_transform(pose.to_transformation_matrix())
+    mesh.apply_transform(pose.to_transformation_matrix())
+    return mesh
 
 
 def _drawn(shape) -> trimesh.Trimesh:
     if isinstance(shape, sapien.render.RenderShapeTriangleMesh):
         parts = [trimesh.Trimesh(part.vertices * shape.scale, part.triangles, process=False) for part in shape.parts]
-        return trimesh.util.concatenate(parts)
+        return _joined(parts)
     return _primitive(shape)
 
 
@@ -91,7 +108,7 @@ def _unit_sphere() -> trimesh.Trimesh:
 
 
 def _primitive(shape) -> trimesh.Trimesh:
-    """Box, sphere, capsule, cylinder and plane, drawn or colliding: their names differ in the prefix alone."""
+    """Mesh of a visual or collision shape that is a box, sphere, capsule, cylinder or plane."""
     kind = type(shape).__name__.removeprefix("RenderShape").removeprefix("PhysxCollisionShape")
     x_from_z = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])  # SAPIEN's axis is x, trimesh's z
     if kind == "Box":
@@ -99,12 +116,16 @@ def _primitive(shape) -> trimesh.Trimesh:
     if kind == "Sphere":
         return _unit_sphere().copy().apply_scale(shape.radius)
     if kind == "Capsule":
-        capsule = trimesh.creation.capsule(height=2 * shape.half_length, radius=shape.radius, count=[128, 128])
+        capsule = trimesh.creation.capsule(
+            height=2 * shape.half_length, radius=shape.radius, count=[CAPSULE_SECTIONS, CAPSULE_SECTIONS]
+        )
         return capsule.apply_transform(x_from_z)
     if kind == "Cylinder":
-        cylinder = trimesh.creation.cylinder(radius=shape.radius, height=2 * shape.half_length, sections=256)
+        cylinder = trimesh.creation.cylinder(radius=shape.radius, height=2 * shape.half_length, sections=CYLINDER_SECTIONS)
         return cylinder.apply_transform(x_from_z)
     if kind == "Plane":
-        slab = trimesh.creation.box(extents=(0.1, 2 * PLANE_HALF_SIZE, 2 * PLANE_HALF_SIZE))
-        return slab.apply_translation([-0.05, 0, 0])  # SAPIEN's plane: normal along x
-    raise RuntimeError(f"a shape of type {type(shape).__name__} cannot be felt; use a mesh, box, sphere, capsule or cylinder")
+        slab = trimesh.creation.box(extents=(PLANE_THICKNESS, 2 * PLANE_HALF_SIZE, 2 * PLANE_HALF_SIZE))
+        return slab.apply_translation([-PLANE_THICKNESS / 2, 0, 0])  # SAPIEN's plane: normal along x
+    raise InvalidArgumentError(
+        f"a pad cannot feel a shape of type {type(shape).__name__}; use a mesh, box, sphere, capsule or cylinder"
+    )

@@ -1,0 +1,1 @@
+"""Forces on a pad: the measured wrench, and the gel that carries it."""

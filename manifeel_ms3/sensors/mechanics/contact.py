@@ -1,10 +1,11 @@
 # pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
-# (warp reads a kernel's annotations as its own types)
-"""Gel mechanics: from the shape of what presses and the measured wrench to pressure, shear and penetration of every cell.
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false
+# (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
+"""Gel mechanics: from the shape of what presses and the measured wrench to penetration, normal force and shear of each cell.
 
-One thread block a pad: its threads share the cells and add up their parts, so that a whole Newton iteration stays on the
-device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad frame
-(z out of the gel).
+Each pad has one block of threads, which share the cells and add up their parts, so that a whole Newton iteration stays on
+the device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad
+frame (z out of the gel).
 """
 
 from dataclasses import dataclass
@@ -14,15 +15,19 @@ import warp as wp
 
 from manifeel_ms3.sensors.warp_device import warp_device
 
-MAX_TILT = wp.constant(wp.float64(0.087))  # rad, 5 degrees: further off, the moment comes from outside what the pad sees
-MAX_GAP = wp.constant(wp.float64(3.0e-3))  # m; geometry further from the face is not what the measured force presses on
-MIN_FORCE = wp.constant(wp.float64(1.0e-3))  # N; below it the pad is untouched
-LEVER = wp.constant(wp.float64(1.0e-2))  # m; rotations times this are lengths like displacements: conditions the 3 x 3 systems
-CONVERGED = wp.constant(wp.float64(1.0e-11))  # m
-MAX_STEP = wp.constant(wp.float64(1.0e-3))  # m: a runaway in full slip stays finite
+# Physical limits of the model (chosen)
+MAX_TILT = wp.constant(wp.float64(0.087))  # rad, 5 degrees: a larger moment comes from outside the pad's view
+MAX_GAP = wp.constant(wp.float64(3.0e-3))  # m: the measured force does not press on geometry further from the face
+MIN_FORCE = wp.constant(wp.float64(1.0e-3))  # N: below it the pad counts as untouched
+# Numerics of the two Newton methods (chosen; tests/sensors compares the results with closed forms)
+LEVER = wp.constant(wp.float64(1.0e-2))  # m: times a rotation, a length like a displacement; conditions the 3 x 3 systems
+CONVERGED = wp.constant(wp.float64(1.0e-11))  # m: last step of an iteration that has converged
+MAX_STEP = wp.constant(wp.float64(1.0e-3))  # m: keeps the iteration finite when the whole contact slips
 CONE = wp.constant(wp.float64(0.999))  # share of the cone that the sum may take, so that the system stays regular
-ITERATIONS = wp.constant(12)
-THREADS = 128  # a pad, on a GPU
+RIDGE = wp.constant(wp.float64(1.0e-6))  # added to a system's diagonal, as a share of its trace
+TINY = wp.constant(wp.float64(1.0e-15))  # m: avoids a division by zero
+ITERATIONS = wp.constant(12)  # Newton steps at most
+THREADS = 128  # threads per pad on a GPU
 
 wp.set_module_options({"enable_backward": False})
 vec9d = wp.types.vector(length=9, dtype=wp.float64)
@@ -30,15 +35,16 @@ vec9d = wp.types.vector(length=9, dtype=wp.float64)
 
 @dataclass
 class ContactGrid:
-    """Cells over the whole gel face.
-
-    `x`, `y`: (C,) centres in the pad frame, m, float64. `shape`: rows, columns with C = rows * columns. `area`: of a cell, m^2.
-    """
+    """Cells over the whole gel face."""
 
     x: torch.Tensor
+    """Centres of the cells across the finger in the pad frame, (C,) float64, m."""
     y: torch.Tensor
+    """Centres of the cells along the finger in the pad frame, (C,) float64, m."""
     shape: tuple[int, int]
+    """Rows and columns of the cells, C = rows * columns."""
     area: float
+    """Area of a cell, m^2."""
 
     @classmethod
     def covering(cls, size: tuple[float, float], cell: float, device: torch.device) -> "ContactGrid":
@@ -53,14 +59,15 @@ class ContactGrid:
 def solve_indentation(height: torch.Tensor, wrench: torch.Tensor, grid: ContactGrid, stiffness: torch.Tensor) -> torch.Tensor:
     """Plane (N, 3) to add to a surface's height so that what sticks out of the gel's face carries the measured load.
 
-    Virtual indentation: of the object only the shape matters; how deep it sits follows from the force. Find the depth d, m,
+    Virtual indentation: only the object's shape matters; how deep it sits follows from the force. Find the depth d, m,
     and the tilts a, b such that the layer's pressure p = K max(0, height + d + a x + b y) has sum p dA = F_n and the measured
     first moments sum p x dA, sum p y dA. This is the minimum of a convex potential: Newton's method, started from the depth
     at zero tilt. An untouched pad gets d = -1 m.
 
     Args:
-        height: (N, C) float32, m, of the object's surface above (+: into) the gel's face.
+        height: (N, C) float32, m, height of the object's surface above (+: into) the gel's face.
         wrench: (N, 6) float64, N and N m, force and moment of the object on the pad about the pad frame's origin.
+        grid: The C cells.
         stiffness: (N,) float64, K, N/m^3.
     """
     plane = torch.empty(len(height), 3, dtype=torch.float64, device=height.device)
@@ -69,9 +76,9 @@ def solve_indentation(height: torch.Tensor, wrench: torch.Tensor, grid: ContactG
 
 
 def depth_below_face(height: torch.Tensor, plane: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-    """How deep the surface stands in the gel, (N, C), m, at points x, y (C,) of the face; negative above it.
+    """Depth (N, C), m, of the surface in the gel at points x, y (C,) of the face; negative above it.
 
-    `plane` is that of `solve_indentation`; the result has the type of `height`.
+    `plane` comes from `solve_indentation`; the result has the type of `height`.
     """
     plane, x, y = plane.to(height.dtype), x.to(height.dtype), y.to(height.dtype)
     return height + plane[:, :1] + plane[:, 1:2] * x + plane[:, 2:3] * y
@@ -79,7 +86,7 @@ def depth_below_face(height: torch.Tensor, plane: torch.Tensor, x: torch.Tensor,
 
 def solve_shear(
     bristle: torch.Tensor,
-    pressure: torch.Tensor,
+    cell_force: torch.Tensor,
     wrench: torch.Tensor,
     grid: ContactGrid,
     stiffness: torch.Tensor,
@@ -87,21 +94,21 @@ def solve_shear(
 ) -> torch.Tensor:
     """Shear force (N, C, 2), N, of every cell such that the field carries the measured shear and twist.
 
-    Every cell is a bristle with memory: its traction is k_t (z + u + theta x r) until Coulomb's limit mu p, beyond which it
+    Every cell is a bristle with memory: its traction is k_t (z + u + theta x r) up to Coulomb's limit mu p, beyond which it
     slips. The contact moves as a rigid body by (u, theta) between two calls, the one unknown, found such that the tractions
-    add up to the measured F_x, F_y, M_z (minimum of a convex, Huber-like potential; semismooth Newton).
+    add up to the measured F_x, F_y, M_z (minimum of a convex, Huber-like potential; semismooth Newton). The new deflections
+    are the result divided by k_t dA.
 
     Args:
         bristle: (N, C, 2) float64, m, deflections z after the last call.
-        pressure: (N, C) float64, N, normal force of every cell.
+        cell_force: (N, C) float64, N, normal force of every cell, p dA.
         wrench: (N, 6) float64, as in `solve_indentation`.
+        grid: The C cells.
         stiffness: (N,) float64, k_t, N/m^3.
         friction: (N,) float64, mu.
-
-    The new deflections are the result / (k_t dA).
     """
     shear = torch.empty_like(bristle)
-    _launch(_slide, grid, bristle, [bristle, pressure, wrench, stiffness, friction, grid.x, grid.y, grid.area], [shear])
+    _launch(_slide, grid, bristle, [bristle, cell_force, wrench, stiffness, friction, grid.x, grid.y, grid.area], [shear])
     return shear
 
 
@@ -126,8 +133,8 @@ def _total(part: vec9d) -> vec9d:
 
 @wp.func
 def _newton_step(sums: vec9d, residual: wp.vec3d) -> wp.vec3d:
-    """Solve the symmetric system whose entries are sums[3..8], with a millionth of its trace on the diagonal."""
-    ridge = wp.float64(1.0e-6) * (wp.float64(1.0) + sums[3] + sums[6] + sums[8])
+    """Solve the symmetric system whose entries are sums[3..8], with a ridge on its diagonal."""
+    ridge = RIDGE * (wp.float64(1.0) + sums[3] + sums[6] + sums[8])
     hessian = wp.mat33d(sums[3] + ridge, sums[4], sums[5], sums[4], sums[6] + ridge, sums[7], sums[5], sums[7], sums[8] + ridge)
     return wp.inverse(hessian) * residual
 
@@ -146,7 +153,7 @@ def _depth(
 ) -> wp.float64:
     """Depth d with sum max(0, height - highest + tilts + d) = load.
 
-    The sum is convex and increasing in d, so that Newton's method falls onto the root from above, after one step at most.
+    The sum is convex and increasing in d, so that Newton's method approaches the root from above after at most one step.
     """
     depth = start
     for _ in range(ITERATIONS):
@@ -217,13 +224,43 @@ def _indent(
 
 @wp.func
 def _stretched(bristle: wp.array3d(dtype=wp.float64), n: int, c: int, move: wp.vec3d, u: wp.float64, v: wp.float64):
+    """Deflection of a cell's bristle after the contact has moved, before it slips."""
     return wp.vec2d(bristle[n, c, 0] + move[0] - move[2] * v, bristle[n, c, 1] + move[1] + move[2] * u)
+
+
+@wp.func
+def _clamped_terms(stretched: wp.vec2d, limit: wp.float64, u: wp.float64, v: wp.float64) -> vec9d:
+    """A cell's part in the residual (3 entries) and in the Hessian (6 entries), its deflection clamped to the limit."""
+    s = stretched
+    length = wp.length(s)
+    # derivative of the clamped deflection: identity where it sticks, the tangential part shrunk where it slips
+    xx = wp.float64(1.0)
+    xy = wp.float64(0.0)
+    yy = wp.float64(1.0)
+    if length > limit:
+        shrink = limit / length
+        ahead = s / length
+        s = ahead * limit
+        xx = shrink * (wp.float64(1.0) - ahead[0] * ahead[0])
+        xy = -shrink * ahead[0] * ahead[1]
+        yy = shrink * (wp.float64(1.0) - ahead[1] * ahead[1])
+    return vec9d(
+        s[0],
+        s[1],
+        u * s[1] - v * s[0],
+        xx,
+        xy,
+        u * xy - v * xx,
+        yy,
+        u * yy - v * xy,
+        u * u * yy - wp.float64(2.0) * u * v * xy + v * v * xx,
+    )
 
 
 @wp.kernel
 def _slide(
     bristle: wp.array3d(dtype=wp.float64),
-    pressure: wp.array2d(dtype=wp.float64),
+    cell_force: wp.array2d(dtype=wp.float64),
     wrench: wp.array2d(dtype=wp.float64),
     stiffness: wp.array(dtype=wp.float64),
     friction: wp.array(dtype=wp.float64),
@@ -234,57 +271,34 @@ def _slide(
 ):
     n, lane = wp.tid()
     per_metre = stiffness[n] * area
-    slack = friction[n] / per_metre  # m/N: times a cell's pressure, the deflection at which it slips
+    slack = friction[n] / per_metre  # m/N: times a cell's normal force, the deflection at which it slips
     part = vec9d(wp.float64(0.0))
-    for c in range(lane, pressure.shape[1], wp.block_dim()):
-        part[0] += pressure[n, c]
+    for c in range(lane, cell_force.shape[1], wp.block_dim()):
+        part[0] += cell_force[n, c]
     normal = _total(part)[0]
     load = wp.vec3d(wrench[n, 0], wrench[n, 1], wrench[n, 5] / LEVER) / per_metre
     planar = wp.length(wp.vec2d(load[0], load[1]))
     most = CONE * slack * normal
-    if planar > most:  # the cone rules
+    if planar > most:  # the contact cannot carry more
         load *= most / planar
     move = wp.vec3d(wp.float64(0.0))
     if normal > wp.float64(0.0):
         for _ in range(ITERATIONS):
             part = vec9d(wp.float64(0.0))
-            for c in range(lane, pressure.shape[1], wp.block_dim()):
-                limit = slack * pressure[n, c]
+            for c in range(lane, cell_force.shape[1], wp.block_dim()):
+                limit = slack * cell_force[n, c]
                 if limit > wp.float64(0.0):
                     u = x[c] / LEVER
                     v = y[c] / LEVER
-                    s = _stretched(bristle, n, c, move, u, v)
-                    length = wp.length(s)
-                    # derivative of the clamped deflection: identity where it sticks, the tangential part shrunk where it slips
-                    xx = wp.float64(1.0)
-                    xy = wp.float64(0.0)
-                    yy = wp.float64(1.0)
-                    if length > limit:
-                        shrink = limit / length
-                        ahead = s / length
-                        s = ahead * limit
-                        xx = shrink * (wp.float64(1.0) - ahead[0] * ahead[0])
-                        xy = -shrink * ahead[0] * ahead[1]
-                        yy = shrink * (wp.float64(1.0) - ahead[1] * ahead[1])
-                    part += vec9d(
-                        s[0],
-                        s[1],
-                        u * s[1] - v * s[0],
-                        xx,
-                        xy,
-                        u * xy - v * xx,
-                        yy,
-                        u * yy - v * xy,
-                        u * u * yy - wp.float64(2.0) * u * v * xy + v * v * xx,
-                    )
+                    part += _clamped_terms(_stretched(bristle, n, c, move, u, v), limit, u, v)
             total = _total(part)
             step = _newton_step(total, load - wp.vec3d(total[0], total[1], total[2]))
             for i in range(3):
                 move[i] += wp.clamp(step[i], -MAX_STEP, MAX_STEP)
             if wp.length(step) < CONVERGED:
                 break
-    for c in range(lane, pressure.shape[1], wp.block_dim()):
+    for c in range(lane, cell_force.shape[1], wp.block_dim()):
         s = _stretched(bristle, n, c, move, x[c] / LEVER, y[c] / LEVER)
-        s *= per_metre * wp.min(slack * pressure[n, c] / wp.max(wp.length(s), wp.float64(1.0e-15)), wp.float64(1.0))
+        s *= per_metre * wp.min(slack * cell_force[n, c] / wp.max(wp.length(s), TINY), wp.float64(1.0))
         shear[n, c, 0] = s[0]
         shear[n, c, 1] = s[1]

@@ -1,4 +1,4 @@
-"""The whole wrench on a link, friction included, from the force that its joint carries."""
+"""Wrench on a link, including friction, from the force that the link's joint carries."""
 
 import sapien
 import torch
@@ -8,12 +8,14 @@ from mani_skill.utils.structs import Articulation, Link
 class WrenchGauge:
     """Measures the force and moment of the world on one link, in a frame fixed to it, about that frame's origin.
 
-    The engine's spatial force of a joint is what the child link puts through it onto its parent, in the joint's frame. SAPIEN's
-    joint frames are turned against the link's (half a turn about x for fixed joints); contact queries would leave friction out.
-    The link's own weight and inertia are in it, unless its gravity is off, as on ManiSkill's robots.
+    The engine's spatial force of a joint is the force of the child link on its parent, in the joint's frame. SAPIEN's joint
+    frames are turned against the link's (by half a turn about x for fixed joints). Contact queries would leave out friction.
+    The wrench includes the link's own inertia, and its weight unless its gravity is off, as on ManiSkill's robots.
 
     Args:
-        frame: in the link's frame; default: the link's own.
+        articulation: Robot that the link belongs to.
+        link: Link on which the wrench acts.
+        frame: Frame of the wrench, given in the link's frame; the link's own by default.
     """
 
     def __init__(self, articulation: Articulation, link: Link, frame: sapien.Pose | None = None):

@@ -1,0 +1,1 @@
+"""Image of the gel from behind: its surface, its colours, and their calibration."""

@@ -1,7 +1,7 @@
 """Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.optics.fit_shader {table,presses} ...`.
 
-From a table in Taxim's format, or from presses of a ball of known radius: a folder with `background.png` (untouched gel), the
-pictures, and `presses.csv`, whose lines say `file,row,col,radius`: the contact circle in pixels.
+It is fitted to a table in Taxim's format, or to images of presses of a ball of known radius: a folder with `background.png`
+(untouched gel), the images, and `presses.csv`, which has the columns `file,row,col,radius` (the contact circle in pixels).
 """
 
 import csv
@@ -14,101 +14,110 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 from .taxim_table import fit_table, read_table
 
-RIDGE = 1e-6  # of the mean diagonal: slopes and places that no press reached stay at zero
+RIDGE = 1e-6  # share of the mean diagonal (chosen): coefficients of slopes and places that no press reached stay at zero
 
 
 @dataclass
 class Table:
-    """Fit to a polycalib.npz in Taxim's format."""
+    """Fit the shader to a polycalib.npz in Taxim's format."""
 
     table: Path
-    """npz with grad_r, grad_g, grad_b, each (bins, bins, 6)"""
+    """Path of the table: an npz file with grad_r, grad_g and grad_b, each (bins, bins, 6)."""
     out: Path
+    """Path of the shader file that is written."""
     image_shape: tuple[int, int] = (240, 320)
-    """rows and columns of our picture, the table's on its side"""
+    """Rows and columns of the sensor's image: the table's image, laid on its side."""
 
 
 @dataclass
 class Presses:
-    """Fit to pictures of ball presses."""
+    """Fit the shader to images of ball presses."""
 
     folder: Path
+    """Path of the folder with background.png, presses.csv and the images."""
     ball_radius: float
-    """m"""
+    """Radius of the ball, m."""
     pixel_size: float
-    """m per pixel"""
+    """Size of a pixel on the gel's face, m."""
     out: Path
+    """Path of the shader file that is written."""
 
 
 def fit_presses(
-    background: np.ndarray, pictures: np.ndarray, circles: np.ndarray, ball_radius: float, pixel_size: float
+    background: np.ndarray, images: np.ndarray, circles: np.ndarray, ball_radius: float, pixel_size: float
 ) -> Shader:
-    """Shader of a gel from presses of a ball.
+    """Shader of a gel, fitted to presses of a ball.
 
-    Within a contact circle the gel has the ball's shape, so that every pixel there is a sample of slope, direction and place.
+    Within a contact circle the gel has the ball's shape, so that each pixel there is a sample of slope, direction and place.
 
     Args:
-        background: (H, W, 3), RGB, untouched gel.
-        pictures: (P, H, W, 3), RGB, of presses.
+        background: (H, W, 3), RGB image of the untouched gel.
+        images: (P, H, W, 3), RGB images of presses.
         circles: (P, 3), row, column and radius of the contact, pixels.
-        ball_radius: m.
-        pixel_size: m per pixel.
+        ball_radius: Radius of the ball, m.
+        pixel_size: Size of a pixel on the gel's face, m.
 
     Raises:
-        ValueError: a contact circle larger than the ball, or pictures of different shapes.
+        InvalidArgumentError: A contact circle is larger than the ball, or the images have different shapes.
     """
     rows, cols = background.shape[:2]
-    if pictures.shape[1:] != background.shape:
-        raise ValueError(f"pictures have shape {pictures.shape[1:]}, the background {background.shape}; they must be the same")
+    if images.shape[1:] != background.shape:
+        raise InvalidArgumentError(
+            f"the images have shape {images.shape[1:]} and the background {background.shape}; they must be the same"
+        )
     if (circles[:, 2] * pixel_size >= ball_radius).any():
-        raise ValueError(f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball: mend radius or pixel_size")
+        raise InvalidArgumentError(
+            f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball; mend ball_radius or pixel_size"
+        )
     row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
     place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
     columns = FOURIER_TERMS * (len(KNOTS) - 1) * PLACE_TERMS
     normal, right = np.zeros((columns, columns)), np.zeros((columns, 3))
-    for picture, (middle_row, middle_col, radius) in zip(pictures, circles, strict=True):
+    for image, (middle_row, middle_col, radius) in zip(images, circles, strict=True):
         y, x = (row - middle_row) * pixel_size, (col - middle_col) * pixel_size
         r2 = x * x + y * y
         inside = r2 < (radius * pixel_size) ** 2
         slope = np.sqrt(r2[inside] / (ball_radius**2 - r2[inside]))
-        phi = np.arctan2(-x[inside], -y[inside])  # uphill, into the gel, is towards the middle
+        phi = np.arctan2(-x[inside], -y[inside])  # the surface rises, into the gel, towards the middle
         design = np.einsum("nf,nk,nq->nfkq", fourier_terms(phi), slope_terms(slope), place[inside]).reshape(-1, columns)
         normal += design.T @ design
-        right += design.T @ (picture[inside].astype(float) - background[inside])
+        right += design.T @ (image[inside].astype(float) - background[inside])
     weights = np.linalg.solve(normal + RIDGE * np.trace(normal) / columns * np.eye(columns), right)
     flat = np.linalg.lstsq(place.reshape(-1, PLACE_TERMS), background.reshape(-1, 3).astype(float), rcond=None)[0]
     return Shader(weights.T.reshape(3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS), flat.T)
 
 
 def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Background, pictures and circles of a folder, as `fit_presses` takes them.
+    """Background, images and circles of a folder, in the form that `fit_presses` expects.
 
     Raises:
-        ValueError: a file is missing or cannot be read.
+        InvalidFileError: A file is missing or cannot be read.
     """
     listing = folder / "presses.csv"
     if not listing.is_file():
-        raise ValueError(f"{listing} does not exist; it must say file,row,col,radius of every press")
+        raise InvalidFileError(f"{listing} does not exist; it must list file,row,col,radius of every press")
     with listing.open(newline="") as lines:
         presses = list(csv.DictReader(lines))
     if not presses or set(presses[0]) < {"file", "row", "col", "radius"}:
-        raise ValueError(f"{listing} must have the columns file, row, col, radius and at least one press")
+        raise InvalidFileError(f"{listing} must have the columns file, row, col, radius and at least one press")
     circles = np.array([[float(press[name]) for name in ("row", "col", "radius")] for press in presses])
-    return _picture(folder / "background.png"), np.stack([_picture(folder / p["file"]) for p in presses]), circles
+    return _read_image(folder / "background.png"), np.stack([_read_image(folder / p["file"]) for p in presses]), circles
 
 
-def _picture(path: Path) -> np.ndarray:
-    picture = cv2.imread(str(path))
-    if picture is None:
-        raise ValueError(f"{path} is missing or no picture")
-    return picture[..., ::-1]
+def _read_image(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    if image is None:
+        raise InvalidFileError(f"{path} is missing or is not an image")
+    return image[..., ::-1]
 
 
 def main(args: Table | Presses) -> None:
+    """Fit a shader and write it."""
     if isinstance(args, Table):
         shader = fit_table(read_table(args.table), args.image_shape)
     else:

@@ -1,52 +1,61 @@
-"""Calibration tables in Taxim's format (Si & Yuan 2022, section III), `polycalib.npz`, and the compact shader that fits one.
+"""Calibration tables in Taxim's format, `polycalib.npz` (Si & Yuan 2022, section III), and the compact shader fitted to one.
 
-The table lies in portrait: u = column along our rows, v = row against our columns. A bin pair (slope m, direction phi) holds,
-per channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. Any number of bins.
+The table's image is in portrait format: its columns u run along our rows, its rows v against our columns. A pair of bins
+(slope m, direction phi) holds, for each channel, the coefficients of (u^2, v^2, u v, u, v, 1) of the colour change. A table
+may have any number of bins.
 """
 
 from pathlib import Path
 
 import numpy as np
 
+from manifeel_ms3.errors import InvalidFileError
+
 from .shader import KNOTS, Shader, fourier_terms, place_terms, slope_terms
 
-MAX_SLOPE = 1.0  # rad; the shader is constant beyond
+MAX_SLOPE = 1.0  # rad: the last of `KNOTS`, beyond which the shader is constant
 TABLE_CHANNELS = ("grad_r", "grad_g", "grad_b")
-# Untouched R1.5 gel, RGB at the picture's centre and its corners (u, v) = (-,-) (+,-) (-,+) (+,+): quadratic through them
+# Colour (RGB) of an untouched R1.5 gel at the image's centre and at its corners (u, v) = (-,-) (+,-) (-,+) (+,+); the
+# background is the quadratic through them
 BACKGROUND_CENTRE = (140.0, 149.0, 134.0)
 BACKGROUND_CORNERS = ((107.0, 112.0, 31.0), (93.0, 113.0, 68.0), (106.0, 87.0, 72.0), (102.0, 103.0, 83.0))
 
 
 def read_table(path: Path) -> np.ndarray:
-    """(3, bins, bins, 6): channel, slope bin, direction bin, term.
+    """Table (3, bins, bins, 6): channel, slope bin, direction bin, term.
 
     Raises:
-        ValueError: the file is missing or not of Taxim's form.
+        InvalidFileError: The file is missing or does not have Taxim's format.
     """
     if not Path(path).is_file():
-        raise ValueError(f"calibration table {path} does not exist; give a polycalib.npz in Taxim's format")
+        raise InvalidFileError(f"calibration table {path} does not exist; give a polycalib.npz in Taxim's format")
     with np.load(path) as stored:
         missing = [name for name in TABLE_CHANNELS if name not in stored]
         if missing:
-            raise ValueError(f"calibration table {path} lacks {missing}; it must hold {TABLE_CHANNELS}, each (bins, bins, 6)")
+            raise InvalidFileError(
+                f"calibration table {path} lacks {missing}; it must hold {TABLE_CHANNELS}, each (bins, bins, 6)"
+            )
         arrays = [stored[name] for name in TABLE_CHANNELS]
     shape = arrays[0].shape
     if len(shape) != 3 or shape[0] != shape[1] or shape[2] != 6 or any(a.shape != shape for a in arrays):
-        raise ValueError(f"calibration table {path} has arrays of shape {[a.shape for a in arrays]}, not (bins, bins, 6) each")
+        raise InvalidFileError(
+            f"calibration table {path} has arrays of shape {[a.shape for a in arrays]}, not (bins, bins, 6) each"
+        )
     return np.stack(arrays)
 
 
 def portrait_place(r: np.ndarray, c: np.ndarray, image_shape: tuple[int, int]) -> np.ndarray:
-    """Table terms (..., 6) = (u^2, v^2, u v, u, v, 1) at normalised places (r, c) of our picture."""
+    """Table terms (..., 6) = (u^2, v^2, u v, u, v, 1) at normalised places (r, c) of our image."""
     rows, cols = image_shape
     u, v = (r + 1) / 2 * (rows - 1), (1 - c) / 2 * (cols - 1)
     return np.stack([u * u, v * v, u * v, u, v, np.ones_like(u)], axis=-1)
 
 
 def fit_table(table: np.ndarray, image_shape: tuple[int, int]) -> Shader:
-    """Least squares over all bins up to `MAX_SLOPE`, after taking the table's own zero-slope value off at every place.
+    """Shader fitted by least squares over all bins up to `MAX_SLOPE`.
 
-    `image_shape`: rows and columns of our picture, the table's on its side.
+    The table's own value at zero slope is subtracted first, at every place. `image_shape` is that of our image: rows and
+    columns of the table's image, laid on its side.
     """
     bins = table.shape[1]
     slope = np.arange(bins) * (np.pi / 2 / (bins - 1))
@@ -68,7 +77,7 @@ def fit_table(table: np.ndarray, image_shape: tuple[int, int]) -> Shader:
 
 
 def _background() -> np.ndarray:
-    """(3, 6) place terms through the five measured colours, the curvature shared equally between the axes."""
+    """Place terms (3, 6) of the quadratic through the five measured colours, with equal curvature along both axes."""
     centre, corners = np.array(BACKGROUND_CENTRE), np.array(BACKGROUND_CORNERS)
     r, c = np.array([-1.0, 1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])  # u is our r, v our -c
     linear = [(corners * weight[:, None]).mean(axis=0) for weight in (r, c, r * c)]
