@@ -16,6 +16,7 @@ import tyro
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.files import write_text
 
 from .markdown import markdown_table
 from .paper import ENCODERS, EQUIDP, FM, TACFF, TACRGB, VISION, setup
@@ -155,7 +156,7 @@ def main(args: Args) -> dict[Comparison, Answer | None]:
     answers = answers_of(collect(results_in(*args.results)))
     log.info("%s", table(answers))
     if args.out:
-        args.out.write_text(table(answers))
+        write_text(args.out, table(answers))
     return answers
 
 

@@ -5,7 +5,6 @@ which ball is held, where the battery is, at what angle the peg lies in the hand
 policy that has that modality alone will hardly know. Answers are cross-validated over episodes.
 """
 
-import json
 import logging
 import sys
 import textwrap
@@ -22,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
@@ -352,8 +352,8 @@ def main(args: Args) -> list[Answer]:
         for question, path in bar.track(asked.items(), description="asking"):
             answers += ask(question, path)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "audit.json").write_text(json.dumps([asdict(answer) for answer in answers], indent=1))
-    (args.out / "audit.md").write_text(table(answers))
+    write_json(args.out / "audit.json", [asdict(answer) for answer in answers])
+    write_text(args.out / "audit.md", table(answers))
     figure(answers, args.out / "audit.png")
     log.info("%s", table(answers))
     return answers

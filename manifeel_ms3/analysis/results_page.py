@@ -14,6 +14,7 @@ import tyro
 from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.files import write_text
 
 from .claims import answers_of, find_alike
 from .claims import table as claim_table
@@ -48,7 +49,7 @@ def main(args: Args) -> Path:
     results = results_in(*args.results)
     picture = args.out.parent / f"images/{args.out.stem}.png"
     curves = training_curves(args.results, picture)
-    args.out.write_text("".join(page(results, picture.relative_to(args.out.parent) if curves else None)))
+    write_text(args.out, "".join(page(results, picture.relative_to(args.out.parent) if curves else None)))
     log.info("%s", args.out)
     return args.out
 

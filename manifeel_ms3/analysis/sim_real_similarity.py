@@ -7,7 +7,6 @@ distance of the normal distributions nearest to theirs (Heusel et al. 2017), KID
 cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so which are used is always asked and told.
 """
 
-import json
 import logging
 import sys
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from scipy import linalg
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.evaluation.policy import import_name
+from manifeel_ms3.files import write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
 
@@ -103,7 +103,7 @@ def main(args: Args) -> Similarity:
         len(true),
     )
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "similarity.json").write_text(json.dumps(asdict(result), indent=1))
+    write_json(args.out / "similarity.json", asdict(result))
     cv2.imwrite(str(args.out / "nearest.png"), nearest_pairs(sim, real, told, true)[..., ::-1])
     for name, found in (("FID", result.fid), ("KID", result.kid)):
         log.info("%s %.4g [%.4g, %.4g]", name, found.value, found.low, found.high)

@@ -21,6 +21,7 @@ import tyro
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
+from manifeel_ms3.files import write_text
 
 from .policy import load_policy
 from .result import read_result
@@ -93,7 +94,7 @@ def main(args: Args) -> Path:
         curve=jinja2.utils.markupsafe.Markup(training_curve(args.run_dir / "log.jsonl")),
     )
     out = args.out or args.run_dir / "report.html"
-    out.write_text(page)
+    write_text(out, page)
     log.info("%s", out)
     return out
 

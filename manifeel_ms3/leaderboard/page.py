@@ -12,6 +12,7 @@ import plotly.offline
 
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.protocol import LAST, Estimate, Runs, Setup, collect, setup_of, success
+from manifeel_ms3.files import write_text
 
 from .submission import Submission
 
@@ -79,11 +80,11 @@ def table(rows: list[Row]) -> str:
 def write(submissions: list[Submission], board: Path) -> Path:
     """Write the page and the table; returns the page."""
     rows = ranked(submissions)
-    (board / TABLE).write_text(table(rows))
+    write_text(board / TABLE, table(rows))
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         rows=[_for_page(row) for row in rows], full=FULL, plotly=jinja2.utils.markupsafe.Markup(plotly.offline.get_plotlyjs())
     )
-    (board / PAGE).write_text(page)
+    write_text(board / PAGE, page)
     return board / PAGE
 
 
