@@ -99,7 +99,11 @@ def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
 
 
 def _check_room(args: Args, counts: dict[str, int]) -> None:
-    """Refuse to begin what the disk has no room for."""
+    """Check that the disk has room for so many demonstrations of each task.
+
+    Raises:
+        MachineError: It has not.
+    """
     free = shutil.disk_usage(args.out).free
     pixels = ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2
     full = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())

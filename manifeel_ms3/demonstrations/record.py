@@ -121,7 +121,7 @@ def _submit(pool: WorkerPool[Recorder, int], seeds: Iterator[int], args: Args, i
     while len(infos) + pool.num_running < args.num:
         seed = next(seeds, None)
         if seed is None and pool.num_running > 0:
-            return  # what runs is still recorded
+            return  # episodes that run may still succeed
         if seed is None:
             raise WorkFailedError(
                 f"{len(args.seeds)} seeds were tried and {len(infos)} of {args.num} episodes succeeded; see whether the "

@@ -1,4 +1,4 @@
-"""What everything that records shares: the json of a trajectory file, what an earlier run has left, and the worker's state."""
+"""Shared by everything that records: a trajectory file's json, the episodes of earlier runs, and the state of a worker."""
 
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -18,7 +18,7 @@ PACKAGES = ("manifeel-ms3", "mani-skill", "sapien", "torch")
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     """The json of a trajectory file, but for its episodes.
 
-    The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import what registers the id. The render
+    The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import the module that registers it. The render
     backend is left out, because it is a choice of the machine at hand.
 
     Args:

@@ -105,8 +105,8 @@ def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
 
 
 @needs_renderer
-def test_materialised_observations_are_those_of_the_recording(tmp_path):
-    """Recorded with pictures at once, and recorded without and played again: the same bits."""
+def test_rendered_observations_are_those_of_the_recording(tmp_path):
+    """Observations are the same bits whether they are recorded at once or rendered from states and actions."""
     kwargs = dict(seed=3, cameras=("front",), tactile_sensors=("right",))
     direct = record.main(record.Args(SEARCH, 1, out=tmp_path / "direct.h5", obs_mode="rgb+tacrgb+tacff", **kwargs))
     bare = record.main(
