@@ -18,8 +18,8 @@ PACKAGES = ("manifeel-ms3", "mani-skill", "sapien", "torch")
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     """The json of a trajectory file, but for its episodes.
 
-    The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import the module that registers it. The render
-    backend is left out, because it is a choice of the machine at hand.
+    The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import the module that registers it. The
+    render backend is left out, because it is a choice of the machine at hand.
 
     Args:
         env_id: Id of the task.

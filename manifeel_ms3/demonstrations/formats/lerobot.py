@@ -4,10 +4,10 @@ Features are named after what they hold: `observation.images.wrist`, `observatio
 `observation.force_field.tactile_right` (N per taxel), `observation.state` (pose of the tool in the base frame, m and wxyz), and
 `action`.
 
-The files are written here and not by lerobot's own library, because its requirements exclude those of this package: lerobot
-0.4.4 asks for torch < 2.11, torchvision >= 0.21, opencv-python-headless < 4.13, packaging < 26, diffusers < 0.36,
-huggingface-hub < 0.36 and rerun-sdk < 0.27, while this package runs on torch 2.13, whose CPU build torchvision cannot be
-imported beside, and on OpenCV 5. The tests read datasets that lerobot 0.4.4 has written, and let its reader, where it is
+The files are written here and not by lerobot's own library, because lerobot 0.4.4 cannot be installed beside the versions that
+this package is tested with. It requires torch < 2.11 with torchvision and torchcodec, opencv-python-headless < 4.13, packaging
+< 26 and diffusers < 0.36; the tests run with torch 2.13, beside whose CPU build torchvision cannot be imported, OpenCV 5,
+packaging 26 and diffusers 0.42. The tests read datasets that lerobot 0.4.4 has written, and let its reader, where it is
 installed, read what is written here.
 """
 
