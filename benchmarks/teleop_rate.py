@@ -1,6 +1,6 @@
-"""How often a second teleoperation could act, were it not to wait: `python benchmarks/teleop_rate.py`.
+"""Measure how many steps per second teleoperation can take without waiting: `python benchmarks/teleop_rate.py`.
 
-Steps an environment and shows it on the page, as `manifeel teleop` does; the task's control rate is what it must reach.
+Steps an environment and shows it on the page, as `manifeel teleop` does. The rate must reach the task's control rate.
 """
 
 import statistics
@@ -12,26 +12,30 @@ import tyro
 from rich.console import Console
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
-from manifeel_ms3.teleop.operator import Operator
+from manifeel_ms3.teleop.operator import Operator, steerable_axes
 from manifeel_ms3.teleop.page import Page
 
 
 @dataclass
 class Args:
     task: str = "ManiFeel-USBInsertion-v1"
+    """Id of the task."""
     cameras: tuple[str, ...] = ("wrist",)
+    """Cameras to show."""
     tactile_sensors: tuple[str, ...] = ("right",)
+    """Sides of the tactile sensors to show."""
     steps: int = 60
+    """Number of steps to time."""
     port: int = 8080
+    """Port of the page."""
 
 
 def main(args: Args) -> float:
-    """Median Hz."""
+    """Print and return the median rate, in Hz."""
     env = gym.make(
         args.task, obs_mode="rgb+tacrgb+tacff", cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors)
     )
-    operator = Operator(ACTION_AXES[env.unwrapped.control_mode])
+    operator = Operator(steerable_axes(env.unwrapped.control_mode))
     page = Page(operator, args.task, "localhost", args.port)
     env.reset(seed=0)
     took = []

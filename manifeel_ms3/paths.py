@@ -1,4 +1,4 @@
-"""Where shipped data lies and where derived assets are cached."""
+"""Folders of the data that ships with the package, and of derived assets."""
 
 import os
 from pathlib import Path
@@ -15,11 +15,11 @@ def data_dir() -> Path:
 
 
 def troubleshooting() -> Path:
-    """The page that says what lies behind an error: beside the data in a wheel, in `docs` in a clone."""
+    """Path of the page that explains errors: beside the data in a wheel, in `docs` in a clone."""
     packaged = _PACKAGE / "data" / "troubleshooting.md"
     return packaged if packaged.is_file() else _PACKAGE.parent / "docs" / "troubleshooting.md"
 
 
 def cache_dir() -> Path:
-    """Folder of derived assets; the environment variable `MANIFEEL_CACHE_DIR` overrides the user cache."""
+    """Folder of derived assets: the user's cache, unless the environment variable `MANIFEEL_CACHE_DIR` names another."""
     return Path(os.environ.get("MANIFEEL_CACHE_DIR") or platformdirs.user_cache_dir("manifeel_ms3"))

@@ -1,12 +1,20 @@
-"""Progress bars that show what is done, how long it took and how long it will."""
+"""Progress bars that show what is done, how long it took, and how long the rest will take."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+REFRESH_HZ = 2
+"""Rate in Hz at which a bar is drawn; episodes take seconds."""
+
 
 def progress_bar(disable: bool = False) -> Progress:
+    """A progress bar for a terminal.
+
+    Args:
+        disable: Show nothing.
+    """
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -14,7 +22,7 @@ def progress_bar(disable: bool = False) -> Progress:
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        refresh_per_second=2,
+        refresh_per_second=REFRESH_HZ,
         disable=disable,
     )
 
@@ -23,7 +31,14 @@ def progress_bar(disable: bool = False) -> Progress:
 def episode_counter(
     description: str, total: int, done: int, on_episode: Callable[[], None] | None = None
 ) -> Iterator[Callable[[], None]]:
-    """What to call after each episode: `on_episode`, or else a progress bar's advance."""
+    """A context with the function to call after each episode: `on_episode`, or else one that advances a progress bar.
+
+    Args:
+        description: Text beside the bar.
+        total: Number of episodes.
+        done: Number of episodes that are finished already.
+        on_episode: Called instead of showing a bar.
+    """
     if on_episode is not None:
         yield on_episode
         return

@@ -75,8 +75,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 SMALLER = {  # what follows a command, by its name or module: of a flag the last counts, and what takes hours takes seconds
     "record": "-n 1 --cameras wrist --tactile-sensors right",
-    "dataset": "--num 10 --tasks ManiFeel-BallSorting-v1 --cameras front --tactile-sensors right --picture-size 64",
-    "materialize": "--num 1 --picture-size 64",
+    "dataset": "--num 10 --tasks ManiFeel-BallSorting-v1 --cameras front --tactile-sensors right --image-size 64",
+    "materialize": "--num 1 --image-size 64",
     "replay": "--num 1",
     "teleop": "--port 8137",
     "view": "--save peg.rrd",
@@ -97,7 +97,7 @@ def shelf(tmp_path_factory) -> Path:
     shelf = tmp_path_factory.mktemp("shelf")
     for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
         states = REPOSITORY / f"data/sample/{task}/states.h5"
-        seen = dict(cameras=("wrist",), tactile_sensors=("right",), picture_size=64)
+        seen = dict(cameras=("wrist",), tactile_sensors=("right",), image_size=64)
         render_observations.main(render_observations.Args(states, shelf / f"{name}.h5", **seen, num=1))
     for suffix in (".h5", ".json"):
         shutil.copy(shelf / f"trajectory{suffix}", shelf / f"peg{suffix}")

@@ -1,14 +1,14 @@
 """Demonstrations in memory, and sequences of them by index arithmetic."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, read_header
-from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
+from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.demonstrations.formats import format_of
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -27,29 +27,20 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
         DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
     """
     files, episodes = list(files), []
-    formats = [_format(file, env_id) for file in files]
-    held = [count(file) for file, (count, _) in zip(files, formats, strict=True)]
+    formats = [format_of(file) for file in files]
+    held = [known.count(file) for file, known in zip(files, formats, strict=True)]
     wanted = sum(held) if num_demos is None else num_demos
     if not 0 < wanted <= sum(held):
         raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
     with progress_bar() as bar:
-        for file, count, (_, read) in zip(files, held, formats, strict=True):
+        for file, count, known in zip(files, held, formats, strict=True):
             left = min(count, wanted - len(episodes))
             if left == 0:
                 break
             track = partial(bar.track, description=f"reading {file.name}")
-            for episode in read(file, spec.keys, num=left, progress=track):
+            for episode in known.read(file, spec.keys, num=left, progress=track, env_id=env_id):
                 episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
     return episodes
-
-
-def _format(file: Path, env_id: str) -> tuple[Callable[[Path], int], Callable[..., list[Episode]]]:
-    """How episodes of a file are counted, and read."""
-    if lerobot.is_lerobot(file):  # these two do not say of what task they are
-        return lerobot.count_episodes, lerobot.read_lerobot
-    if diffusion_policy_zarr.is_zarr(file):
-        return diffusion_policy_zarr.count_episodes, diffusion_policy_zarr.read_zarr
-    return lambda file: len(read_header(file)["episodes"]), partial(read_demonstrations, env_id=env_id)
 
 
 class SequenceDataset:

@@ -18,8 +18,9 @@ from baselines.common.agent import spec_of
 from baselines.common.observation import POSE, POSE_FEATURES
 from baselines.common.training import default_steps
 from baselines.registry import policy_spec
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header, write_json
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation.provenance import machine
+from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
 
 from .jobs import DONE, read_note, training_args

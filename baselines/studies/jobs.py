@@ -14,9 +14,10 @@ import psutil
 
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.demonstrations import record
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header, write_json
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.provenance import machine
+from manifeel_ms3.files import write_json
 
 from .study import Stage
 

@@ -16,6 +16,7 @@ import tyro
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.files import write_text
 
 from .markdown import markdown_table
 from .paper import ENCODERS, EQUIDP, FM, MODES, TACFF, TACRGB, VISION, paper_condition, tasks_in_table
@@ -187,7 +188,7 @@ def main(args: Args) -> dict[Comparison, ClaimResult | None]:
     results = results_of_claims(collect(results_in(*args.results)))
     log.info("%s", claims_table(results))
     if args.out:
-        args.out.write_text(claims_table(results))
+        write_text(args.out, claims_table(results))
     return results
 
 

@@ -7,7 +7,6 @@ has that modality alone will hardly know. Predictions are cross-validated over e
 The table and the figure go into the documentation, so the figure is a static image that matplotlib draws.
 """
 
-import json
 import logging
 import sys
 import textwrap
@@ -23,6 +22,7 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
 
@@ -324,8 +324,8 @@ def main(args: Args) -> list[ProbeResult]:
         for probe, env_id, path in bar.track(asked, description="asking"):
             results += run_probe(probe, env_id, path)
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "audit.json").write_text(json.dumps([asdict(result) for result in results], indent=1))
-    (args.out / "audit.md").write_text(audit_table(results))
+    write_json(args.out / "audit.json", [asdict(result) for result in results])
+    write_text(args.out / "audit.md", audit_table(results))
     draw_figure(results, args.out / "audit.png")
     log.info("%s", audit_table(results))
     return results

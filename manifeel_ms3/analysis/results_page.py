@@ -18,6 +18,7 @@ import tyro
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.files import write_text
 
 from .claims import claims_table, find_with_one_network, results_of_claims
 from .markdown import markdown_table
@@ -62,7 +63,7 @@ def main(args: Args) -> Path:
     results = results_in(*args.results)
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
-    args.out.write_text("".join(page(results, figure.relative_to(args.out.parent) if has_figure else None)))
+    write_text(args.out, "".join(page(results, figure.relative_to(args.out.parent) if has_figure else None)))
     log.info("%s", args.out)
     return args.out
 

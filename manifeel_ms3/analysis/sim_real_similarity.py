@@ -8,7 +8,6 @@ discrepancy under a cubic kernel (Binkowski et al. 2018, unbiased). Both depend 
 and the result names them.
 """
 
-import json
 import logging
 import sys
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import import_name
+from manifeel_ms3.files import write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
 
@@ -112,7 +112,7 @@ def main(args: Args) -> Similarity:
         len(real),
     )
     args.out.mkdir(parents=True, exist_ok=True)
-    (args.out / "similarity.json").write_text(json.dumps(asdict(result), indent=1))
+    write_json(args.out / "similarity.json", asdict(result))
     cv2.imwrite(str(args.out / "nearest.png"), nearest_pairs(sim_images, real_images, sim, real)[..., ::-1])
     for name, found in (("FID", result.fid), ("KID", result.kid)):
         log.info("%s %.4g [%.4g, %.4g]", name, found.value, found.low, found.high)

@@ -1,14 +1,15 @@
 """Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --workers 2`.
 
-For each task two files: `states.h5`, states and actions alone, and `trajectory.h5`, the same episodes with observations; beside
-them all a `manifest.json` with hashes, versions, seeds and outcomes, which `validate` checks. A run that was killed goes on
-where it stopped when the same command is given again.
+Each task has two files: `states.h5` with states and actions alone, and `trajectory.h5` with the same episodes and their
+observations. A `manifest.json` beside the tasks' folders has hashes, versions, seeds and outcomes, which `validate` checks. A
+run that was killed continues where it stopped when the same command is given again.
 """
 
 import hashlib
 import shutil
 import sys
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,48 +17,59 @@ from typing import Any
 import tyro
 
 from manifeel_ms3.command_line import run
-from manifeel_ms3.errors import MachineError
+from manifeel_ms3.errors import InvalidFileError, MachineError
+from manifeel_ms3.files import read_json, write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import record, render_observations
-from .formats.maniskill_h5 import DemonstrationError, finished_episodes, read_header, read_json, write_json
+from .formats.maniskill_h5 import DemonstrationError, finished_episodes, read_header
 
 SCHEMA = "manifeel-demonstrations-1"
-MANIFEST = {  # what is read of a manifest, as a json schema
+"""Name and version of the manifest's form."""
+IMAGE_SIZE = 256
+"""Width and height of the tasks' camera images in pixels, for which `TaskSpec.demo_megabytes` holds."""
+SMALLEST_SHARE = 0.2
+"""Share of a demonstration's size that is counted on at least, because touch and states do not shrink with the images."""
+HASH_BLOCK = 1 << 20
+"""Number of bytes that are read at a time for a hash."""
+MANIFEST = {
     "type": "object",
     "required": ["schema", "files"],
     "properties": {"files": {"type": "object", "additionalProperties": {"type": "object"}}},
 }
+"""Json schema of the fields that are read from a manifest."""
 
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     out: Path = Path("data/demos")
-    """folder to write"""
+    """Folder to write."""
     tasks: tuple[str, ...] = field(default_factory=lambda: tuple(all_tasks()))
-    """tasks to record"""
+    """Ids of the tasks to record."""
     num: int | None = None
-    """episodes a task; default: the paper's counts"""
+    """Number of episodes of each task; as many as the paper recorded if not given."""
     workers: int = 1
-    """processes"""
+    """Number of worker processes."""
     obs_mode: str = "rgb+tacrgb+tacff"
-    """what to observe; "none" for states and actions alone"""
+    """Observations to render, joined by "+"; "none" writes states and actions alone."""
     cameras: tuple[str, ...] = CAMERAS
-    """cameras to observe"""
+    """Cameras to render."""
     tactile_sensors: tuple[str, ...] = SIDES
-    """pads to observe"""
-    picture_size: int | None = None
-    """pixels, of the cameras' sides; default: the tasks' 256"""
+    """Sides of the tactile sensors to render."""
+    image_size: int | None = None
+    """Width and height of camera images in pixels; the tasks' 256 if not given."""
 
 
 def main(args: Args) -> Path:
-    """Record, and return the manifest's path.
+    """Record, and return the path of the manifest.
 
     Raises:
-        ValueError: a task that is not known.
-        MachineError: the disk has no room for it.
+        UnknownNameError: A task is not registered, or has no demonstrator.
+        MachineError: The disk has too little room.
     """
     counts = {task: args.num or task_spec(task).paper_demos for task in args.tasks}
     observed = args.obs_mode != "none"
@@ -67,31 +79,38 @@ def main(args: Args) -> Path:
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
         done = sum(len(finished_episodes(path)) for paths in files.values() for path in paths[: 1 + observed])
-        whole = bar.add_task("all tasks", total=total, completed=min(done, total))
-
-        def count() -> None:
-            bar.advance(whole)
-
+        progress = bar.add_task("all tasks", total=total, completed=min(done, total))
+        count = partial(bar.advance, progress)
         for task, (states, trajectory) in files.items():
-            bar.update(whole, description=f"recording {task}")
-            bare = dict(obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs='{"render_backend": "none"}')
-            record.main(record.Args(task, counts[task], args.workers, out=states, **bare), count)
+            bar.update(progress, description=f"recording {task}")
+            record.main(_states_args(args, task, counts[task], states), count)
             if observed:
-                bar.update(whole, description=f"observing {task}")
-                pictures = (args.obs_mode, args.cameras, args.tactile_sensors, args.picture_size)
-                render_observations.main(render_observations.Args(states, trajectory, *pictures, workers=args.workers), count)
+                bar.update(progress, description=f"rendering {task}")
+                images = (args.obs_mode, args.cameras, args.tactile_sensors, args.image_size)
+                render_observations.main(render_observations.Args(states, trajectory, *images, workers=args.workers), count)
             write_manifest(args.out)
     return args.out / "manifest.json"
 
 
+def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
+    """Arguments to record states and actions alone, without a renderer."""
+    backend = '{"render_backend": "none"}'
+    return record.Args(task, num, args.workers, out=path, obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs=backend)
+
+
 def _check_room(args: Args, counts: dict[str, int]) -> None:
+    """Check that the disk has room for so many demonstrations of each task.
+
+    Raises:
+        MachineError: It has not.
+    """
     free = shutil.disk_usage(args.out).free
-    pixels = ((args.picture_size or 256) / 256) ** 2
-    whole = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
-    if (needed := whole * max(pixels, 0.2)) > free:
+    pixels = ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2
+    full = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
+    if (needed := full * max(pixels, SMALLEST_SHARE)) > free:
         raise MachineError(
-            f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} episodes take up to {needed / 1e9:.1f}; give "
-            "another --out, fewer --tasks or cameras, or --obs-mode none (what is there already is kept)"
+            f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} episodes take up to {needed / 1e9:.1f} GB; give "
+            "another --out, fewer --tasks or --cameras, or --obs-mode none (finished episodes are kept)"
         )
 
 
@@ -102,13 +121,14 @@ def write_manifest(folder: Path) -> None:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """What a manifest says of a trajectory file."""
+    """A trajectory file's entry in the manifest."""
     header = read_header(path)
     episodes = header["episodes"]
     return dict(
         env_id=header["env_info"]["env_id"].rpartition(":")[2],
         env_kwargs=header["env_info"]["env_kwargs"],
         versions=header["versions"],
+        revision=header.get("revision"),
         sha256=_sha256(path),
         json_sha256=_sha256(path.with_suffix(".json")),
         bytes=path.stat().st_size,
@@ -123,21 +143,24 @@ def describe(path: Path) -> dict[str, Any]:
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with path.open("rb") as file:
-        while block := file.read(1 << 20):
+        while block := file.read(HASH_BLOCK):
             digest.update(block)
     return digest.hexdigest()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """A folder's manifest.
+    """The content of a folder's manifest.
 
     Raises:
-        DemonstrationError: there is none, it is of another form, or of a newer version.
+        DemonstrationError: There is no manifest, or it has another form or a newer version.
     """
     path = Path(folder) / "manifest.json"
     if not path.is_file():
         raise DemonstrationError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
-    manifest = read_json(path, MANIFEST, "a manifest")
+    try:
+        manifest = read_json(path, MANIFEST, "a manifest")
+    except InvalidFileError as error:
+        raise DemonstrationError(str(error)) from error
     if (found := manifest["schema"]) != SCHEMA:
         raise DemonstrationError(f"{path} has the schema {found!r}, this version reads {SCHEMA!r}; update manifeel-ms3")
     return manifest

@@ -1,20 +1,24 @@
-"""Run one episode and keep everything of it."""
+"""One episode in a simulator, with all that a trajectory file holds of it."""
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from mani_skill.utils import common
 
 from manifeel_ms3.experts import make_expert
+from manifeel_ms3.tasks import VisuotactileEnv
 
 from .formats.maniskill_h5 import Episode
 
+FORCE_DECIMALS = 3
+"""Decimals of a peak force in the json, in N: millinewtons, far below what matters in contact."""
+
 
 def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
-    """Run the demonstrator through one episode."""
-    return run_episode(env, seed, lambda: make_expert(env_id, env.unwrapped, seed).actions())
+    """Run the scripted demonstrator of a task through one episode."""
+    return run_episode(env, seed, lambda: make_expert(env_id, cast(VisuotactileEnv, env.unwrapped), seed).actions())
 
 
 def run_episode(
@@ -23,12 +27,15 @@ def run_episode(
     actions: Callable[[], Iterable[np.ndarray]],
     on_step: Callable[[dict[str, Any], dict[str, Any]], None] = lambda _obs, _info: None,
 ) -> Episode:
-    """Reset with a seed, take the actions (asked for after the reset), and keep observations, states and outcome.
+    """Run one episode, and return its observations, states and outcome.
 
     Args:
-        on_step: sees every observation and `info`, those of the reset too.
+        env: Environment with `num_envs=1`.
+        seed: Seed of the reset.
+        actions: Returns the actions (A,); called after the reset.
+        on_step: Called with every observation and `info`, those of the reset included.
     """
-    base = env.unwrapped
+    base: Any = env.unwrapped
     obs, info = env.reset(seed=seed)
     on_step(obs, info)
     observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
@@ -55,13 +62,13 @@ def run_episode(
         elapsed_steps=len(steps["actions"]),
         success=bool(steps["success"] and steps["success"][-1]),
         fail=bool(steps["fail"] and steps["fail"][-1]),
-        peak_contact_force=round(float(max(steps["contact_force"], default=0.0)), 3),
+        peak_contact_force=round(float(max(steps["contact_force"], default=0.0)), FORCE_DECIMALS),
     )
     return Episode(seed, arrays, info)
 
 
-def _stack(trees: list[dict]) -> dict[str, Any]:
-    """A list over time of trees with arrays (1, ...) as one tree with arrays (T, ...)."""
+def _stack(trees: list[Any]) -> dict[str, Any]:
+    """Turn a list over time of trees with arrays (1, ...) into one tree with arrays (T, ...)."""
     first = trees[0]
     return {
         key: _stack([tree[key] for tree in trees])

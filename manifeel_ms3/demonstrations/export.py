@@ -1,4 +1,4 @@
-"""Demonstrations for other tools: `python -m manifeel_ms3.demonstrations.export trajectory.h5 --to lerobot --out folder`."""
+"""Export demonstrations: `python -m manifeel_ms3.demonstrations.export trajectory.h5 --to lerobot --out folder`."""
 
 import logging
 import shutil
@@ -14,9 +14,9 @@ import tyro
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
 
-from .formats.diffusion_policy_zarr import write_zarr
-from .formats.lerobot import write_lerobot
-from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observed
+from .formats import FORMATS
+from .formats.demonstration_format import Progress
+from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
 
 log = logging.getLogger(__name__)
 Format = Literal["lerobot", "zarr", "npz"]
@@ -24,35 +24,42 @@ Format = Literal["lerobot", "zarr", "npz"]
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     file: tyro.conf.Positional[Path]
-    """trajectory file with observations"""
+    """Path of a trajectory file with observations."""
     to: Format
-    """"lerobot": a LeRobot dataset (3.0); "zarr": the layout of the paper's data; "npz": a file an episode"""
+    """Format: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each episode."""
     out: Path
-    """folder; must not be there yet"""
+    """Folder to write; it must not exist yet."""
 
 
-def write_npz(path: Path, folder: Path, progress: Callable = iter) -> None:
-    """A file an episode: `actions` (T, A) and every observation (T + 1, ...) by its path, "/" as "."."""
-    for i, episode in enumerate(each_demonstration(path, observed(path), progress)):
-        folder.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(
-            folder / f"episode_{i:05d}.npz", **{key.replace("/", "."): values for key, values in episode.items()}
-        )
+def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
+    """Write one npz file for each episode, with `actions` (T, A) and the observations (T + 1, ...).
+
+    Observations have their keys as names, with "." for "/".
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, episode in enumerate(each_demonstration(path, observation_keys(path), progress)):
+        arrays = {key.replace("/", "."): values for key, values in episode.items()}
+        np.savez_compressed(folder / f"episode_{i:05d}.npz", allow_pickle=False, **arrays)
 
 
-WRITERS: dict[str, Callable[..., None]] = dict(lerobot=write_lerobot, zarr=write_zarr, npz=write_npz)
+WRITERS: dict[str, Callable[[Path, Path, Progress], None]] = {
+    "npz": write_npz,  # not among the formats, because it is not read
+    **{known.name: known.write for known in FORMATS if known.write is not None},
+}
 
 
 def main(args: Args) -> Path:
-    """Export, and return the folder: whole, or not there.
+    """Export a trajectory file, and return the folder, which appears whole or not at all.
 
     Raises:
-        DemonstrationError: the file cannot be exported, or the folder is there already.
-        ModuleNotFoundError: the format's extra is not installed.
+        DemonstrationError: The file cannot be exported, or the folder exists already.
+        MissingExtraError: The library that writes the format is not installed.
     """
     if args.out.exists():
-        raise DemonstrationError(f"{args.out} is there already; give another --out, or delete it")
+        raise DemonstrationError(f"{args.out} exists already; give another --out, or delete it")
     partial = args.out.with_name(args.out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     with progress_bar() as bar:

@@ -1,190 +1,139 @@
 """Record demonstrations: `python -m manifeel_ms3.demonstrations.record ManiFeel-PegInsertion-v1 -n 50 --workers 2`.
 
 Seeds are tried in order until `num` episodes have succeeded; any number of workers gives the same episodes. A run that was
-killed goes on where it stopped when the same command is given again.
+killed continues where it stopped when the same command is given again.
 """
 
 import logging
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import cache
-from importlib.metadata import version
-from multiprocessing import get_context
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium as gym
-import torch
 import tyro
 
 from manifeel_ms3.command_line import json_object, run
-from manifeel_ms3.errors import WorkFailedError
+from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
+from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
-from .formats.maniskill_h5 import (
-    DemonstrationError,
-    consolidate,
-    episode_folder,
-    finished_episodes,
-    read_header,
-    split,
-    write_episode,
-    write_index,
-)
+from .formats.maniskill_h5 import consolidate, open_for_more, write_index
+from .recording import Recorder, finished_before, make_header, make_recorder
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     env_id: tyro.conf.Positional[str]
-    """task, such as ManiFeel-PegInsertion-v1"""
+    """Id of the task, such as ManiFeel-PegInsertion-v1."""
     num: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 50
-    """successful episodes wanted"""
+    """Number of successful episodes that the file shall hold."""
     workers: int = 1
-    """processes"""
+    """Number of worker processes."""
     seed: int = 0
-    """first seed"""
+    """First seed to try. Seeds from 100000 on are for evaluation."""
     out: Path | None = None
-    """trajectory file to write; default data/demos/<task>/trajectory.h5"""
+    """Path of the trajectory file to write; data/demos/<task>/trajectory.h5 if not given."""
     obs_mode: str = "rgb+tacrgb+tacff"
-    """what to observe; "none" keeps states and actions alone"""
+    """Observations to record, joined by "+"; "none" records states and actions alone."""
     cameras: tuple[str, ...] = CAMERAS
-    """cameras to record"""
+    """Cameras to record."""
     tactile_sensors: tuple[str, ...] = SIDES
-    """pads to record"""
+    """Sides of the tactile sensors to record."""
     env_kwargs: str = "{}"
-    """further arguments of the task as json, such as '{"fit": "loose", "randomization": {"socket_xy": 0.01}}'"""
-    max_tries: int = field(default=10)
-    """give up when this many times `num` seeds have been tried"""
+    """Further arguments of the task as json, such as '{"fit": "loose", "randomization": {"socket_xy": 0.01}}'."""
+    max_tries: int = 10
+    """Number of seeds to try before giving up, as a multiple of `num`."""
+
+    @property
+    def path(self) -> Path:
+        """Path of the trajectory file."""
+        return self.out or Path("data/demos") / self.env_id / "trajectory.h5"
+
+    @property
+    def seeds(self) -> range:
+        """Seeds that may be tried.
+
+        Raises:
+            InvalidArgumentError: There are not `num` seeds for demonstrations from `seed` on.
+        """
+        if not 0 <= self.seed <= FIRST_EVALUATION_SEED - self.num:
+            raise InvalidArgumentError(
+                f"{self.num} episodes from seed {self.seed} on are asked for; demonstrations have the seeds 0 to "
+                f"{FIRST_EVALUATION_SEED - 1}, because those from {FIRST_EVALUATION_SEED} on are for evaluation"
+            )
+        return range(self.seed, min(self.seed + self.max_tries * self.num, FIRST_EVALUATION_SEED))
 
 
 def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
-    """Record, and return the file's path. `on_episode` is called after each episode, instead of a progress bar."""
+    """Record, and return the path of the trajectory file.
+
+    Args:
+        args: Arguments of the command.
+        on_episode: Called after each successful episode; a progress bar is shown if it is not given.
+
+    Raises:
+        UnknownNameError: The task is not registered, or has no demonstrator.
+        InvalidArgumentError: Seeds are asked for that are for evaluation, or an argument is not allowed.
+        DemonstrationError: The file was recorded with other arguments.
+        WorkFailedError: Too many seeds failed, or a worker process died.
+    """
     require_demonstrator(args.env_id)
-    path = args.out or Path("data/demos") / args.env_id / "trajectory.h5"
-    env_kwargs = _env_kwargs(args)
+    path, seeds = args.path, args.seeds
+    images = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
+    env_kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | images | json_object("--env-kwargs", args.env_kwargs)
     header = make_header(args.env_id, env_kwargs)
-    infos, failed = already_there(path, header)
+    infos, failed = finished_before(path, header)
     if len(infos) >= args.num:
         log.info("%s already holds %d episodes", path, len(infos))
         return path
+    open_for_more(path)
     with (
         episode_counter(f"recording {args.env_id}", args.num, len(infos), on_episode) as count,
-        worker_pool(args.workers, args.env_id, env_kwargs, path) as pool,
+        WorkerPool(args.workers, partial(make_recorder, args.env_id, env_kwargs, path)) as pool,
     ):
-        for seed, info in _episodes(pool, args, infos, failed):
+        left = (seed for seed in seeds if seed not in infos and seed not in failed)
+        _submit(pool, left, args, infos)
+        for finished in pool.as_finished():
+            info = finished.result()
             if info is None:
-                failed.add(seed)
+                failed.add(finished.task)
             else:
-                infos[seed] = info
+                infos[finished.task] = info
                 count()
             write_index(path, header | dict(failed_seeds=sorted(failed)), dict(sorted(infos.items())))
+            _submit(pool, left, args, infos)
     consolidate(path)
     return path
 
 
-def _episodes(pool: ProcessPoolExecutor, args: Args, infos: dict, failed: set[int]):
-    """Results (seed, info or None) as they come; a seed is tried only when all before it cannot make up `num` successes."""
-    pending: dict[Future, int] = {}
-    seed = args.seed
-    while len(infos) < args.num:
-        while len(infos) + len(pending) < args.num:
-            if seed not in infos and seed not in failed:
-                if seed - args.seed >= args.max_tries * args.num:
-                    raise WorkFailedError(
-                        f"{len(failed)} of {seed - args.seed} seeds failed, with no more to try: "
-                        f"see whether the demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
-                    )
-                pending[pool.submit(_record_seed, seed)] = seed
-            seed += 1
-        for future in wait(pending, return_when=FIRST_COMPLETED).done:
-            yield pending.pop(future), future.result()
-
-
-def _env_kwargs(args: Args) -> dict[str, Any]:
-    pictures = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
-    return dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | pictures | json_object("--env-kwargs", args.env_kwargs)
-
-
-def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The json of a trajectory file, but for its episodes."""
-    packages = {name: version(name) for name in ("manifeel-ms3", "mani-skill", "sapien", "torch")}
-    limit = gym.spec(env_id).max_episode_steps
-    return dict(
-        # "module:id" is gymnasium's way to import what registers an id: ManiSkill's tools then know it, too. What renders is
-        # this machine's affair, and not kept
-        env_info=dict(env_id=f"manifeel_ms3:{env_id}", env_kwargs=_without_renderer(env_kwargs), max_episode_steps=limit),
-        source_type="scripted",
-        source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
-        versions=packages,
-    )
-
-
-def _without_renderer(env_kwargs: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in env_kwargs.items() if name != "render_backend"}
-
-
-def already_there(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
-    """Episodes and failed seeds that an earlier run has left."""
-    failed: set[int] = set()
-    if path.is_file():
-        before = read_header(path)
-        if before["env_info"] != header["env_info"]:
-            raise DemonstrationError(
-                f"{path} was recorded with {before['env_info']}, this run asks for {header['env_info']}; give another --out, "
-                "or delete the file"
+def _submit(pool: WorkerPool[Recorder, int], seeds: Iterator[int], args: Args, infos: dict[int, Any]) -> None:
+    """Submit seeds: each one only once the seeds before it cannot be enough, so that the episodes never depend on timing."""
+    while len(infos) + pool.num_running < args.num:
+        seed = next(seeds, None)
+        if seed is None and pool.num_running > 0:
+            return  # episodes that run may still succeed
+        if seed is None:
+            raise WorkFailedError(
+                f"{len(args.seeds)} seeds were tried and {len(infos)} of {args.num} episodes succeeded; see whether the "
+                f"demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
             )
-        failed = set(before.get("failed_seeds", []))
-    return finished_episodes(path), failed
+        pool.submit(_record_seed, seed)
 
 
-# -------------------------------------------------------------------- in the workers
-
-worker: dict[str, Any] = {}
-"""In a worker process: the `env_id`, `env_kwargs` and `path` that it was started for."""
-
-
-@contextmanager
-def worker_pool(workers: int, env_id: str, env_kwargs: dict[str, Any], path: Path) -> Iterator[ProcessPoolExecutor]:
-    """Processes with one environment each, for episodes that are written beside `path`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_file() and not episode_folder(path).is_dir():
-        split(path)
-    context = get_context("spawn")  # a forked renderer does not work
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (env_id, env_kwargs, path))
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _start_worker(env_id: str, env_kwargs: dict[str, Any], path: Path) -> None:
-    torch.set_num_threads(1)  # processes share the cores
-    import manifeel_ms3  # noqa: F401
-
-    worker.update(env_id=env_id, env_kwargs=env_kwargs, path=path)
-
-
-@cache
-def worker_env() -> gym.Env:
-    """In a worker process: its environment, made when first asked for, so that the one who asks hears what is wrong with it."""
-    return gym.make(worker["env_id"], **worker["env_kwargs"])
-
-
-def _record_seed(seed: int) -> dict[str, Any] | None:
-    """Record one episode; write it if it succeeded, and return its info, else None."""
-    episode = demonstrate(worker_env(), worker["env_id"], seed)
-    if not episode.info["success"]:
-        return None
-    write_episode(worker["path"], episode)
-    return episode.info | dict(episode_seed=seed)
+def _record_seed(recorder: Recorder, seed: int) -> dict[str, Any] | None:
+    """In a worker process: record an episode, and return its entry in the json, or None if it failed."""
+    episode = demonstrate(recorder.env, recorder.env_id, seed)
+    return recorder.write(episode) if episode.info["success"] else None
 
 
 if __name__ == "__main__":

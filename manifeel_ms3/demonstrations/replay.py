@@ -1,4 +1,4 @@
-"""Prove that episodes succeed again from their actions: `python -m manifeel_ms3.demonstrations.replay trajectory.h5`."""
+"""Replay episodes from their actions, to prove that they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
 
 import logging
 import sys
@@ -11,37 +11,54 @@ import numpy as np
 import tyro
 from mani_skill.utils import common
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.registry import task_spec
 
 from .formats.maniskill_h5 import open_trajectories, read_header
 
 log = logging.getLogger(__name__)
+POSE = slice(0, 7)
+"""Part of an actor's state that is its pose: position (m) and quaternion wxyz."""
 
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     path: tyro.conf.Positional[Path]
-    """trajectory file"""
+    """Path of the trajectory file."""
     num: int | None = None
-    """episodes to replay; default: all"""
+    """Number of episodes to replay; all of them if not given."""
 
 
 @dataclass
 class Replay:
-    """Outcome of one episode: `deviation` is the largest difference of any object's pose from the recorded one, m or 1."""
+    """Outcome of one replayed episode."""
 
     seed: int
+    """Seed of the reset."""
     success: bool
+    """Whether the episode succeeded at some step."""
     deviation: float
+    """Largest difference of any object's last pose from the recorded one: positions in m, quaternions without unit."""
 
 
 def replay(path: Path, num: int | None = None) -> list[Replay]:
-    """Replay episodes from their seeds and actions, without pictures."""
+    """Replay episodes from their seeds and actions, without rendering.
+
+    Args:
+        path: Trajectory file.
+        num: Number of episodes; all of them if not given.
+
+    Raises:
+        DemonstrationError: The file is missing or broken.
+        UnknownNameError: The task of the file is not registered.
+    """
     header = read_header(path)
     kwargs = header["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = gym.make(header["env_info"]["env_id"], **kwargs)
+    env = gym.make(task_spec(header["env_info"]["env_id"]).env_id, **kwargs)
+    base: Any = env.unwrapped
     results = []
     with progress_bar() as bar:
         for info in bar.track(header["episodes"][:num], description="replaying"):
@@ -51,22 +68,23 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
             for action in actions:
                 *_, outcome = env.step(action)
                 success |= bool(outcome["success"])
-            actors = common.to_numpy(env.unwrapped.get_state_dict()["actors"])
-            deviation = max(float(np.abs(state[0, :7] - ends[name]).max()) for name, state in actors.items())
+            actors: Any = common.to_numpy(base.get_state_dict()["actors"])
+            deviation = max(float(np.abs(state[0, POSE] - ends[name]).max()) for name, state in actors.items())
             results.append(Replay(info["episode_seed"], success, deviation))
     env.close()
     return results
 
 
 def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The actions, and where each object ended."""
+    """The actions (T, A) of a recorded episode, and the last pose (7,) of each object."""
     with open_trajectories(path) as file:
         group = file[f"traj_{episode}"]
-        actors: Any = group["env_states/actors"]
-        return group["actions"][()], {name: actors[name][-1, :7] for name in actors}
+        actors = group["env_states/actors"]
+        return group["actions"][()], {name: actors[name][-1, POSE] for name in actors}
 
 
 def main(args: Args) -> int:
+    """Replay, and return 1 if an episode fails, else 0."""
     results = replay(args.path, args.num)
     failures = [result.seed for result in results if not result.success]
     worst = max(result.deviation for result in results)

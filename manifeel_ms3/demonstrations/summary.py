@@ -1,4 +1,4 @@
-"""What a trajectory file holds, in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
+"""Summarise a trajectory file in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
 
 import sys
 from dataclasses import dataclass
@@ -15,20 +15,27 @@ from manifeel_ms3.command_line import run
 from .formats.maniskill_h5 import open_trajectories, read_header
 
 BARS = " ▁▂▃▄▅▆▇█"
-WIDTH = 28  # characters of a sparkline
-SHOWN = 12  # episodes
-FORCE_EDGES = (0, 0.5, 1, 2, 5, 10, 20, 40, 60, np.inf)  # N
+"""Characters of a sparkline, from the lowest level to the highest: Unicode's eighths of a block."""
+WIDTH = 28
+"""Number of characters of a sparkline and of the longest bar of a histogram."""
+NUM_SHOWN = 12
+"""Number of episodes, and of arrays, that are listed one by one."""
+FORCE_EDGES = (0, 0.5, 1, 2, 5, 10, 20, 40, 60, np.inf)
+"""Edges of the histogram's bins in N, in steps of about 2; demonstrations stay under 60 N."""
 
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     file: tyro.conf.Positional[Path]
-    episodes: int = SHOWN
-    """listed one by one"""
+    """Path of the trajectory file."""
+    episodes: int = NUM_SHOWN
+    """Number of episodes to list one by one."""
 
 
 def sparkline(values: np.ndarray, top: float) -> str:
-    """Values (T,) as a row of bars, the highest at `top`; the largest of each stretch counts."""
+    """Values (T,) as a row of bars, each as high as the largest value of its stretch; the highest bar stands for `top`."""
     if len(values) == 0:
         return ""
     stretches = np.array_split(values, min(WIDTH, len(values)))
@@ -40,13 +47,21 @@ def main(args: Args) -> None:
     """Print the summary.
 
     Raises:
-        DemonstrationError: the file is missing or broken.
+        DemonstrationError: The file is missing or broken.
     """
     Console().print(summary(args.file, args.episodes))
 
 
-def summary(path: Path, shown: int = SHOWN) -> Group:
-    """Tables of the file, of its contact forces, and of some episodes."""
+def summary(path: Path, num_shown: int = NUM_SHOWN) -> Group:
+    """Tables of a trajectory file: the file as a whole, contact forces, episodes, and the sizes of its arrays.
+
+    Args:
+        path: Trajectory file.
+        num_shown: Number of episodes to list one by one.
+
+    Raises:
+        DemonstrationError: The file is missing or broken.
+    """
     header = read_header(path)
     episodes = header["episodes"]
     with open_trajectories(path) as file:
@@ -59,18 +74,25 @@ def summary(path: Path, shown: int = SHOWN) -> Group:
                 sizes[part] = sizes.get(part, 0) + item.id.get_storage_size()
 
         file.visititems(count)
-    return Group(_whole(path, header), _histogram(forces), _listed(episodes[:shown], forces), _parts(sizes, len(episodes)))
+    return Group(
+        _file_table(path, header),
+        _force_table(forces),
+        _episode_table(episodes[:num_shown], forces),
+        _size_table(sizes, len(episodes)),
+    )
 
 
-def _whole(path: Path, header: dict) -> Table:
+def _file_table(path: Path, header: dict) -> Table:
     episodes, env = header["episodes"], header["env_info"]
     lengths = np.array([episode["elapsed_steps"] for episode in episodes] or [0])
-    won = sum(bool(episode["success"]) for episode in episodes)
+    successes = sum(bool(episode["success"]) for episode in episodes)
     table = Table(title=str(path), show_header=False)
     table.add_row("task", env["env_id"].rpartition(":")[2])
     table.add_row("observations", str(env["env_kwargs"].get("obs_mode")))
     table.add_row("source", str(header.get("source_type")))
-    table.add_row("episodes", f"{len(episodes)}, {won} successes, {len(header.get('failed_seeds', []))} seeds that failed")
+    table.add_row(
+        "episodes", f"{len(episodes)}, {successes} successes, {len(header.get('failed_seeds', []))} seeds that failed"
+    )
     table.add_row("steps", f"{lengths.mean():.0f} on average, {lengths.min()} to {lengths.max()}, {lengths.sum()} in all")
     table.add_row(
         "size", f"{path.stat().st_size / 1e6:.2f} MB, {path.stat().st_size / 1e6 / max(len(episodes), 1):.2f} an episode"
@@ -78,8 +100,8 @@ def _whole(path: Path, header: dict) -> Table:
     return table
 
 
-def _histogram(forces: list[np.ndarray]) -> Table:
-    """Steps by the contact force of the held part on the world."""
+def _force_table(forces: list[np.ndarray]) -> Table:
+    """Numbers of steps by the contact force of the held part on the world."""
     table = Table("contact force, N", "steps", "", title="contact forces")
     everything = np.concatenate(forces) if forces else np.zeros(0)
     counts, _ = np.histogram(everything, FORCE_EDGES)
@@ -89,19 +111,19 @@ def _histogram(forces: list[np.ndarray]) -> Table:
     return table
 
 
-def _listed(episodes: list[dict], forces: list[np.ndarray]) -> Table:
+def _episode_table(episodes: list[dict], forces: list[np.ndarray]) -> Table:
     table = Table("episode", "seed", "steps", "success", "peak, N", "contact force over time", title="episodes")
     top = max((force.max(initial=0) for force in forces), default=0.0)
     for episode, force in zip(episodes, forces, strict=False):
         cells = (episode["episode_id"], episode["episode_seed"], episode["elapsed_steps"])
-        won = "yes" if episode["success"] else "no"
-        table.add_row(*map(str, cells), won, f"{force.max(initial=0):.1f}", sparkline(force, top))
+        success = "yes" if episode["success"] else "no"
+        table.add_row(*map(str, cells), success, f"{force.max(initial=0):.1f}", sparkline(force, top))
     return table
 
 
-def _parts(sizes: dict[str, int], episodes: int) -> Table:
-    table = Table("array", "MB", "kB an episode", title="where the room goes")
-    for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:SHOWN]:
+def _size_table(sizes: dict[str, int], episodes: int) -> Table:
+    table = Table("array", "MB", "kB an episode", title="sizes of the arrays")
+    for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:NUM_SHOWN]:
         table.add_row(name, f"{size / 1e6:.2f}", f"{size / 1e3 / max(episodes, 1):.1f}")
     return table
 

@@ -1,4 +1,4 @@
-"""Check a set of demonstrations: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`."""
+"""Check demonstrations against their manifest: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`."""
 
 import logging
 import sys
@@ -23,14 +23,24 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     folder: tyro.conf.Positional[Path]
-    """with a manifest.json"""
+    """Folder that holds a manifest.json."""
     replay: int = 0
-    """episodes of each file to play again from their actions"""
+    """Number of episodes of each file to replay from their actions."""
 
 
 def validate(folder: Path, num_replays: int = 0) -> list[str]:
-    """What is wrong with a set, a line each; nothing, if it is sound."""
+    """Faults of a set of demonstrations, one line each; an empty list if there are none.
+
+    Args:
+        folder: Folder that holds the manifest.
+        num_replays: Number of episodes of each file to replay from their actions.
+
+    Raises:
+        DemonstrationError: The folder has no manifest that can be read.
+    """
     problems = []
     files = read_manifest(folder)["files"]
     with progress_bar() as bar:
@@ -40,12 +50,13 @@ def validate(folder: Path, num_replays: int = 0) -> list[str]:
 
 
 def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
+    """Faults of one trajectory file, given its entry in the manifest."""
     try:
         found = describe(path)
         problems = [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in entry if found[key] != entry[key]]
         with open_trajectories(path) as file:
             for episode in read_header(path)["episodes"]:
-                problems += [f"seed {episode['episode_seed']}: {what}" for what in _episode_problems(file, episode)]
+                problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
     except (DemonstrationError, KeyError, OSError) as error:
         return [str(error)]
     if shared := [seed for seed in found["seeds"] if seed >= FIRST_EVALUATION_SEED]:
@@ -53,12 +64,13 @@ def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
     if len(set(found["seeds"])) < len(found["seeds"]):
         problems.append("a seed occurs twice")
     if num_replays:
-        again = replay(path, num_replays)
-        problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in again if r.deviation > 0]
+        replays = replay(path, num_replays)
+        problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in replays if r.deviation > 0]
     return problems
 
 
-def _episode_problems(file: h5py.File, episode: dict[str, Any]) -> list[str]:
+def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
+    """Faults of one episode, given its entry in the json."""
     group, steps = file[f"traj_{episode['episode_id']}"], episode["elapsed_steps"]
     problems = []
     if not group["success"][-1]:
@@ -73,13 +85,14 @@ def _episode_problems(file: h5py.File, episode: dict[str, Any]) -> list[str]:
         if len(item) != expected:
             problems.append(f"{name} has {len(item)} entries instead of {expected}")
         elif item.dtype.kind == "f" and not np.isfinite(item[()]).all():
-            problems.append(f"{name} holds what is not a number")
+            problems.append(f"{name} holds NaN or infinite numbers")
 
     group.visititems(check)
     return problems
 
 
 def main(args: Args) -> int:
+    """Log the faults, and return 1 if there are any, else 0."""
     problems = validate(args.folder, args.replay)
     for problem in problems:
         log.error(problem)

@@ -1,6 +1,6 @@
-"""Look at a recorded episode in Rerun: `python -m manifeel_ms3.demonstrations.view trajectory.h5`.
+"""View a recorded episode in Rerun: `python -m manifeel_ms3.demonstrations.view trajectory.h5`.
 
-Cameras, touch, forces, actions and success over one time axis. Needs the extra `view`.
+Cameras, touch, forces, actions and success are shown over one time axis. Needs the extra `view`.
 """
 
 import logging
@@ -12,46 +12,66 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import h5py
 import numpy as np
 import torch
 import tyro
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
-from manifeel_ms3.command_line import run
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, PandaGelSight
+from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
-STEP = "step"
+TIMELINE = "step"
+"""Name of Rerun's time axis, which counts control steps."""
 PORT = 9090
-FORCES = ("normal, N", "shear down the pad, N", "shear across the pad, N")  # of a whole pad
+"""Port of the viewer in the browser, Rerun's default."""
+FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
+"""Names of the components of the force on a whole pad, in the order of the force field's channels."""
+JOINT_AXES = {"pd_joint_pos": (*(f"{name}, rad" for name in PandaGelSight.arm_joint_names), "gripper")}
+"""Names of the entries of an action by control mode, for modes that command joints."""
 
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     file: tyro.conf.Positional[Path]
+    """Path of the trajectory file."""
     episode: int = 0
+    """Number of the episode, from 0."""
     save: Path | None = None
-    """a .rrd to write, to be opened with `rerun` later; default: open the viewer"""
+    """Path of a .rrd file to write, which `rerun` opens; the viewer is opened if not given."""
     web: bool = False
-    """open it in the browser, from this machine's port 9090"""
+    """Serve the viewer for a browser at port 9090 of this machine."""
+
+
+@dataclass(frozen=True)
+class EpisodeStreams:
+    """All that the viewer shows of an episode, by place in Rerun's tree."""
+
+    title: str
+    """Task and seed."""
+    images: dict[str, np.ndarray]
+    """Images uint8 (T + 1, H, W, 3)."""
+    series: dict[str, tuple[list[str], np.ndarray]]
+    """Names of lines, and their values (T or T + 1, lines)."""
 
 
 def main(args: Args) -> None:
-    """Show an episode, or write it.
+    """Show an episode, or write it to a file.
 
     Raises:
-        DemonstrationError: the file is missing or broken, or has no such episode.
-        ModuleNotFoundError: Rerun is not installed.
+        DemonstrationError: The file is missing or broken, or has no such episode.
+        MissingExtraError: Rerun is not installed.
     """
-    recording = recording_of(args.file, args.episode)
+    recording = rerun_recording(args.file, args.episode)
     if args.save:
         recording.save(args.save)
         log.info("%s; `rerun %s` opens it", args.save, args.save)
     elif args.web:
-        import rerun as rr  # pyright: ignore[reportMissingImports]
+        import rerun as rr
 
         stream = recording.serve_grpc()
         rr.serve_web_viewer(web_port=PORT, connect_to=stream)
@@ -62,53 +82,81 @@ def main(args: Args) -> None:
         recording.spawn()
 
 
-def recording_of(file: Path, episode: int) -> Any:
-    """Rerun's stream of everything that a file holds of an episode, and how it is laid out."""
-    try:
-        import rerun as rr  # pyright: ignore[reportMissingImports]
-        import rerun.blueprint as rrb  # pyright: ignore[reportMissingImports]
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("the viewer is Rerun: pip install 'manifeel-ms3[view]'") from error
-    header = read_header(file)
-    if not 0 <= episode < len(header["episodes"]):
-        raise DemonstrationError(f"{file} has episodes 0 to {len(header['episodes']) - 1}; there is no {episode}")
-    about = header["episodes"][episode]
-    name = f"{header['env_info']['env_id'].rpartition(':')[2]}, seed {about['episode_seed']}"
-    recording = rr.RecordingStream("manifeel", recording_id=f"{name}, {file}")
-    with open_trajectories(file) as opened:
-        group = opened[f"traj_{about['episode_id']}"]
-        pictures = dict(_pictures(group))
-        series = dict(_series(group, ACTION_AXES[about["control_mode"]]))
-    for place, frames in pictures.items():
+def rerun_recording(file: Path, episode: int) -> Any:
+    """Rerun's recording of everything that a file holds of an episode, with the layout of the viewer.
+
+    Raises:
+        DemonstrationError: The file is missing or broken, or has no such episode.
+        MissingExtraError: Rerun is not installed.
+    """
+    with missing_extras_named():
+        import rerun as rr
+    streams = read_streams(file, episode)
+    recording = rr.RecordingStream("manifeel", recording_id=f"{streams.title}, {file}")
+    for place, frames in streams.images.items():
         for step, frame in enumerate(frames):
-            recording.set_time(STEP, sequence=step)
+            recording.set_time(TIMELINE, sequence=step)
             recording.log(place, rr.Image(frame).compress())
-    for place, (names, values) in series.items():
+    for place, (names, values) in streams.series.items():
         recording.log(place, rr.SeriesLines(names=names), static=True)
-        steps = [rr.TimeColumn(STEP, sequence=np.arange(len(values)))]
+        steps = [rr.TimeColumn(TIMELINE, sequence=np.arange(len(values)))]
         recording.send_columns(place, steps, rr.Scalars.columns(scalars=values))
-    plots = rrb.Horizontal(*(rrb.TimeSeriesView(origin=place) for place in series))
-    views = rrb.Horizontal(*(rrb.Spatial2DView(origin=place) for place in pictures))
-    recording.send_blueprint(rrb.Blueprint(rrb.Vertical(views, plots) if pictures else plots, collapse_panels=True))
+    recording.send_blueprint(_blueprint(streams))
     return recording
 
 
-def _pictures(group: h5py.Group) -> Iterator[tuple[str, np.ndarray]]:
-    """By name, uint8 (T + 1, H, W, 3)."""
+def read_streams(file: Path, episode: int) -> EpisodeStreams:
+    """Read all that is shown of an episode.
+
+    Raises:
+        DemonstrationError: The file is missing or broken, or has no such episode.
+    """
+    header = read_header(file)
+    if not 0 <= episode < len(header["episodes"]):
+        raise DemonstrationError(f"{file} has episodes 0 to {len(header['episodes']) - 1}; there is no {episode}")
+    entry = header["episodes"][episode]
+    title = f"{header['env_info']['env_id'].rpartition(':')[2]}, seed {entry['episode_seed']}"
+    with open_trajectories(file) as opened:
+        group = opened[f"traj_{entry['episode_id']}"]
+        names = action_names(entry["control_mode"], group["actions"].shape[1])
+        return EpisodeStreams(title, dict(_images(group)), dict(_series(group, names)))
+
+
+def action_names(control_mode: str, size: int) -> list[str]:
+    """Names of the entries of an action; numbers where the control mode is another robot's.
+
+    Args:
+        control_mode: Name of the controller, such as "pd_ee_delta_pose".
+        size: Number of entries.
+    """
+    return list((ACTION_AXES | JOINT_AXES).get(control_mode, map(str, range(size))))
+
+
+def _blueprint(streams: EpisodeStreams) -> Any:
+    """Layout of the viewer: images above, plots below."""
+    import rerun.blueprint as rrb
+
+    plots = rrb.Horizontal(*(rrb.TimeSeriesView(origin=place) for place in streams.series))
+    views = rrb.Horizontal(*(rrb.Spatial2DView(origin=place) for place in streams.images))
+    return rrb.Blueprint(rrb.Vertical(views, plots) if streams.images else plots, collapse_panels=True)
+
+
+def _images(group: Any) -> Iterator[tuple[str, np.ndarray]]:
+    """Images of an episode's cameras and tactile sensors, by place; force fields are drawn."""
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "rgb" in data:
-            yield f"pictures/{sensor}", data["rgb"][()]
+            yield f"images/{sensor}", data["rgb"][()]
         if "force_field" in data:
-            yield f"pictures/{sensor}_forces", force_field_images(torch.from_numpy(data["force_field"][()])).numpy()
+            yield f"images/{sensor}_forces", force_field_images(torch.from_numpy(data["force_field"][()])).numpy()
 
 
-def _series(group: h5py.Group, axes: tuple[str, ...]) -> Iterator[tuple[str, tuple[Any, np.ndarray]]]:
-    """By name: names of its lines, and values (T, lines)."""
+def _series(group: Any, action_names: list[str]) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
+    """Numbers over time of an episode, by place."""
     yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "force_field" in data:
-            yield f"{sensor}_force", (list(FORCES), data["force_field"][()].sum((1, 2)))
-    yield "actions", (list(axes), group["actions"][()])
+            yield f"{sensor}_force", (list(FORCE_NAMES), data["force_field"][()].sum((1, 2)))
+    yield "actions", (action_names, group["actions"][()])
     yield "success", (["success"], group["success"][()][:, None].astype(float))
 
 

@@ -12,24 +12,22 @@ of the wrong shape, or does not answer in time fails that episode, and the resul
 import json
 import logging
 import sys
-from concurrent.futures import as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import torch
 import tyro
-from pebble import ProcessExpired, ProcessPool
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
+from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds, task_spec
+from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
 from .checkpoint_config import CheckpointError, checkpoint_config
-from .policy import PolicySource
+from .policy import Policy, PolicySource
 from .result import result_of, write_result
 from .rollout import EpisodeOutcome, evaluate_episode
 
@@ -143,40 +141,31 @@ def _of_checkpoint(checkpoint: Path, kwargs: dict[str, Any], extra: dict[str, An
 
 def run_episodes(evaluation: Evaluation, seeds: list[int], workers: int, step_timeout: float) -> list[EpisodeOutcome]:
     """Outcomes in the seeds' order; an episode whose process dies has failed."""
-    outcomes = {}
-    with (
-        progress_bar() as bar,
-        ProcessPool(workers, context=get_context("spawn"), initializer=_start_worker, initargs=(evaluation,)) as pool,
-    ):
+    outcomes: dict[int, EpisodeOutcome] = {}
+    with progress_bar() as bar, WorkerPool(workers, partial(_make_env_and_policy, evaluation)) as pool:
         task = bar.add_task("evaluating", total=len(seeds))
-        seed_of = {pool.schedule(_run_seed, args=(seed, step_timeout)): seed for seed in seeds}
-        for future in as_completed(seed_of):
-            seed = seed_of[future]
+        for seed in seeds:
+            pool.submit(partial(_run_seed, step_timeout=step_timeout), seed)
+        for finished in pool.as_finished():
             try:
-                outcomes[seed] = future.result()
-            except ProcessExpired as error:
-                reason = f"the policy's process ended with exit code {error.exitcode}: it crashed, or hung for good"
-                outcomes[seed] = EpisodeOutcome(seed, False, False, 0, 0.0, 0.0, reason)
-            won = sum(outcome.success_once for outcome in outcomes.values())
-            bar.update(task, advance=1, description=f"evaluating, {won} of {len(outcomes)} succeed")
+                outcomes[finished.task] = finished.result()
+            except WorkerDiedError as error:
+                reason = f"the policy's process ended with exit code {error.exit_code}: it crashed, or hung for good"
+                outcomes[finished.task] = EpisodeOutcome(finished.task, False, False, 0, 0.0, 0.0, reason)
+            successes = sum(outcome.success_once for outcome in outcomes.values())
+            bar.update(task, advance=1, description=f"evaluating, {successes} of {len(outcomes)} succeed")
     return [outcomes[seed] for seed in seeds]
 
 
-_worker: dict[str, Any] = {}
+def _make_env_and_policy(evaluation: Evaluation) -> tuple[gym.Env, Policy]:
+    """In a worker process: what it keeps from one episode to the next."""
+    all_tasks()  # registers the tasks in this process, those of plug-ins, too
+    return gym.make(evaluation.env_id, **evaluation.env_kwargs), evaluation.source.make()
 
 
-def _start_worker(evaluation: Evaluation) -> None:
-    torch.set_num_threads(1)  # processes share the cores, and sums do not depend on their number
-    _worker.update(evaluation=evaluation)
-
-
-def _run_seed(seed: int, step_timeout: float) -> EpisodeOutcome:
-    if "env" not in _worker:  # here, not at the worker's start, where an error would be lost
-        import manifeel_ms3  # noqa: F401
-
-        evaluation = _worker["evaluation"]
-        _worker.update(env=gym.make(evaluation.env_id, **evaluation.env_kwargs), policy=evaluation.source.make())
-    return evaluate_episode(_worker["env"], _worker["policy"], seed, step_timeout=step_timeout)
+def _run_seed(env_and_policy: tuple[gym.Env, Policy], seed: int, step_timeout: float) -> EpisodeOutcome:
+    env, policy = env_and_policy
+    return evaluate_episode(env, policy, seed, step_timeout=step_timeout)
 
 
 def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:

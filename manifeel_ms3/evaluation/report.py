@@ -20,6 +20,7 @@ import tyro
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import task_spec
 
 from .policy import load_policy
@@ -114,7 +115,7 @@ def main(args: Args) -> Path:
         curve=Markup(training_curve(args.run_dir / "log.jsonl")),
     )
     out = args.out or args.run_dir / "report.html"
-    out.write_text(page)
+    write_text(out, page)
     log.info("%s", out)
     return out
 

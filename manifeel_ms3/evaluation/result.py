@@ -9,6 +9,7 @@ import jsonschema
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
@@ -73,8 +74,7 @@ def write_result(result: dict[str, Any], path: Path) -> None:
     """
     result = json.loads(json.dumps(result, default=str))
     check_result(result, path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=2))
+    write_json(path, result)
 
 
 def read_result(path: Path) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from manifeel_ms3.analysis.protocol import (
     mean_success,
 )
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.files import write_text
 
 from .submission import EPISODES, Submission
 
@@ -97,11 +98,11 @@ def leaderboard_table(rows: list[Row]) -> str:
 def write_page(submissions: list[Submission], board: Path) -> Path:
     """Write the page and the table into the leaderboard's folder, and return the path of the page."""
     rows = ranked(submissions)
-    (board / TABLE).write_text(leaderboard_table(rows))
+    write_text(board / TABLE, leaderboard_table(rows))
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         rows=[_for_page(row) for row in rows], full=FULL, plotly=Markup(plotly.offline.get_plotlyjs())
     )
-    (board / PAGE).write_text(page)
+    write_text(board / PAGE, page)
     return board / PAGE
 
 

@@ -1,21 +1,22 @@
-"""Record demonstrations by hand, in a browser: `python -m manifeel_ms3.teleop ManiFeel-USBInsertion-v1`. Needs the extra
-`teleop`."""
+"""Record demonstrations by hand, in a browser: `python -m manifeel_ms3.teleop ManiFeel-USBInsertion-v1`.
+
+Needs the extra `teleop`.
+"""
 
 import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import tyro
 
-import manifeel_ms3  # noqa: F401
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
-from manifeel_ms3.command_line import json_object, run
+from manifeel_ms3.command_line import json_object, missing_extras_named, run
+from manifeel_ms3.tasks.registry import task_spec
 
 from .devices import DEVICES, follow
-from .operator import Operator
+from .operator import Operator, steerable_axes
 from .session import Session
 
 log = logging.getLogger(__name__)
@@ -23,44 +24,50 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Args:
+    """Arguments of the command."""
+
     env_id: tyro.conf.Positional[str]
-    """task, such as ManiFeel-USBInsertion-v1"""
+    """Id of the task, such as ManiFeel-USBInsertion-v1."""
     out: Path | None = None
-    """trajectory file; what is in it stays; default data/demos/<task>/human.h5"""
+    """Path of the trajectory file, to which episodes are added; data/demos/<task>/human.h5 if not given."""
     obs_mode: str = "rgb+tacrgb+tacff"
-    """what is shown and recorded"""
+    """Observations to show and record, joined by "+"."""
     cameras: tuple[str, ...] | None = None
-    """default: the task's policy camera"""
+    """Cameras to show and record; the camera of the task's policies if not given."""
     tactile_sensors: tuple[str, ...] = ("right",)
+    """Sides of the tactile sensors to show and record."""
     seed: int = 0
-    """of the first episode"""
+    """Seed of the first episode."""
     env_kwargs: str = "{}"
-    """further arguments of the task as json"""
+    """Further arguments of the task as json, such as '{"fit": "loose"}'."""
     device: Literal["spacemouse", "gamepad"] | None = None
-    """steer with it, besides the page"""
+    """Device to steer with, besides the page; none if not given."""
     host: str = "localhost"
-    """address to listen on; anybody who reaches it can watch, and the first steers"""
+    """Address to listen on. Whoever reaches it can watch, and the first to open the page steers."""
     port: int = 8080
+    """Port to listen on; the next free one if it is taken."""
 
 
 def main(args: Args) -> Path:
-    """Record until interrupted; returns the file's path.
+    """Record until interrupted, and return the path of the trajectory file.
 
     Raises:
-        DemonstrationError: the file was recorded with other settings.
-        DeviceError: the device is not there.
-        ModuleNotFoundError: viser is not installed.
+        UnknownNameError: The task is not registered.
+        InvalidArgumentError: The control mode cannot be steered, or an argument is not allowed.
+        DemonstrationError: The file was recorded with other arguments.
+        DeviceError: The device cannot be used.
+        MissingExtraError: viser, which serves the page, is not installed.
     """
-    try:
+    with missing_extras_named():
         from .page import Page
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError("the page is made with viser: pip install 'manifeel-ms3[teleop]'") from error
-    kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))
+    task_spec(args.env_id)
+    kwargs: dict[str, Any] = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))
     if args.cameras is not None:
         kwargs["cameras"] = list(args.cameras)
     kwargs |= json_object("--env-kwargs", args.env_kwargs)
     env = gym.make(args.env_id, **kwargs)
-    operator = Operator(ACTION_AXES[env.unwrapped.control_mode])
+    base: Any = env.unwrapped
+    operator = Operator(steerable_axes(base.control_mode))
     if args.device:
         follow(DEVICES[args.device](), operator)
     out = args.out or Path("data/demos") / args.env_id / "human.h5"

@@ -1,4 +1,4 @@
-"""SpaceMouse and gamepad, where one is plugged in: each pushes the operator's axes in a thread of its own."""
+"""SpaceMouse and gamepad: each pushes the axes of the operator from a thread of its own."""
 
 import logging
 import os
@@ -7,36 +7,48 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from manifeel_ms3.errors import MachineError
+
 from .operator import Operator
 
 log = logging.getLogger(__name__)
-RATE = 200.0  # Hz: a SpaceMouse queues its readings, and what is read too seldom lags
-DEAD_ZONE = 0.08  # of full deflection
+RATE = 200.0
+"""Rate in Hz at which a device is read. A SpaceMouse queues its readings, so that motions lag if it is read too seldom."""
+DEAD_ZONE = 0.08
+"""Share of the full deflection below which an axis counts as released: sticks at rest do not read exactly 0."""
+STICK_RANGE = 32767
+"""Reading of a gamepad's stick at full deflection: SDL gives int16."""
 SIX_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
-NO_DEVICE = "no {name} was found: plug one in, or leave out --device; the page's keys and buttons work without"
+NO_DEVICE = "no {name} was found: plug one in, or leave out --device; the page's keys and buttons work without a device"
 
 
-class DeviceError(RuntimeError):
-    """A device that cannot be used."""
+class DeviceError(MachineError):
+    """A device cannot be used."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Deflections by axis, in [-1, 1], and whether the gripper's button is down."""
+    """State of a device at one moment."""
 
     axes: dict[str, float]
+    """Deflections in [-1, 1] by axis."""
     gripper: bool
+    """Whether the button of the gripper is down."""
 
 
 def spacemouse() -> Iterator[Reading]:
-    """Readings of a 3Dconnexion SpaceMouse."""
+    """Readings of a 3Dconnexion SpaceMouse, without end.
+
+    Raises:
+        DeviceError: None is plugged in, or its library is not installed.
+    """
     try:
         import pyspacemouse  # pyright: ignore
     except ModuleNotFoundError as error:
         raise DeviceError("a SpaceMouse needs pip install 'manifeel-ms3[spacemouse]', and libhidapi") from error
     try:
-        mouse = pyspacemouse.open(axis_convention="ros")  # x ahead, y left, z up, as the robot's base; right-handed turns
-    except Exception as error:  # the library raises what hidapi does
+        mouse = pyspacemouse.open(axis_convention="ros")  # pyright: ignore[reportArgumentType]; x forward, y left, z up, as the base
+    except Exception as error:  # the library passes on whatever hidapi raises
         raise DeviceError(NO_DEVICE.format(name="SpaceMouse") + f" ({error})") from error
     while True:
         state = mouse.read()
@@ -44,12 +56,17 @@ def spacemouse() -> Iterator[Reading]:
 
 
 def gamepad() -> Iterator[Reading]:
-    """Readings of the first gamepad: left stick x, y; right stick yaw, z; shoulders roll; lowest button the gripper.
+    """Readings of the first gamepad, without end.
 
-    By SDL's names of sticks and buttons, whose numbers are others from pad to pad and from system to system.
+    The left stick moves along x and y, the right stick along z and about yaw, the shoulder buttons turn about roll, and the
+    lowest button toggles the gripper. Sticks and buttons have the names of SDL's controllers, because their numbers differ
+    from gamepad to gamepad and between operating systems.
+
+    Raises:
+        DeviceError: None is plugged in, or its library is not installed.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, and the page is in the browser
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, which a server does not have
     try:
         import pygame  # pyright: ignore
         from pygame._sdl2 import controller  # pyright: ignore
@@ -63,7 +80,7 @@ def gamepad() -> Iterator[Reading]:
     pad = controller.Controller(found[0])
 
     def stick(name: str) -> float:
-        return pad.get_axis(getattr(pygame, f"CONTROLLER_AXIS_{name}")) / 32767
+        return pad.get_axis(getattr(pygame, f"CONTROLLER_AXIS_{name}")) / STICK_RANGE
 
     while True:
         pygame.event.pump()
@@ -76,10 +93,10 @@ DEVICES: dict[str, Callable[[], Iterator[Reading]]] = dict(spacemouse=spacemouse
 
 
 def follow(readings: Iterator[Reading], operator: Operator) -> threading.Thread:
-    """Let a device push an operator; the first reading is taken at once.
+    """Push an operator with the readings of a device, from a thread; the first reading is taken at once.
 
     Raises:
-        DeviceError: there is no such device.
+        DeviceError: The device cannot be used.
     """
     first = next(readings)
 

@@ -1,4 +1,4 @@
-"""What the person wants: told from any thread, asked by the robot's."""
+"""What the person who steers wants: set from any thread, and read by the thread that moves the robot."""
 
 import threading
 import time
@@ -7,19 +7,27 @@ from enum import Enum
 
 import numpy as np
 
-HOLD = 0.25  # s that a key press moves the arm for; while it is held down, the next one comes before that
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.errors import InvalidArgumentError
+
+HOLD = 0.25
+"""Time in s for which one key press moves the arm; a key that is held down repeats faster, so that the arm keeps moving."""
+FIRST_SPEED = 0.5
+"""Share of the full speed at which the arm moves until the person sets another."""
 
 
 class Mode(Enum):
-    READY = "ready: start when you like"
+    """State of an episode; the value is the text that the page shows."""
+
+    READY = "ready: press start"
     RUNNING = "recording"
     PAUSED = "paused"
     ENDED = "ended: save or discard"
     CLOSED = "closed"
 
 
-class Wish(Enum):
-    """How an episode is to end."""
+class EpisodeCommand(Enum):
+    """How an episode shall end; the value is the text of the button."""
 
     STOP = "stop"
     RETRY = "retry"
@@ -27,36 +35,58 @@ class Wish(Enum):
     DISCARD = "discard"
 
 
+def steerable_axes(control_mode: str) -> tuple[str, ...]:
+    """Names of the entries of an action, for a control mode that a person can steer.
+
+    Raises:
+        InvalidArgumentError: Actions of the control mode are not motions of the tool.
+    """
+    if control_mode not in ACTION_AXES:
+        raise InvalidArgumentError(
+            f"control_mode={control_mode!r} cannot be steered by hand, because its actions are not motions of the tool; choose "
+            f"from {list(ACTION_AXES)}"
+        )
+    return ACTION_AXES[control_mode]
+
+
 class Operator:
-    """Motions and wishes of the person who steers.
+    """Motions and commands of the person who steers.
 
     Args:
-        axes: names of an action's entries, such as ("x", "y", "z", "yaw", "gripper").
-        clock: s.
+        axes: Names of an action's entries, such as ("x", "y", "z", "yaw", "gripper").
+        clock: Returns the time in s.
     """
 
     def __init__(self, axes: tuple[str, ...], clock: Callable[[], float] = time.monotonic):
-        self.axes, self.speed, self._clock = axes, 0.5, clock
+        self.axes, self.speed, self._clock = axes, FIRST_SPEED, clock
         self._changed = threading.Condition()
-        self._mode, self._wish = Mode.READY, None
+        self._mode = Mode.READY
+        self._command: EpisodeCommand | None = None
         self._pushed: dict[str, tuple[float, float]] = {}
         self._closed_gripper = False
 
     @property
     def mode(self) -> Mode:
+        """State of the episode."""
         return self._mode
 
     def push(self, axis: str, direction: float) -> None:
-        """Move along an axis for a moment, in [-1, 1] of the speed; an axis that the task does not have is not moved."""
+        """Move along an axis for `HOLD` seconds; an axis that the task does not have is ignored.
+
+        Args:
+            axis: Name of the axis.
+            direction: Velocity in [-1, 1], as a share of the speed that is set.
+        """
         with self._changed:
             self._pushed[axis] = (direction, self._clock() + HOLD)
 
     def toggle_gripper(self) -> None:
+        """Open the gripper if it is closed, and close it if it is open."""
         with self._changed:
             self._closed_gripper = not self._closed_gripper
 
     def action(self) -> np.ndarray:
-        """What is wanted now, (A,) in [-1, 1]."""
+        """The action that is wanted now, (A,) in [-1, 1]."""
         with self._changed:
             now = self._clock()
             moving = {axis: direction * self.speed for axis, (direction, until) in self._pushed.items() if now < until}
@@ -66,48 +96,51 @@ class Operator:
     # ---------------------------------------------------------------- modes
 
     def begin(self) -> None:
-        """A new episode is there."""
+        """Get ready for a new episode."""
         with self._changed:
             if self._mode is not Mode.CLOSED:
                 self._mode = Mode.READY
-            self._wish, self._closed_gripper = None, False
+            self._command, self._closed_gripper = None, False
             self._pushed.clear()
 
     def start(self) -> None:
-        """Start, or go on."""
+        """Start the episode, or continue it after a pause."""
         self._move(Mode.RUNNING, Mode.READY, Mode.PAUSED)
 
     def pause(self) -> None:
+        """Stop moving until the episode is started again."""
         self._move(Mode.PAUSED, Mode.RUNNING)
 
     def end(self) -> None:
-        """The episode is over."""
+        """Mark the episode as over."""
         self._move(Mode.ENDED, Mode.READY, Mode.RUNNING, Mode.PAUSED)
 
     def close(self) -> None:
+        """End the session."""
         self._move(Mode.CLOSED, *Mode)
 
-    def wish(self, wish: Wish) -> None:
+    def command(self, command: EpisodeCommand) -> None:
+        """Ask for the end of the episode."""
         with self._changed:
-            self._wish = wish
+            self._command = command
             self._changed.notify_all()
 
     def may_move(self, patience: float) -> bool:
-        """Wait until the robot may move; False after so many s, so that the one who waits can look around."""
+        """Wait until the robot may move; False if it may not within `patience` seconds, or if the episode is over."""
         with self._changed:
             return self._changed.wait_for(lambda: self._mode is Mode.RUNNING or self.is_over, patience) and not self.is_over
 
-    def take_wish(self, patience: float) -> Wish | None:
-        """A wish that was told, once; None if none came within so many s."""
+    def take_command(self, patience: float) -> EpisodeCommand | None:
+        """The command that was given, which is forgotten then; None if none is given within `patience` seconds."""
         with self._changed:
-            self._changed.wait_for(lambda: self._wish is not None or self._mode is Mode.CLOSED, patience)
-            wish, self._wish = self._wish, None
-            return wish
+            self._changed.wait_for(lambda: self._command is not None or self._mode is Mode.CLOSED, patience)
+            command, self._command = self._command, None
+            return command
 
     @property
     def is_over(self) -> bool:
-        """Whether the episode is to end."""
-        return self._wish is not None or self._mode is Mode.CLOSED
+        """Whether the episode shall end."""
+        return self._command is not None or self._mode is Mode.CLOSED
 
     def _move(self, to: Mode, *of: Mode) -> None:
         with self._changed:

@@ -1,9 +1,10 @@
-"""The page: what is seen and felt, and everything to steer with, in a browser (viser)."""
+"""The page in a browser (viser): it shows the observations, and has the keys and buttons to steer with."""
 
 import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cv2
@@ -13,11 +14,23 @@ import viser.uplot
 
 from manifeel_ms3.sensors.visualisation import observation_images
 
-from .operator import Mode, Operator, Wish
+from .operator import EpisodeCommand, Mode, Operator
 
-TILE = 360  # pixels, height of a picture
-PLOTTED = 150  # steps
-KEYS = {  # as one looks at the robot from behind: x is ahead, y to the left
+TILE_HEIGHT = 360
+"""Height of each image on the page, in pixels."""
+NUM_PLOTTED = 150
+"""Number of steps that the plot of the contact force shows: the last 15 s at 10 Hz."""
+PLOT_HEIGHT = 150
+"""Height of that plot, in pixels."""
+JPEG_QUALITY = 80
+"""Quality of the images that the page is sent, of 100; enough to see, and little to send."""
+NOTICE_SECONDS = 4.0
+"""Time for which the page shows who steers, in s."""
+HOLD_HZ = 10.0
+"""Rate in Hz at which a button that is held down pushes; faster than `HOLD` needs."""
+SPEED_RANGE, SPEED_STEP = (0.05, 1.0), 0.05
+"""Smallest and largest speed on the slider, and its step, as shares of the full speed."""
+KEYS = {
     "W": ("x", 1.0),
     "S": ("x", -1.0),
     "A": ("y", 1.0),
@@ -31,24 +44,28 @@ KEYS = {  # as one looks at the robot from behind: x is ahead, y to the left
     "arrowleft": ("roll", -1.0),
     "arrowright": ("roll", 1.0),
 }
-HELP = """Keys (hold them): **W S** ahead, back · **A D** left, right · **R F** up, down · **Q E** turn · arrows tilt ·
+"""Axis and direction of each key, as seen from behind the robot: x is forward, y to the left."""
+HELP = """Keys (hold them): **W S** forward, back · **A D** left, right · **R F** up, down · **Q E** turn · arrows tilt ·
 **G** gripper · **space** start, pause · **enter** save · **backspace** discard"""
 
 
 class Page:
-    """One client steers; others watch, and may take over once that one has gone.
+    """The page. One client steers; others watch, and one of them can take over after that client has left.
 
     Args:
-        host: address to listen on.
+        operator: Receives the motions and commands of the client that steers.
+        title: Title of the page.
+        host: Address to listen on.
+        port: Port to listen on; the next free one if it is taken.
     """
 
     def __init__(self, operator: Operator, title: str, host: str, port: int):
         self.operator = operator
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it tells of every page that comes and goes
+        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs every page that opens or closes
         self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         self._pilot: int | None = None
         self._rights = threading.Lock()
-        self._forces: deque[float] = deque([0.0] * PLOTTED, PLOTTED)
+        self._forces: deque[float] = deque([0.0] * NUM_PLOTTED, NUM_PLOTTED)
         self.address = f"http://{host}:{self._server.get_port()}"
         self._server.on_client_connect(lambda client: self._claim(client.client_id))
         self._server.on_client_disconnect(self._left)
@@ -57,16 +74,20 @@ class Page:
     # ---------------------------------------------------------------- for the session
 
     def show(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
-        self._server.scene.set_background_image(_mosaic(list(observation_images(obs).values())), format="jpeg", jpeg_quality=80)
+        """Show an observation and its `info`."""
+        mosaic = _mosaic(list(observation_images(obs).values()))
+        self._server.scene.set_background_image(mosaic, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self._forces.append(float(info.get("contact_force", 0.0)))
-        self._plot.data = (np.arange(PLOTTED, dtype=float), np.array(self._forces))
+        self._plot.data = (np.arange(NUM_PLOTTED, dtype=float), np.array(self._forces))
         self._mode.content = f"**{self.operator.mode.value}**" + (" · success" if bool(info.get("success", False)) else "")
 
-    def tell(self, text: str) -> None:
+    def set_message(self, text: str) -> None:
+        """Show a line of text."""
         self._line.content = text
         self._mode.content = f"**{self.operator.mode.value}**"
 
     def stop(self) -> None:
+        """Stop serving the page."""
         self._server.stop()
 
     # ---------------------------------------------------------------- who steers
@@ -75,7 +96,7 @@ class Page:
         with self._rights:
             if self._pilot is None:
                 self._pilot = client_id
-        self._say_who_steers()
+        self._notify_clients()
 
     def _left(self, client: viser.ClientHandle) -> None:
         with self._rights:
@@ -83,19 +104,20 @@ class Page:
                 return
             self._pilot = None
         self.operator.pause()
-        self._say_who_steers()
+        self._notify_clients()
 
-    def _say_who_steers(self) -> None:
+    def _notify_clients(self) -> None:
+        """Show every client whether it steers."""
         for client_id, client in self._server.get_clients().items():
-            told = "you steer" if client_id == self._pilot else "you watch; another page steers"
+            text = "you steer" if client_id == self._pilot else "you watch; another page steers"
             if self._pilot is None:
-                told = "nobody steers: take over"
-            client.add_notification("Teleoperation", told, auto_close_seconds=4.0)
+                text = "nobody steers: take over"
+            client.add_notification("Teleoperation", text, auto_close_seconds=NOTICE_SECONDS)
 
-    def _if_pilot(self, do: Callable[[], None]) -> Callable[[viser.GuiEvent], None]:
-        """A callback that heeds the one who steers."""
+    def _if_pilot(self, do: Callable[[], None]) -> Callable[[Any], None]:
+        """A callback of viser that ignores every client but the one that steers."""
 
-        def callback(event: viser.GuiEvent) -> None:
+        def callback(event: Any) -> None:
             if event.client_id == self._pilot:
                 do()
 
@@ -111,50 +133,57 @@ class Page:
         gui.add_markdown(f"### {title}")
         self._mode = gui.add_markdown("")
         self._line = gui.add_markdown("")
-        wishes = {wish.value: lambda wish=wish: self.operator.wish(wish) for wish in Wish}
-        self._buttons("robot", dict(start=self.operator.start, pause=self.operator.pause, stop=wishes.pop("stop")))
-        self._buttons("episode", wishes)
+        commands = {command.value: partial(self.operator.command, command) for command in EpisodeCommand}
+        self._buttons("robot", dict(start=self.operator.start, pause=self.operator.pause, stop=commands.pop("stop")))
+        self._buttons("episode", commands)
         self._plot = gui.add_uplot(
-            (np.arange(PLOTTED, dtype=float), np.zeros(PLOTTED)),
+            (np.arange(NUM_PLOTTED, dtype=float), np.zeros(NUM_PLOTTED)),
             (viser.uplot.Series(label="step"), viser.uplot.Series(label="contact force, N", stroke="#4aa3ff", width=2)),
             scales={"x": viser.uplot.Scale(time=False, auto=True), "y": viser.uplot.Scale(auto=True)},
-            height=150,
+            height=PLOT_HEIGHT,
         )
-        speed = gui.add_slider("speed", min=0.05, max=1.0, step=0.05, initial_value=self.operator.speed)
-        speed.on_update(lambda event: self._if_pilot(lambda: setattr(self.operator, "speed", speed.value))(event))
+        low, high = SPEED_RANGE
+        speed = gui.add_slider("speed", min=low, max=high, step=SPEED_STEP, initial_value=self.operator.speed)
+        speed.on_update(self._if_pilot(lambda: setattr(self.operator, "speed", speed.value)))
+        self._build_axes()
+        take_over = gui.add_button("take over", hint="for a page that watches, after the page that steered has left")
+        take_over.on_click(lambda event: self._claim(event.client_id))
+        self._build_keys()
+
+    def _build_axes(self) -> None:
+        """Two buttons for every axis, and one for the gripper."""
+        gui = self._server.gui
         with gui.add_folder("steer"):
             gui.add_markdown(HELP)
             for axis in dict.fromkeys(axis for axis, _ in KEYS.values() if axis in self.operator.axes):
                 for sign, name in ((1.0, f"{axis} +"), (-1.0, f"{axis} -")):
-                    button = gui.add_button(name)
-                    button.on_hold(
-                        self._if_pilot(lambda axis=axis, sign=sign: self.operator.push(axis, sign)), callback_hz=10.0
-                    )
+                    push = self._if_pilot(partial(self.operator.push, axis, sign))
+                    gui.add_button(name).on_hold(push, callback_hz=HOLD_HZ)
             if "gripper" in self.operator.axes:
                 gui.add_button("gripper").on_click(self._if_pilot(self.operator.toggle_gripper))
-        take_over = gui.add_button("take over", hint="where the page that steered has gone")
-        take_over.on_click(lambda event: self._claim(event.client_id))
+
+    def _build_keys(self) -> None:
         for key, (axis, sign) in KEYS.items():
-            self._key(f"{axis} {'+' if sign > 0 else '-'}", key, lambda axis=axis, sign=sign: self.operator.push(axis, sign))
+            self._key(f"{axis} {'+' if sign > 0 else '-'}", key, partial(self.operator.push, axis, sign))
         self._key("gripper", "G", self.operator.toggle_gripper)
         self._key("start or pause", "space", self._start_or_pause)
-        self._key("save", "enter", lambda: self.operator.wish(Wish.SAVE))
-        self._key("discard", "backspace", lambda: self.operator.wish(Wish.DISCARD))
+        self._key("save", "enter", partial(self.operator.command, EpisodeCommand.SAVE))
+        self._key("discard", "backspace", partial(self.operator.command, EpisodeCommand.DISCARD))
 
     def _buttons(self, label: str, named: dict[str, Callable[[], None]]) -> None:
         group = self._server.gui.add_button_group(label, tuple(named))
         group.on_click(lambda event: self._if_pilot(named[group.value])(event))
 
-    def _key(self, label: str, key: str, do: Callable[[], None]) -> None:
+    def _key(self, label: str, key: Any, do: Callable[[], None]) -> None:
         self._server.gui.add_command(label, hotkey=key).on_trigger(self._if_pilot(do))
 
     def _start_or_pause(self) -> None:
         self.operator.pause() if self.operator.mode is Mode.RUNNING else self.operator.start()
 
 
-def _mosaic(pictures: list[np.ndarray]) -> np.ndarray:
-    """Side by side, in two rows."""
-    tiles = [cv2.resize(picture, (round(TILE * picture.shape[1] / picture.shape[0]), TILE)) for picture in pictures]
+def _mosaic(images: list[np.ndarray]) -> np.ndarray:
+    """Images uint8 (H, W, 3) side by side, in two rows."""
+    tiles = [cv2.resize(image, (round(TILE_HEIGHT * image.shape[1] / image.shape[0]), TILE_HEIGHT)) for image in images]
     rows = [tiles[: (len(tiles) + 1) // 2], tiles[(len(tiles) + 1) // 2 :]]
     rows = [np.concatenate(row, axis=1) for row in rows if row]
     width = max(row.shape[1] for row in rows)

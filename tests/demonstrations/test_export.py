@@ -10,8 +10,8 @@ import pytest
 from baselines.common.dataset import read_episodes
 from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
-from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import observed
+from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys
 from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
 
@@ -39,9 +39,9 @@ def require_same(read: list[dict[str, np.ndarray]], last_is_repeated: bool) -> N
 
 
 def test_what_can_be_exported_is_found():
-    assert sorted(observed(SAMPLE)) == sorted(KEYS)
+    assert sorted(observation_keys(SAMPLE)) == sorted(KEYS)
     with pytest.raises(DemonstrationError, match="states and actions alone"):
-        observed(SAMPLE.with_name("states.h5"))
+        observation_keys(SAMPLE.with_name("states.h5"))
 
 
 def test_lerobot(tmp_path):
@@ -51,8 +51,8 @@ def test_lerobot(tmp_path):
     poses = np.concatenate([episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS)])
     assert np.allclose(stats["observation.state"]["mean"], poses.mean(0), atol=1e-6)
     assert np.allclose(stats["observation.state"]["std"], poses.std(0), atol=1e-6)
-    pictures = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
-    assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), pictures.mean((0, 1, 2)), atol=1e-6)
+    images = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
+    assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
 
 
 @pytest.mark.skipif(importlib.util.find_spec("lerobot") is None, reason="lerobot is not installed")
@@ -79,15 +79,15 @@ def test_zarr_of_the_papers_layout(tmp_path):
     require_same(diffusion_policy_zarr.read_zarr(folder, KEYS, 2), last_is_repeated=True)
 
 
-def test_pictures_of_touch_lie_as_in_the_papers_data():
+def test_images_of_touch_lie_as_in_the_papers_data():
     key = "sensor_data/tactile_right/rgb"
     assert diffusion_policy_zarr.array_name(key) == "right_tactile_camera_taxim"
-    pictures = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), np.uint8)
-    theirs = diffusion_policy_zarr._theirs(key, pictures)
+    images = np.random.default_rng(0).integers(0, 256, (3, 240, 320, 3), np.uint8)
+    theirs = diffusion_policy_zarr._to_paper(key, images)
     assert theirs.shape == (3, 320, 240, 3)
     assert theirs.dtype == np.float32
     assert theirs.max() <= 1
-    assert np.array_equal(diffusion_policy_zarr._ours(key, theirs), pictures)
+    assert np.array_equal(diffusion_policy_zarr._from_paper(key, theirs), images)
 
 
 def test_npz(tmp_path):
@@ -107,7 +107,7 @@ def test_baselines_train_on_it(kind, tmp_path):
 
 def test_what_is_there_or_broken_is_said(tmp_path):
     folder = exported("zarr", tmp_path)
-    with pytest.raises(DemonstrationError, match="is there already"):
+    with pytest.raises(DemonstrationError, match="exists already"):
         export.main(export.Args(SAMPLE, "zarr", folder))
     with pytest.raises(DemonstrationError, match=r"lacks \['front'\]; it holds \['action'"):
         diffusion_policy_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1)
@@ -117,3 +117,14 @@ def test_what_is_there_or_broken_is_said(tmp_path):
     with pytest.raises(DemonstrationError, match="is no store of the paper's layout"):
         diffusion_policy_zarr.count_episodes(folder)
     assert not list(tmp_path.glob("*.partial"))
+
+
+def test_formats_are_told_apart_by_what_lies_there(tmp_path):
+    assert format_of(SAMPLE) is MANISKILL_H5
+    for kind in ("lerobot", "zarr"):
+        known = format_of(exported(kind, tmp_path))
+        assert known.name == kind
+        assert known.count(tmp_path / kind) == 2
+        assert len(known.read(tmp_path / kind, KEYS)) == 2
+    with pytest.raises(DemonstrationError, match=r"no known format; known are \['lerobot', 'zarr', 'maniskill'\]"):
+        format_of(tmp_path)

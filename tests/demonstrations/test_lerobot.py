@@ -1,9 +1,10 @@
-"""LeRobot datasets, two written by lerobot 0.4.4 itself: one with pictures, one with videos."""
+"""LeRobot datasets, two written by lerobot 0.4.4 itself: one with images, one with videos."""
 
 import json
 import shutil
 from pathlib import Path
 
+import imageio.v2 as imageio
 import numpy as np
 import pytest
 
@@ -40,7 +41,7 @@ def test_numbers_are_those_that_were_written(kind):
         assert np.allclose(field[:, 3, 2, 1], 10 * e + seen)
 
 
-def test_pictures_are_bit_for_bit():
+def test_images_are_bit_for_bit():
     y, x = np.mgrid[:24, :32]
     for e, episode in enumerate(read_lerobot(DATASETS / "images", KEYS[:1], 2)):
         for t in range(LENGTHS[e]):
@@ -54,6 +55,14 @@ def test_videos_show_each_episodes_frames():
         assert frames.shape == (LENGTHS[e] + 1, 96, 96, 3)
         for t in range(LENGTHS[e]):  # compression loses a little
             assert np.abs(frames[t].mean((0, 1)) - [60 * t + 20, 200 - 50 * t, 90 * e + 30]).max() < 12
+
+
+def test_a_video_file_is_decoded_once(monkeypatch):
+    opened = []
+    get_reader = imageio.get_reader
+    monkeypatch.setattr(imageio, "get_reader", lambda path: opened.append(path) or get_reader(path))
+    assert len(read_lerobot(DATASETS / "videos", KEYS[:1], 2)) == 2
+    assert len(opened) == len(set(opened)) == 1
 
 
 def test_progress_is_reported_and_fewer_can_be_read():
@@ -79,5 +88,5 @@ def test_what_is_missing_or_broken_is_named(copy):
     with pytest.raises(DemonstrationError, match="convert_dataset_v21_to_v30"):
         read_lerobot(copy, KEYS, 1)
     (copy / "meta/info.json").write_text("{")
-    with pytest.raises(DemonstrationError, match="info.json cannot be read"):
+    with pytest.raises(DemonstrationError, match=r"info\.json is not the description of a LeRobot dataset"):
         read_lerobot(copy, KEYS, 1)

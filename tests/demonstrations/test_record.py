@@ -10,10 +10,15 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import psutil
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import episode_folder, read_header
+from manifeel_ms3.demonstrations.recording import make_header
+from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
+from manifeel_ms3.tasks import registry
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
 from tests.conftest import PEG
 
 EASY = dict(fit="loose", render_backend="none")
@@ -117,7 +122,7 @@ def test_reader_gives_actions_and_observations(recorded):
 
 
 def test_missing_file_says_how_to_record_one(tmp_path):
-    with pytest.raises(DemonstrationError, match="demonstrations.record"):
+    with pytest.raises(DemonstrationError, match=r"demonstrations\.record"):
         read_demonstrations(tmp_path / "none.h5", KEYS)
 
 
@@ -143,7 +148,7 @@ def test_other_task(recorded):
 
 
 def test_other_obs_mode(recorded):
-    with pytest.raises(DemonstrationError, match="obs_mode='tacff'.*sensor_data/wrist/rgb"):
+    with pytest.raises(DemonstrationError, match=r"obs_mode='tacff'.*sensor_data/wrist/rgb"):
         read_demonstrations(recorded, ["sensor_data/wrist/rgb"], PEG)
 
 
@@ -171,3 +176,44 @@ def test_maniskill_replays_the_file_unchanged(recorded, tmp_path):
     ]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert "2/2=100.00%" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(("seed", "num"), [(FIRST_EVALUATION_SEED, 1), (FIRST_EVALUATION_SEED - 2, 3), (-1, 1)])
+def test_evaluation_seeds_are_refused(tmp_path, seed, num):
+    with pytest.raises(InvalidArgumentError, match="from 100000 on are for evaluation"):
+        run(tmp_path / "trajectory.h5", num, seed=seed)
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_revision_of_the_task_does_not_mix_into_a_file(recorded, tmp_path):
+    path = tmp_path / "trajectory.h5"
+    path.write_bytes(recorded.read_bytes())
+    header = json.loads(recorded.with_suffix(".json").read_text())
+    assert header["revision"] == task_spec(PEG).revision
+    path.with_suffix(".json").write_text(json.dumps(header | dict(revision=header["revision"] + 1)))
+    with pytest.raises(DemonstrationError, match="revision=2, this run asks for 1"):
+        run(path, num=4)
+
+
+def test_the_header_names_the_module_that_registers_the_task(monkeypatch):
+    env_class = type("TheirEnv", (), dict(__module__="their_package.tasks"))
+    their = TaskSpec("Their-v1", env_class, "insertion", max_episode_steps=7, paper_demos=1)
+    monkeypatch.setitem(registry._SPECS, "Their-v1", their)
+    assert make_header("Their-v1", {})["env_info"]["env_id"] == "their_package:Their-v1"
+    assert make_header(PEG, {})["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
+
+
+def test_a_worker_that_is_killed_loses_no_finished_episode(recorded, tmp_path):
+    path = tmp_path / "trajectory.h5"
+
+    def kill_workers() -> None:
+        for process in psutil.Process().children():
+            if "spawn_main" in " ".join(process.cmdline()):
+                process.kill()
+
+    args = record.Args(PEG, 3, 1, 0, path, "tacff", cameras=(), tactile_sensors=("right",), env_kwargs=json.dumps(EASY))
+    with pytest.raises(WorkFailedError, match="ended with exit code -9"):
+        record.main(args, kill_workers)
+    assert len(read_demonstrations(path, KEYS, PEG)) >= 1
+    run(path, num=3)
+    assert contents(path) == contents(recorded)

@@ -1,10 +1,12 @@
 """What Rerun is given holds every step of what the file holds."""
 
+import json
 import re
 import subprocess
 import sys
 
 import h5py
+import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, view
@@ -25,8 +27,8 @@ def test_everything_is_there(tmp_path):
         rows[place] = rows.get(place, 0) + int(count)
     with h5py.File(FILE) as file:
         steps = len(file["traj_1/actions"])
-    pictures = ("pictures/wrist", "pictures/tactile_right_forces")
-    assert {place: rows[place] for place in pictures} == dict.fromkeys(pictures, steps + 1)
+    images = ("images/wrist", "images/tactile_right_forces")
+    assert {place: rows[place] for place in images} == dict.fromkeys(images, steps + 1)
     for place in ("contact_force", "actions", "success"):
         assert rows[place] == steps + 1  # and its lines' names
 
@@ -41,3 +43,22 @@ def test_without_rerun_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ModuleNotFoundError, match=r"manifeel-ms3\[view\]"):
         view.main(view.Args(FILE))
+
+
+def test_an_episode_in_joint_mode_is_shown(tmp_path):
+    file = tmp_path / "joints.h5"
+    with h5py.File(file, "w") as written:
+        group = written.create_group("traj_0")
+        group["actions"], group["contact_force"], group["success"] = np.zeros((3, 8)), np.zeros(3), np.zeros(3, bool)
+    episode = dict(episode_id=0, episode_seed=5, elapsed_steps=3, success=False, control_mode="pd_joint_pos")
+    header = dict(env_info=dict(env_id=f"manifeel_ms3:{PEG}", env_kwargs={}), episodes=[episode])
+    file.with_suffix(".json").write_text(json.dumps(header))
+    streams = view.read_streams(file, 0)
+    names, values = streams.series["actions"]
+    assert names[:1] + names[6:] == ["panda_joint1, rad", "panda_joint7, rad", "gripper"]
+    assert values.shape == (3, len(names))
+    assert streams.title == f"{PEG}, seed 5"
+
+
+def test_actions_of_another_robot_are_numbered():
+    assert view.action_names("pd_joint_delta_pos_of_another_robot", 2) == ["0", "1"]

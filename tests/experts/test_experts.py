@@ -1,6 +1,5 @@
 """Demonstrators win by the policy's own means, and go by what they feel."""
 
-
 import numpy as np
 import pytest
 

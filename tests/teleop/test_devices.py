@@ -124,11 +124,13 @@ def space_navigator(monkeypatch):
 def test_a_spacemouse(space_navigator, channel, counts, axis, value):
     readings = spacemouse()
     rest = next(readings)
-    assert set(rest.axes.values()) == {0.0} and not rest.gripper
+    assert set(rest.axes.values()) == {0.0}
+    assert not rest.gripper
     space_navigator.reports += [struct.pack("<Bhhh", channel, *counts), bytes([3, 1])]
     pushed, pressed = next(readings), next(readings)
     assert pushed.axes == pytest.approx(rest.axes | {axis: value})
-    assert not pushed.gripper and pressed.gripper
+    assert not pushed.gripper
+    assert pressed.gripper
 
 
 def test_no_spacemouse(monkeypatch):

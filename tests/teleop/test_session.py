@@ -1,4 +1,4 @@
-"""A person's wishes become episodes: on the real simulator, without a page."""
+"""A person's commands become episodes: on the real simulator, without a page."""
 
 import json
 import threading
@@ -9,11 +9,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.demonstrations.replay import replay
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.teleop import session as module
-from manifeel_ms3.teleop.operator import HOLD, Mode, Operator, Wish
+from manifeel_ms3.teleop.operator import HOLD, EpisodeCommand, Mode, Operator, steerable_axes
 from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
 from tests.conftest import PEG
@@ -32,10 +32,10 @@ class Notes:
         assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (1, 10, 14, 3)
         self.steps += 1
 
-    def tell(self, text):
+    def set_message(self, text):
         self.lines.append(text)
 
-    def was_told(self, word: str) -> bool:
+    def has_line(self, word: str) -> bool:
         return any(word in line for line in self.lines)
 
 
@@ -45,7 +45,7 @@ class Desk:
     def __init__(self, out: Path, **kwargs):
         self.kwargs = KWARGS | kwargs
         self.env = gym.make(PEG, **self.kwargs)
-        self.operator, self.screen = Operator(ACTION_AXES[self.env.unwrapped.control_mode]), Notes()
+        self.operator, self.screen = Operator(steerable_axes(self.env.unwrapped.control_mode)), Notes()
         self.session = Session(self.env, PEG, self.kwargs, out, 0, self.operator)
         self.thread = threading.Thread(target=self.session.run, args=(self.screen,))
         self.thread.start()
@@ -59,11 +59,11 @@ class Desk:
             self.operator.push(axis, direction)
             time.sleep(0.02)
 
-    def wish(self, wish: Wish, word: str) -> None:
-        """Say it, and wait for what is told then."""
+    def command(self, command: EpisodeCommand, word: str) -> None:
+        """Say it, and wait for the line that follows."""
         self.screen.lines.clear()
-        self.operator.wish(wish)
-        wait_until(lambda: self.screen.was_told(word))
+        self.operator.command(command)
+        wait_until(lambda: self.screen.has_line(word))
 
     def close(self) -> None:
         self.operator.close()
@@ -89,19 +89,19 @@ def desk(tmp_path):
 def test_episodes_are_saved_discarded_and_tried_again(desk, tmp_path):
     first = desk()
     first.move("z", -1.0)
-    first.wish(Wish.SAVE, "seed 1, 1 saved")
+    first.command(EpisodeCommand.SAVE, "seed 1, 1 saved")
     first.move("x", 1.0)
-    first.wish(Wish.RETRY, "seed 1, 1 saved")
+    first.command(EpisodeCommand.RETRY, "seed 1, 1 saved")
     first.move("y", 1.0)
-    first.wish(Wish.DISCARD, "seed 2, 1 saved")
-    first.wish(Wish.SAVE, "seed 2, 1 saved")  # nothing was recorded
-    first.wish(Wish.DISCARD, "seed 3, 1 saved")
+    first.command(EpisodeCommand.DISCARD, "seed 2, 1 saved")
+    first.command(EpisodeCommand.SAVE, "seed 2, 1 saved")  # nothing was recorded
+    first.command(EpisodeCommand.DISCARD, "seed 3, 1 saved")
     first.close()
 
     second = desk()  # another day: what is there stays
     second.move("yaw", -1.0)
-    second.wish(Wish.STOP, "save or discard")
-    second.wish(Wish.SAVE, "2 saved")
+    second.command(EpisodeCommand.STOP, "save or discard")
+    second.command(EpisodeCommand.SAVE, "2 saved")
     second.close()
 
     path = tmp_path / "human.h5"
@@ -125,9 +125,9 @@ def test_a_full_disk_loses_nothing(desk, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(module, "write_episode", no_room)
-    full.wish(Wish.SAVE, "No space left on device")
+    full.command(EpisodeCommand.SAVE, "No space left on device")
     monkeypatch.setattr(module, "write_episode", write)
-    full.wish(Wish.SAVE, "1 saved")
+    full.command(EpisodeCommand.SAVE, "1 saved")
     full.close()
     assert len(read_header(tmp_path / "human.h5")["episodes"]) == 1
 
@@ -148,7 +148,7 @@ def test_nothing_moves_before_start_nor_while_paused(desk):
 def test_a_file_of_another_task_stays(desk, tmp_path):
     first = desk()
     first.move("z", -1.0)
-    first.wish(Wish.SAVE, "1 saved")
+    first.command(EpisodeCommand.SAVE, "1 saved")
     first.close()
     before = (tmp_path / "human.h5").read_bytes()
     other = KWARGS | dict(fit="loose")
@@ -187,3 +187,8 @@ def test_modes_follow_each_other():
     operator.begin()
     operator.start()
     assert operator.mode is Mode.CLOSED
+
+
+def test_a_control_mode_that_cannot_be_steered_is_refused():
+    with pytest.raises(InvalidArgumentError, match=r"control_mode='pd_joint_pos' .* choose from \['pd_ee_delta_pose'"):
+        steerable_axes("pd_joint_pos")

@@ -1,21 +1,27 @@
 """The zarr layout of the paper's own data (Diffusion Policy's replay buffer): read as demonstrations, and written.
 
-`data/` holds all steps of all episodes one after the other, `meta/episode_ends` where each ends: cameras under their names
-(uint8), `right_tactile_camera_taxim` (float in [0, 1], 320 x 240: our pictures on their side), `tactile_force_field_right`
-(10 x 14 x 3), `state` (the tool's pose, m and xyzw) and `action`.
+`data/` holds the steps of all episodes one after the other, and `meta/episode_ends` the step at which each one ends. The arrays
+are the cameras under their names (uint8), `right_tactile_camera_taxim` (float in [0, 1], 320 x 240: TacRGB turned by 90
+degrees), `tactile_force_field_right` (10 x 14 x 3), `state` (pose of the tool, m and xyzw) and `action`.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .maniskill_h5 import DemonstrationError, each_demonstration, observed
+from manifeel_ms3.command_line import missing_extras_named
+
+from .demonstration_format import DemonstrationFormat, Progress
+from .maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
 
 ENDS = "meta/episode_ends"
-XYZW = [0, 1, 2, 4, 5, 6, 3]  # of a pose whose quaternion is wxyz
+STEPS_PER_CHUNK = 64
+"""Number of steps in a chunk of an array."""
+XYZW = [0, 1, 2, 4, 5, 6, 3]
+"""Order that turns a pose with a quaternion wxyz into one with xyzw."""
 WXYZ = [0, 1, 2, 6, 3, 4, 5]
+"""Order that turns a pose with a quaternion xyzw into one with wxyz."""
 
 
 def is_zarr(path: Path) -> bool:
@@ -24,27 +30,38 @@ def is_zarr(path: Path) -> bool:
 
 
 def array_name(key: str) -> str:
-    """The paper's name of one of our observations ("sensor_data/wrist/rgb")."""
+    """The paper's name of an observation, such as "wrist" for "sensor_data/wrist/rgb"."""
     if key == "extra/tcp_pose":
         return "state"
-    _, sensor, what = key.split("/")
+    _, sensor, kind = key.split("/")
     if not sensor.startswith("tactile_"):
         return sensor
     side = sensor.removeprefix("tactile_")
-    return f"{side}_tactile_camera_taxim" if what == "rgb" else f"tactile_force_field_{side}"
+    return f"{side}_tactile_camera_taxim" if kind == "rgb" else f"tactile_force_field_{side}"
 
 
 def count_episodes(folder: Path) -> int:
+    """Number of episodes in a store."""
     return _open(folder)[ENDS].shape[0]
 
 
-def read_zarr(folder: Path, keys: list[str], num: int, progress: Callable = iter) -> list[dict[str, np.ndarray]]:
-    """The first `num` episodes, as `read_demonstrations` gives them; the observation after the last action, which the store
-    does not hold, is the last one again.
+def read_zarr(
+    folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
+) -> list[dict[str, np.ndarray]]:
+    """The first episodes of a store, as `read_demonstrations` returns them.
+
+    The store does not hold the observation after the last action: the last observation stands there a second time.
+
+    Args:
+        folder: Folder of the store.
+        keys: Observations to read.
+        num: Number of episodes; all of them if not given.
+        progress: Wraps the iteration over episodes, to show a progress bar.
+        env_id: Ignored: a store does not name its task.
 
     Raises:
-        DemonstrationError: it is broken, or lacks an array.
-        ModuleNotFoundError: the extra is not installed.
+        DemonstrationError: The store is broken, or lacks an array.
+        MissingExtraError: zarr is not installed.
     """
     store = _open(folder)
     names = {key: array_name(key) for key in keys}
@@ -54,37 +71,43 @@ def read_zarr(folder: Path, keys: list[str], num: int, progress: Callable = iter
     ends = np.asarray(store[ENDS][:])
     starts = np.concatenate([[0], ends[:-1]])
     episodes = []
-    for i in progress(range(num)):
+    for i in progress(range(len(ends) if num is None else num)):
         part = slice(int(starts[i]), int(ends[i]))
-        episode = {key: _ours(key, np.asarray(store[f"data/{name}"][part])) for key, name in names.items()}
+        episode = {key: _from_paper(key, np.asarray(store[f"data/{name}"][part])) for key, name in names.items()}
         episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
         episodes.append(episode | dict(actions=np.asarray(store["data/action"][part], np.float32)))
     return episodes
 
 
-def write_zarr(path: Path, folder: Path, progress: Callable = iter) -> None:
-    """Write a trajectory file as such a store (zarr format 2, as the paper's code reads).
+def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
+    """Write a trajectory file as a store of zarr format 2, which the paper's code reads.
+
+    Args:
+        path: Trajectory file.
+        folder: Folder of the store; it is made.
+        progress: Wraps the iteration over episodes, to show a progress bar.
 
     Raises:
-        DemonstrationError: the file is broken, or holds no observations.
-        ModuleNotFoundError: the extra is not installed.
+        DemonstrationError: The trajectory file is broken, or holds no observations.
+        MissingExtraError: zarr is not installed.
     """
     zarr = _zarr()
-    keys, arrays, ends = observed(path), {}, []
+    keys, arrays, ends = observation_keys(path), {}, []
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
     for episode in each_demonstration(path, keys, progress):
         length = len(episode["actions"])
-        parts = {array_name(key): _theirs(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
+        parts = {array_name(key): _to_paper(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
         for name, values in parts.items():
             if name not in arrays:
-                shape, chunks = (0, *values.shape[1:]), (64, *values.shape[1:])
+                shape, chunks = (0, *values.shape[1:]), (STEPS_PER_CHUNK, *values.shape[1:])
                 arrays[name] = store.create_array(f"data/{name}", shape=shape, chunks=chunks, dtype=values.dtype)
             arrays[name].append(values)
         ends.append(length + (ends[-1] if ends else 0))
     store.create_array(ENDS, data=np.array(ends, np.int64))
 
 
-def _ours(key: str, values: np.ndarray) -> np.ndarray:
+def _from_paper(key: str, values: np.ndarray) -> np.ndarray:
+    """An array of the store (T, ...) as the observation of this key."""
     if key == "extra/tcp_pose":
         return values[:, WXYZ].astype(np.float32)
     if not key.endswith("/rgb"):
@@ -94,7 +117,8 @@ def _ours(key: str, values: np.ndarray) -> np.ndarray:
     return np.rot90(values, axes=(1, 2)) if "/tactile_" in key else values
 
 
-def _theirs(key: str, values: np.ndarray) -> np.ndarray:
+def _to_paper(key: str, values: np.ndarray) -> np.ndarray:
+    """The observation of this key (T, ...) as an array of the store."""
     if key == "extra/tcp_pose":
         return values[:, XYZW]
     if "/tactile_" in key and key.endswith("/rgb"):
@@ -103,10 +127,8 @@ def _theirs(key: str, values: np.ndarray) -> np.ndarray:
 
 
 def _zarr() -> Any:
-    try:
+    with missing_extras_named():
         import zarr
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{error}; zarr stores need `pip install manifeel_ms3[zarr]`") from error
     return zarr
 
 
@@ -120,3 +142,6 @@ def _open(folder: Path) -> Any:
             f"{folder} is no store of the paper's layout ({error}): it must have data/ and {ENDS}; copy it again"
         ) from error
     return store
+
+
+DIFFUSION_POLICY_ZARR = DemonstrationFormat("zarr", is_zarr, count_episodes, read_zarr, write_zarr)

@@ -1,23 +1,43 @@
 """LeRobot datasets (format 3.0): read as demonstrations, and written.
 
 Features are named after what they hold: `observation.images.wrist`, `observation.images.tactile_right` (TacRGB),
-`observation.force_field.tactile_right` (N per taxel), `observation.state` (the tool's pose in the base frame: m and wxyz), and
+`observation.force_field.tactile_right` (N per taxel), `observation.state` (pose of the tool in the base frame, m and wxyz), and
 `action`.
+
+The files are written here and not by lerobot's own library, because lerobot 0.4.4 cannot be installed beside the versions that
+this package is tested with. It requires torch < 2.11 with torchvision and torchcodec, opencv-python-headless < 4.13, packaging
+< 26 and diffusers < 0.36; the tests run with torch 2.13, beside whose CPU build torchvision cannot be imported, OpenCV 5,
+packaging 26 and diffusers 0.42. The tests read datasets that lerobot 0.4.4 has written, and let its reader, where it is
+installed, read what is written here.
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from .maniskill_h5 import DemonstrationError, each_demonstration, observed, read_header, write_json
+from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import read_json, write_json
+
+from .demonstration_format import DemonstrationFormat, Progress
+from .lerobot_statistics import episode_statistics, joined_statistics
+from .maniskill_h5 import DemonstrationError, each_demonstration, observation_keys, read_header
 
 INFO = "meta/info.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 FPS = 10
+"""Frames per second: the control rate of every task, in Hz."""
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+"""Features that number frames, episodes and tasks; every LeRobot dataset has them."""
+FILES_PER_CHUNK = 1000
+"""Number of files in a folder, lerobot's default."""
+DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
+"""Sizes in MB from which lerobot starts a new file, its defaults."""
 
 
 def is_lerobot(path: Path) -> bool:
@@ -26,28 +46,28 @@ def is_lerobot(path: Path) -> bool:
 
 
 def feature_name(key: str) -> str:
-    """LeRobot's name of one of our observations ("sensor_data/wrist/rgb")."""
+    """LeRobot's name of an observation, such as "observation.images.wrist" for "sensor_data/wrist/rgb"."""
     if key == "extra/tcp_pose":
         return "observation.state"
-    _, sensor, what = key.split("/")
-    return f"observation.{'images' if what == 'rgb' else what}.{sensor}"
+    _, sensor, kind = key.split("/")
+    return f"observation.{'images' if kind == 'rgb' else kind}.{sensor}"
 
 
 def count_episodes(folder: Path) -> int:
+    """Number of episodes in a dataset."""
     return read_info(folder)["total_episodes"]
 
 
 def read_info(folder: Path) -> dict[str, Any]:
-    """meta/info.json.
+    """The content of meta/info.json.
 
     Raises:
-        DemonstrationError: it is broken, or of another version.
+        DemonstrationError: The file is broken, or the dataset is of another version.
     """
-    path = Path(folder) / INFO
     try:
-        info = json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise DemonstrationError(f"{path} cannot be read ({error}); the dataset is broken, export it again") from error
+        info = read_json(Path(folder) / INFO, {"type": "object"}, "the description of a LeRobot dataset")
+    except InvalidFileError as error:
+        raise DemonstrationError(str(error)) from error
     if not str(info.get("codebase_version")).startswith("v3."):
         raise DemonstrationError(
             f"{folder} is a LeRobot dataset of version {info.get('codebase_version')}, v3.0 is read here; convert it with "
@@ -56,28 +76,44 @@ def read_info(folder: Path) -> dict[str, Any]:
     return info
 
 
-def read_lerobot(folder: Path, keys: list[str], num: int, progress: Callable = iter) -> list[dict[str, np.ndarray]]:
-    """The first `num` episodes, as `read_demonstrations` gives them; the observation after the last action, which LeRobot does
-    not hold, is the last one again.
+# -------------------------------------------------------------------- reading
+
+
+def read_lerobot(
+    folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
+) -> list[dict[str, np.ndarray]]:
+    """The first episodes of a dataset, as `read_demonstrations` returns them.
+
+    LeRobot does not hold the observation after the last action: the last observation stands there a second time.
+
+    Args:
+        folder: Folder of the dataset.
+        keys: Observations to read.
+        num: Number of episodes; all of them if not given.
+        progress: Wraps the iteration over episodes, to show a progress bar.
+        env_id: Ignored: datasets of other sources do not name tasks of this package.
 
     Raises:
-        DemonstrationError: the dataset is broken, or lacks a feature.
-        ModuleNotFoundError: the extra is not installed.
+        DemonstrationError: The dataset is broken, or lacks a feature.
+        MissingExtraError: pyarrow or imageio is not installed.
     """
     info = read_info(folder)
     names = {key: feature_name(key) for key in keys}
     if missing := [name for name in (*names.values(), "action") if name not in info["features"]]:
         raise DemonstrationError(f"{folder} lacks {missing}; it holds {sorted(info['features'])}")
-    episodes = _table(folder, "meta/episodes").sort_by("episode_index")
+    entries = _table(folder, "meta/episodes").sort_by("episode_index")
     data = _table(folder, "data").sort_by("index")
-    read = []
-    for i in progress(range(num)):
-        meta = {name: episodes[name][i].as_py() for name in episodes.column_names if not name.startswith("stats/")}
-        rows = data.slice(meta["dataset_from_index"], meta["length"])
-        episode = {key: _feature(folder, info, name, rows, meta) for key, name in names.items()}
-        episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
-        read.append(episode | dict(actions=_numbers(rows["action"], info["features"]["action"]["shape"])))
-    return read
+    videos = {name: _Video(folder, info, name) for name in names.values() if info["features"][name]["dtype"] == "video"}
+    episodes = []
+    for i in progress(range(info["total_episodes"] if num is None else num)):
+        entry = {name: entries[name][i].as_py() for name in entries.column_names if not name.startswith("stats/")}
+        rows = data.slice(entry["dataset_from_index"], entry["length"])
+        episode = {}
+        for key, name in names.items():
+            values = videos[name].frames(entry) if name in videos else _values(folder, info, name, rows)
+            episode[key] = np.concatenate([values, values[-1:]])
+        episodes.append(episode | dict(actions=_numbers(rows["action"], info["features"]["action"]["shape"])))
+    return episodes
 
 
 def _table(folder: Path, part: str) -> Any:
@@ -89,12 +125,11 @@ def _table(folder: Path, part: str) -> Any:
         raise DemonstrationError(f"{folder}/{part} cannot be read ({error}); the dataset is broken, export it again") from error
 
 
-def _feature(folder: Path, info: dict, name: str, rows: Any, meta: dict) -> np.ndarray:
+def _values(folder: Path, info: dict, name: str, rows: Any) -> np.ndarray:
+    """Values (T, ...) of a feature that is not a video."""
     feature = info["features"][name]
     if feature["dtype"] == "image":
-        return np.stack([_decoded(picture["bytes"], folder, name) for picture in rows[name].to_pylist()])
-    if feature["dtype"] == "video":
-        return _video(folder, info, name, meta)
+        return np.stack([_decoded(image["bytes"], folder, name) for image in rows[name].to_pylist()])
     return _numbers(rows[name], feature["shape"])
 
 
@@ -103,100 +138,149 @@ def _numbers(column: Any, shape: list[int]) -> np.ndarray:
 
 
 def _decoded(png: bytes, folder: Path, name: str) -> np.ndarray:
-    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise DemonstrationError(f"{folder}: a picture of {name} cannot be decoded; the dataset is broken, export it again")
-    return picture[..., ::-1]
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise DemonstrationError(f"{folder}: an image of {name} cannot be decoded; the dataset is broken, export it again")
+    return image[..., ::-1]
 
 
-def _video(folder: Path, info: dict, name: str, meta: dict) -> np.ndarray:
-    import imageio.v2 as imageio
+class _Video:
+    """A feature that is stored as video, with several episodes in a file; each file is decoded once, from its start on.
 
-    place = {part: meta[f"videos/{name}/{part}"] for part in ("chunk_index", "file_index", "from_timestamp")}
-    path = Path(folder) / info["video_path"].format(
-        video_key=name, chunk_index=place["chunk_index"], file_index=place["file_index"]
-    )
-    first = round(place["from_timestamp"] * info["fps"])
-    try:
-        with imageio.get_reader(path) as reader:
-            frames = [frame for k, frame in enumerate(reader) if first <= k < first + meta["length"]]
-        return np.stack(frames)
-    except (OSError, ValueError) as error:
-        raise DemonstrationError(f"{path} cannot be read as a video ({error}); export the dataset again") from error
+    Args:
+        folder: Folder of the dataset.
+        info: Content of meta/info.json.
+        name: Name of the feature.
+    """
+
+    def __init__(self, folder: Path, info: dict[str, Any], name: str):
+        self._folder, self._info, self._name = Path(folder), info, name
+        self._path: Path | None = None
+        self._next = 0
+        self._frames: Iterator[np.ndarray] = iter(())
+
+    def frames(self, entry: dict[str, Any]) -> np.ndarray:
+        """Frames uint8 (T, H, W, 3) of the episode that has this entry in meta/episodes.
+
+        Raises:
+            DemonstrationError: The video is missing or broken, or ends before the episode does.
+        """
+        place = {part: entry[f"videos/{self._name}/{part}"] for part in ("chunk_index", "file_index")}
+        path = self._folder / self._info["video_path"].format(video_key=self._name, **place)
+        first = round(entry[f"videos/{self._name}/from_timestamp"] * self._info["fps"])
+        if path != self._path or first < self._next:
+            self._path, self._next, self._frames = path, 0, _decode(path)
+        try:
+            frames = [next(self._frames) for _ in range(first + entry["length"] - self._next)]
+        except (OSError, ValueError, StopIteration) as error:
+            reason = "it ends too early" if isinstance(error, StopIteration) else error
+            raise DemonstrationError(f"{path} cannot be read as a video ({reason}); export the dataset again") from error
+        self._next = first + entry["length"]
+        return np.stack(frames[-entry["length"] :])
+
+
+def _decode(path: Path) -> Iterator[np.ndarray]:
+    """The frames of a video file, one after the other."""
+    with missing_extras_named():
+        import imageio.v2 as imageio
+    with closing(imageio.get_reader(path)) as reader:
+        yield from reader.iter_data()
 
 
 # -------------------------------------------------------------------- writing
 
-COUNTED = ("frame_index", "episode_index", "index", "task_index")
-QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-PER_CHUNK = 1000  # files
 
+def write_lerobot(path: Path, folder: Path, progress: Progress = iter) -> None:
+    """Write a trajectory file as a LeRobot dataset, with lossless images and one data file for each episode.
 
-def write_lerobot(path: Path, folder: Path, progress: Callable = iter) -> None:
-    """Write a trajectory file as a LeRobot dataset: pictures losslessly, a data file an episode.
+    Args:
+        path: Trajectory file.
+        folder: Folder of the dataset; it is made.
+        progress: Wraps the iteration over episodes, to show a progress bar.
 
     Raises:
-        DemonstrationError: the file is broken, or holds no observations.
-        ModuleNotFoundError: the extra is not installed.
+        DemonstrationError: The trajectory file is broken, or holds no observations.
+        MissingExtraError: pyarrow is not installed.
     """
     pa, pq = _pyarrow()
     task = read_header(path)["env_info"]["env_id"].rpartition(":")[2]
-    keys, start, features, index = observed(path), 0, {}, []
+    keys, features, entries, start = observation_keys(path), {}, [], 0
     for e, episode in enumerate(each_demonstration(path, keys, progress)):
-        length = len(episode["actions"])
-        frames = {feature_name(key): episode[key][:length] for key in keys} | dict(action=episode["actions"])
-        frame = np.arange(length)
-        frames["timestamp"] = (frame / FPS).astype(np.float32)
-        frames |= zip(COUNTED, (frame, np.full(length, e), start + frame, np.zeros(length, int)), strict=True)
-        features = features or {name: _described(values) for name, values in frames.items()}
-        place = dict(zip(("chunk_index", "file_index"), divmod(e, PER_CHUNK), strict=True))
+        values = _features_of(episode, keys, e, start)
+        features = features or {name: _described(array) for name, array in values.items()}
+        place = dict(chunk_index=e // FILES_PER_CHUNK, file_index=e % FILES_PER_CHUNK)
         file = folder / DATA.format(**place)
         file.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.table({name: _column(values) for name, values in frames.items()}), file)
-        index.append(
-            dict(episode_index=e, tasks=[task], length=length)
-            | {f"data/{name}": value for name, value in place.items()}
-            | dict(dataset_from_index=start, dataset_to_index=start + length)
-            | {f"stats/{name}/{what}": value for name, values in frames.items() for what, value in _statistics(values).items()}
-            | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
-        )
-        start += length
-    meta = folder / "meta"
-    (meta / "episodes/chunk-000").mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(index), meta / "episodes/chunk-000/file-000.parquet")
-    pq.write_table(_tasks(task), meta / "tasks.parquet")
-    write_json(meta / "stats.json", {name: _joined(name, index) for name in features})
-    info = dict(codebase_version="v3.0", robot_type="panda_gelsight", total_episodes=len(index), total_frames=start)
-    info |= dict(total_tasks=1, chunks_size=PER_CHUNK, data_files_size_in_mb=100, video_files_size_in_mb=200, fps=FPS)
-    info |= dict(splits=dict(train=f"0:{len(index)}"), data_path=DATA, video_path=None, features=features)
-    write_json(folder / INFO, info)  # last: a folder without it is no dataset
+        pq.write_table(pa.table({name: _column(array) for name, array in values.items()}), file)
+        entries.append(_entry(e, task, start, values, place))
+        start = entries[-1]["dataset_to_index"]
+    (folder / "meta/episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(entries), folder / "meta/episodes/chunk-000/file-000.parquet")
+    pq.write_table(_tasks(task), folder / "meta/tasks.parquet")
+    write_json(folder / "meta/stats.json", {name: joined_statistics(name, entries) for name in features})
+    write_json(folder / INFO, _info(features, len(entries), start))  # last: a folder without it is not a dataset
+
+
+def _features_of(episode: dict[str, np.ndarray], keys: list[str], number: int, start: int) -> dict[str, np.ndarray]:
+    """The features of an episode, (T, ...) by their names; `start` is the number of frames before it."""
+    length = len(episode["actions"])
+    frame = np.arange(length)
+    values = {feature_name(key): episode[key][:length] for key in keys} | dict(action=episode["actions"])
+    values["timestamp"] = (frame / FPS).astype(np.float32)
+    return values | dict(zip(COUNTERS, (frame, np.full(length, number), start + frame, np.zeros(length, int)), strict=True))
+
+
+def _entry(number: int, task: str, start: int, values: dict[str, np.ndarray], place: dict[str, int]) -> dict[str, Any]:
+    """An episode's entry in meta/episodes."""
+    length = len(values["action"])
+    return (
+        dict(episode_index=number, tasks=[task], length=length)
+        | {f"data/{name}": value for name, value in place.items()}
+        | dict(dataset_from_index=start, dataset_to_index=start + length)
+        | {f"stats/{name}/{what}": value for name, v in values.items() for what, value in episode_statistics(v).items()}
+        | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+    )
+
+
+def _info(features: dict[str, Any], num_episodes: int, num_frames: int) -> dict[str, Any]:
+    """The content of meta/info.json."""
+    return dict(
+        codebase_version="v3.0",
+        robot_type="panda_gelsight",
+        total_episodes=num_episodes,
+        total_frames=num_frames,
+        total_tasks=1,
+        chunks_size=FILES_PER_CHUNK,
+        data_files_size_in_mb=DATA_FILE_MB,
+        video_files_size_in_mb=VIDEO_FILE_MB,
+        fps=FPS,
+        splits=dict(train=f"0:{num_episodes}"),
+        data_path=DATA,
+        video_path=None,
+        features=features,
+    )
 
 
 def _pyarrow() -> tuple[Any, Any]:
-    try:
+    with missing_extras_named():
         import pyarrow
         import pyarrow.parquet
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"{error}; LeRobot datasets need `pip install manifeel_ms3[lerobot]`") from error
     return pyarrow, pyarrow.parquet
 
 
-def _is_picture(values: np.ndarray) -> bool:
-    return values.dtype == np.uint8
-
-
 def _described(values: np.ndarray) -> dict[str, Any]:
-    """A feature's entry in info.json."""
-    if _is_picture(values):
+    """A feature's entry in meta/info.json."""
+    if values.dtype == np.uint8:
         return dict(dtype="image", shape=list(values.shape[1:]), names=["height", "width", "channels"])
     return dict(dtype=str(values.dtype), shape=list(values.shape[1:] or (1,)), names=None)
 
 
 def _column(values: np.ndarray) -> Any:
+    """A feature as a column of a table: images as PNG, arrays as nested lists."""
     pa, _ = _pyarrow()
-    if _is_picture(values):
-        pictures = [dict(bytes=cv2.imencode(".png", picture[..., ::-1])[1].tobytes(), path=None) for picture in values]
-        return pa.array(pictures, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
+    if values.dtype == np.uint8:
+        images = [dict(bytes=cv2.imencode(".png", image[..., ::-1])[1].tobytes(), path=None) for image in values]
+        return pa.array(images, pa.struct([("bytes", pa.binary()), ("path", pa.string())]))
     kind = pa.from_numpy_dtype(values.dtype)
     if values.ndim == 2:
         kind = pa.list_(kind, values.shape[1])
@@ -205,36 +289,14 @@ def _column(values: np.ndarray) -> Any:
     return pa.array(values.tolist(), kind)
 
 
-def _statistics(values: np.ndarray) -> dict[str, list]:
-    """As lerobot has them: of pictures by channel in [0, 1], (3, 1, 1); of arrays by their last axis."""
-    count = [len(values)]
-    flat = values.reshape(-1, values.shape[-1] if values.ndim > 1 else 1).astype(float) / (255 if _is_picture(values) else 1)
-    found = dict(min=flat.min(0), max=flat.max(0), mean=flat.mean(0), std=flat.std(0))
-    found |= {name: np.quantile(flat, q, axis=0) for name, q in QUANTILES.items()}
-    shape = (-1, 1, 1) if _is_picture(values) else (-1,)
-    return {name: value.reshape(shape).tolist() for name, value in found.items()} | dict(count=count)
-
-
-def _joined(name: str, index: list[dict[str, Any]]) -> dict[str, list]:
-    """Statistics of all episodes from those of each; quantiles as their weighted means, as lerobot does."""
-    of = {what: np.array([row[f"stats/{name}/{what}"] for row in index]) for what in ("min", "max", "mean", "std", *QUANTILES)}
-    weight = np.array([row["length"] for row in index], float)
-    weight /= weight.sum()
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.tensordot(weight, values, 1)
-
-    found = dict(min=of["min"].min(0), max=of["max"].max(0), mean=mean(of["mean"]))
-    found["std"] = np.sqrt(np.maximum(mean(of["std"] ** 2 + of["mean"] ** 2) - found["mean"] ** 2, 0))
-    found |= {what: mean(of[what]) for what in QUANTILES}
-    return {what: value.tolist() for what, value in found.items()} | dict(count=[sum(row["length"] for row in index)])
-
-
 def _tasks(task: str) -> Any:
-    """meta/tasks.parquet: a pandas table whose index is the task's name."""
+    """The content of meta/tasks.parquet: a pandas table whose index is the name of the task."""
     pa, _ = _pyarrow()
     column = dict(name="task_index", field_name="task_index", pandas_type="int64", numpy_type="int64", metadata=None)
     name = "__index_level_0__"
     index = dict(name=None, field_name=name, pandas_type="unicode", numpy_type="object", metadata=None)
     described = dict(index_columns=[name], column_indexes=[], columns=[column, index], pandas_version="2.0.0")
     return pa.table({"task_index": [0], name: [task]}).replace_schema_metadata({"pandas": json.dumps(described)})
+
+
+LEROBOT = DemonstrationFormat("lerobot", is_lerobot, count_episodes, read_lerobot, write_lerobot)

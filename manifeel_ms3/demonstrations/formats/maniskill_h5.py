@@ -1,8 +1,8 @@
-"""Demonstration files: ManiSkill's trajectory h5 + json, written so that a killed run loses nothing that was finished.
+"""Trajectory files: ManiSkill's h5 with a json beside it, written so that a killed run loses nothing that was finished.
 
 While a recording runs, every finished episode is a file of its own in `<name>.episodes/`, and `<name>.h5` is a small index of
-links into them, replaced as a whole after each episode. It opens at any time like the finished file, into which
-`consolidate` turns it at the end.
+links to them that is replaced as a whole after each episode. The index can be read at any time like the finished file, into
+which `consolidate` turns it at the end.
 """
 
 import json
@@ -14,15 +14,18 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import jsonschema
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import atomic_write, read_json, write_json
 
-COMPRESSION_LEVEL = 4  # gzip; lossless
+from .demonstration_format import DemonstrationFormat, Progress
 
-
-HEADER = {  # what is read of a trajectory's json, as a json schema
+COMPRESSION_LEVEL = 4
+"""Level of gzip, which is lossless; 4 is h5py's default."""
+IMAGE_NDIM = 4
+"""Axes of an array over time of images or force fields: (T, H, W, channels)."""
+HEADER = {
     "type": "object",
     "required": ["env_info", "episodes"],
     "properties": {
@@ -41,63 +44,59 @@ HEADER = {  # what is read of a trajectory's json, as a json schema
         },
         "failed_seeds": {"type": "array"},
         "versions": {"type": "object"},
+        "revision": {"type": "integer"},
     },
 }
+"""Json schema of the fields that are read from the json beside a trajectory file."""
 
 
 class DemonstrationError(InvalidFileError):
-    """A demonstration file that cannot be used as asked."""
+    """A file or folder of demonstrations cannot be used as asked."""
 
 
 @dataclass
 class Episode:
-    """One episode: `arrays` in ManiSkill's tree (actions (T, A), obs/... and env_states/... (T + 1, ...), success (T,), ...),
-    `info` its entry in the json."""
+    """One recorded episode."""
 
     seed: int
+    """Seed of the reset."""
     arrays: dict[str, Any]
+    """Arrays in ManiSkill's tree: actions (T, A), obs/... and env_states/... (T + 1, ...), success (T,), and so on."""
     info: dict[str, Any] = field(default_factory=dict)
+    """The episode's entry in the json."""
 
 
 # -------------------------------------------------------------------- writing
 
 
 def episode_folder(path: Path) -> Path:
+    """Folder in which the episodes of a trajectory file are kept while it is recorded."""
     return path.with_suffix(".episodes")
 
 
 def write_episode(path: Path, episode: Episode) -> None:
     """Write one finished episode beside the trajectory file `path`; it appears whole or not at all."""
     folder = episode_folder(path)
-    folder.mkdir(parents=True, exist_ok=True)
     name = f"seed_{episode.seed:08d}"
-    partial = folder / f"{name}.h5.partial"
-    with h5py.File(partial, "w") as file:
+    with atomic_write(folder / f"{name}.h5") as partial, h5py.File(partial, "w") as file:
         _write_tree(file.create_group("traj_0", track_order=True), episode.arrays)
-    partial.replace(folder / f"{name}.h5")
-    write_json(folder / f"{name}.json", episode.info | dict(episode_seed=episode.seed))  # last: it says the rest is there
+    # written last, because an episode counts as finished once its json exists
+    write_json(folder / f"{name}.json", episode.info | dict(episode_seed=episode.seed))
 
 
 def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
     for name, value in tree.items():
         if isinstance(value, dict):
             _write_tree(group.create_group(name, track_order=True), value)
-        elif value.ndim > 1 and len(value):  # a frame is a chunk: any step can be read alone
-            chunks = (1, *value.shape[1:]) if value.ndim > 3 else None
+        elif value.ndim > 1 and len(value):
+            chunks = (1, *value.shape[1:]) if value.ndim >= IMAGE_NDIM else None  # one chunk a step, which can be read alone
             group.create_dataset(name, data=value, chunks=chunks, compression="gzip", compression_opts=COMPRESSION_LEVEL)
         else:
             group.create_dataset(name, data=value)
 
 
-def write_json(path: Path, content: Any) -> None:
-    """Write a json file that appears whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content, indent=2))
-    partial.replace(path)
-
-
 def finished_episodes(path: Path) -> dict[int, dict[str, Any]]:
-    """Infos of the episodes in `path`, or finished beside it, by seed in rising order."""
+    """Json entries of the episodes in `path`, or finished beside it, by seed in rising order."""
     if episode_folder(path).is_dir():
         infos = [json.loads(file.read_text()) for file in sorted(episode_folder(path).glob("seed_*.json"))]
     else:
@@ -106,29 +105,33 @@ def finished_episodes(path: Path) -> dict[int, dict[str, Any]]:
 
 
 def write_index(path: Path, header: dict[str, Any], infos: dict[int, dict[str, Any]]) -> None:
-    """Replace `path` and its json by an index of links to the episodes `infos` (by seed), in that order."""
+    """Replace a trajectory file by an index of links to finished episodes, and its json accordingly.
+
+    Args:
+        path: The trajectory file.
+        header: The json but for its episodes.
+        infos: Json entries of the episodes by seed, in the order that they shall have.
+    """
     folder = episode_folder(path)
-    partial = path.with_name(path.name + ".partial")
-    with h5py.File(partial, "w") as index:
+    with atomic_write(path) as partial, h5py.File(partial, "w") as index:
         for i, seed in enumerate(infos):
             index[f"traj_{i}"] = h5py.ExternalLink(f"{folder.name}/seed_{seed:08d}.h5", "traj_0")
-    partial.replace(path)
     write_json(path.with_suffix(".json"), header | dict(episodes=_numbered(infos)))
 
 
 def consolidate(path: Path) -> None:
-    """Turn an index and its episodes into one file; the episodes' folder goes."""
-    partial = path.with_name(path.name + ".partial")
-    with h5py.File(path, "r") as index, h5py.File(partial, "w") as whole:
+    """Turn an index and its episodes into one file, and remove the folder of episodes."""
+    with atomic_write(path) as partial, h5py.File(path, "r") as index, h5py.File(partial, "w") as whole:
         for i in range(len(index)):
             index.copy(index[f"traj_{i}"], whole, f"traj_{i}")
-    partial.replace(path)
     shutil.rmtree(episode_folder(path), ignore_errors=True)
 
 
-def split(path: Path) -> None:
-    """Turn a whole file back into an index and its episodes, so that more can be recorded."""
+def open_for_more(path: Path) -> None:
+    """Prepare a trajectory file for further episodes: where it is whole, put its episodes back into files of their own."""
     folder = episode_folder(path)
+    if folder.is_dir() or not path.is_file():
+        return
     draft = folder.with_name(folder.name + ".partial")
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir()
@@ -152,7 +155,7 @@ def read_header(path: Path) -> dict[str, Any]:
     """The json beside a trajectory file.
 
     Raises:
-        DemonstrationError: the file or its json is missing, or the json is broken.
+        DemonstrationError: The file or its json is missing, or the json is broken.
     """
     path = Path(path)
     for needed in (path, path.with_suffix(".json")):
@@ -160,30 +163,20 @@ def read_header(path: Path) -> dict[str, Any]:
             raise DemonstrationError(
                 f"demonstration file {needed} does not exist; record one with `python -m manifeel_ms3.demonstrations.record`"
             )
-    return read_json(path.with_suffix(".json"), HEADER, "a trajectory's json")
-
-
-def read_json(path: Path, schema: dict[str, Any], kind: str) -> dict[str, Any]:
-    """A json file of the form that `schema` asks for.
-
-    Raises:
-        DemonstrationError: it is not json, or of another form.
-    """
     try:
-        content = json.loads(path.read_text())
-        jsonschema.validate(content, schema)
-    except (ValueError, jsonschema.ValidationError) as error:
-        reason = f"{error.json_path}: {error.message[:200]}" if isinstance(error, jsonschema.ValidationError) else error
-        raise DemonstrationError(f"{path} is not {kind} ({reason}); copy or record it again") from error
-    return content
+        return read_json(path.with_suffix(".json"), HEADER, "a trajectory's json")
+    except InvalidFileError as error:
+        raise DemonstrationError(str(error)) from error
 
 
 @contextmanager
-def open_trajectories(path: Path) -> Iterator[h5py.File]:
+def open_trajectories(path: Path) -> Iterator[Any]:
     """Open a trajectory file, to read from it within the context.
 
+    The h5py.File is typed as Any, because h5py's types cannot tell groups from data sets.
+
     Raises:
-        DemonstrationError: it is truncated, not HDF5, or lacks what is read.
+        DemonstrationError: The file is truncated, is not HDF5, or lacks what is read.
     """
     try:
         with h5py.File(path, "r") as file:
@@ -194,18 +187,25 @@ def open_trajectories(path: Path) -> Iterator[h5py.File]:
         ) from error
 
 
+def count_episodes(path: Path) -> int:
+    """Number of episodes in a trajectory file."""
+    return len(read_header(path)["episodes"])
+
+
 def read_demonstrations(
-    path: Path, keys: list[str], env_id: str | None = None, num: int | None = None, progress=iter
+    path: Path, keys: list[str], env_id: str | None = None, num: int | None = None, progress: Progress = iter
 ) -> list[dict[str, np.ndarray]]:
-    """Arrays of every episode (or the first `num`) of a file: `actions` (T, A) and the observations `keys` (T + 1, ...).
+    """Arrays of the first episodes of a trajectory file: `actions` (T, A) and the observations `keys` (T + 1, ...).
 
     Args:
-        keys: such as "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose".
-        env_id: the task that the file must be of, if given.
-        progress: wraps the iteration over episodes, to show a bar.
+        path: Trajectory file.
+        keys: Observations, such as "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose".
+        env_id: Id of the task that the file must be of; any task if not given.
+        num: Number of episodes; all of them if not given.
+        progress: Wraps the iteration over episodes, to show a progress bar.
 
     Raises:
-        DemonstrationError: missing, truncated, of another task, with too few episodes, or without what `keys` ask for.
+        DemonstrationError: The file is missing, truncated or of another task, has fewer episodes, or lacks one of the keys.
     """
     path = Path(path)
     header = read_header(path)
@@ -221,33 +221,34 @@ def read_demonstrations(
         return [_read_episode(file, i, keys, path, header) for i in progress(range(count))]
 
 
-def each_demonstration(path: Path, keys: list[str], progress=iter) -> Iterator[dict[str, np.ndarray]]:
-    """What `read_demonstrations` reads, an episode at a time."""
+def each_demonstration(path: Path, keys: list[str], progress: Progress = iter) -> Iterator[dict[str, np.ndarray]]:
+    """All episodes that `read_demonstrations` reads, one at a time, so that one of them is in memory."""
     header = read_header(path)
     with open_trajectories(path) as file:
         for i in progress(range(len(header["episodes"]))):
             yield _read_episode(file, i, keys, path, header)
 
 
-def observed(path: Path) -> list[str]:
-    """What a file's episodes hold that policies see: pictures, force fields, the tool's pose.
+def observation_keys(path: Path) -> list[str]:
+    """Keys of a file's observations that policies use: images, force fields, and the pose of the tool.
 
     Raises:
-        DemonstrationError: nothing of it.
+        DemonstrationError: The file holds states and actions alone.
     """
     with open_trajectories(path) as file:
-        sensors: Any = file.get("traj_0/obs/sensor_data", {})
+        sensors = file.get("traj_0/obs/sensor_data", {})
         keys = [
-            f"sensor_data/{sensor}/{what}" for sensor in sensors for what in ("rgb", "force_field") if what in sensors[sensor]
+            f"sensor_data/{sensor}/{kind}" for sensor in sensors for kind in ("rgb", "force_field") if kind in sensors[sensor]
         ]
         if "traj_0/obs/extra/tcp_pose" not in file:
             raise DemonstrationError(
-                f"{path} holds states and actions alone; `python -m manifeel_ms3.demonstrations.render_observations` adds observations"
+                f"{path} holds states and actions alone; "
+                "`python -m manifeel_ms3.demonstrations.render_observations` adds observations"
             )
     return [*keys, "extra/tcp_pose"]
 
 
-def _read_episode(file: h5py.File, i: int, keys: list[str], path: Path, header: dict) -> dict[str, np.ndarray]:
+def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> dict[str, np.ndarray]:
     group = file[f"traj_{i}"]
     missing = [key for key in keys if f"obs/{key}" not in group]
     if missing:
@@ -257,3 +258,8 @@ def _read_episode(file: h5py.File, i: int, keys: list[str], path: Path, header: 
             "tactile_sensors that include them"
         )
     return dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
+
+
+MANISKILL_H5 = DemonstrationFormat(
+    "maniskill", matches=lambda path: not Path(path).is_dir(), count=count_episodes, read=read_demonstrations
+)

@@ -1,0 +1,51 @@
+"""What the pack needs of a format in which demonstrations are stored."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+Episode = dict[str, np.ndarray]
+"""Arrays of one episode: "actions" (T, A), and observations (T + 1, ...) by their keys, such as "sensor_data/wrist/rgb"."""
+Progress = Callable[[Any], Iterable[int]]
+"""Wraps a sequence of episode numbers to show a progress bar; `iter` shows none."""
+
+
+class ReadEpisodes(Protocol):
+    """Reads episodes."""
+
+    def __call__(
+        self, path: Path, keys: list[str], /, *, num: int | None = None, progress: Progress = iter, env_id: str | None = None
+    ) -> list[Episode]:
+        """The first episodes of a file or folder.
+
+        Args:
+            path: File or folder.
+            keys: Observations to read, such as "sensor_data/wrist/rgb", "extra/tcp_pose".
+            num: Number of episodes; all of them if not given.
+            progress: Wraps the iteration over episodes.
+            env_id: Id of the task that the episodes must be of. Formats that do not hold the task ignore it.
+
+        Raises:
+            DemonstrationError: The data is missing or broken, lacks one of the keys, has fewer episodes or another task.
+            MissingExtraError: The library that reads the format is not installed.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class DemonstrationFormat:
+    """One format of demonstrations."""
+
+    name: str
+    """Name on the command line, such as "lerobot"."""
+    matches: Callable[[Path], bool]
+    """Tells whether a file or folder is of this format, from the names of the files in it."""
+    count: Callable[[Path], int]
+    """Number of episodes in a file or folder."""
+    read: ReadEpisodes
+    """Reads episodes."""
+    write: Callable[[Path, Path, Progress], None] | None = None
+    """Writes the episodes of a trajectory file (first path) into a new folder (second path); None where only recording does."""

@@ -1,0 +1,138 @@
+"""Worker processes: each makes one state, such as an environment, and applies functions to it and to tasks.
+
+with WorkerPool(2, partial(gym.make, "ManiFeel-PegInsertion-v1")) as pool:
+    for seed in range(10):
+        pool.submit(run_seed, seed)  # calls run_seed(env, seed) in one of the processes
+    for finished in pool.as_finished():
+        print(finished.task, finished.result())
+"""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from functools import cached_property
+from multiprocessing import get_context
+from typing import Any, Generic, TypeVar
+
+import torch
+from pebble import ProcessExpired, ProcessPool
+
+from .errors import InvalidArgumentError, WorkFailedError
+
+State = TypeVar("State")
+Task = TypeVar("Task")
+
+
+class WorkerDiedError(WorkFailedError):
+    """A worker process ended while it worked on a task: it was killed or crashed.
+
+    Args:
+        task: The task that it worked on.
+        exit_code: Exit code of the process; minus the number of the signal that ended it.
+    """
+
+    def __init__(self, task: Any, exit_code: int | None):
+        super().__init__(
+            f"the process that worked on {task!r} ended with exit code {exit_code}: it crashed, or was killed, as happens "
+            "where memory runs out; run the command again, perhaps with fewer --workers"
+        )
+        self.exit_code = exit_code
+
+
+@dataclass(frozen=True)
+class Finished(Generic[Task]):
+    """A task that is over, well or badly."""
+
+    task: Task
+    """The task, as it was submitted."""
+    future: "Future[Any]"
+    """What holds its result."""
+
+    def result(self) -> Any:
+        """What the function returned; what it raised is raised here.
+
+        Raises:
+            WorkerDiedError: The process ended before the function returned.
+        """
+        try:
+            return self.future.result()
+        except ProcessExpired as error:
+            raise WorkerDiedError(self.task, error.exitcode) from error
+
+
+class WorkerPool(Generic[State, Task]):
+    """Processes that share tasks; a process that dies fails its task and is replaced.
+
+    Processes are spawned, because a forked renderer does not work, and use one thread each for torch, because they share the
+    cores and because sums then do not depend on the number of threads. Where the context is left by an exception, tasks that
+    wait are cancelled and those that run are ended.
+
+    Args:
+        workers: Number of worker processes.
+        make_state: Makes the state of one process. It is called with the process's first task, so that what it raises is
+            raised by `Finished.result`. It must be picklable.
+
+    Raises:
+        InvalidArgumentError: `workers` is less than 1.
+    """
+
+    def __init__(self, workers: int, make_state: Callable[[], State]):
+        if workers < 1:
+            raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
+        worker = _Worker(make_state)
+        self._pool = ProcessPool(workers, context=get_context("spawn"), initializer=_start, initargs=(worker,))
+        self._running: dict[Future[Any], Task] = {}
+
+    def __enter__(self) -> "WorkerPool[State, Task]":
+        return self
+
+    def __exit__(self, failure: type[BaseException] | None, *_: object) -> None:
+        if failure is None and not self._running:
+            self._pool.close()
+        else:
+            self._pool.stop()
+        self._pool.join()
+
+    @property
+    def num_running(self) -> int:
+        """Number of tasks that were submitted and have not been returned by `as_finished`."""
+        return len(self._running)
+
+    def submit(self, function: Callable[[State, Task], Any], task: Task) -> None:
+        """Call `function(state, task)` in the next process that is free; both must be picklable."""
+        self._running[self._pool.schedule(_run, args=(function, task))] = task
+
+    def as_finished(self) -> Iterator[Finished[Task]]:
+        """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile."""
+        while self._running:
+            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+                yield Finished(self._running.pop(future), future)
+
+
+# -------------------------------------------------------------------- in the worker processes
+
+
+@dataclass
+class _Worker:
+    """All that a worker process keeps from one task to the next."""
+
+    make_state: Callable[[], Any]
+
+    @cached_property
+    def state(self) -> Any:
+        return self.make_state()
+
+
+_this_worker: _Worker | None = None
+"""The worker of this process; None in a process that is not one. A process has no other place to keep a state."""
+
+
+def _start(worker: _Worker) -> None:
+    global _this_worker
+    torch.set_num_threads(1)
+    _this_worker = worker
+
+
+def _run(function: Callable[[Any, Any], Any], task: Any) -> Any:
+    assert _this_worker is not None
+    return function(_this_worker.state, task)

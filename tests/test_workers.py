@@ -1,0 +1,89 @@
+"""One process pool: results as they finish, a state per process, and tasks whose process dies."""
+
+import os
+import signal
+import time
+from functools import partial
+
+import pytest
+
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.workers import WorkerDiedError, WorkerPool
+
+
+def counter(start: int) -> list[int]:
+    return [start]
+
+
+def add(state: list[int], number: int) -> tuple[int, int]:
+    """The process that worked, and the sum of what it was given so far."""
+    state[0] += number
+    return os.getpid(), state[0]
+
+
+def end(state: list[int], number: int) -> int:
+    if number == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def raise_error(state: list[int], number: int) -> None:
+    raise KeyError(number)
+
+
+def sleep(state: list[int], number: int) -> None:
+    time.sleep(number)
+
+
+def broken_state() -> None:
+    raise InvalidArgumentError("no such environment")
+
+
+def test_a_process_keeps_its_state_and_more_tasks_may_follow():
+    with WorkerPool(1, partial(counter, 10)) as pool:
+        pool.submit(add, 1)
+        results = []
+        for finished in pool.as_finished():
+            results.append(finished.result()[1])
+            if finished.task < 3:
+                pool.submit(add, finished.task + 1)
+        assert results == [11, 13, 16]
+        assert pool.num_running == 0
+
+
+def test_a_process_that_dies_fails_its_task_alone():
+    with WorkerPool(1, partial(counter, 0)) as pool:
+        for number in range(3):
+            pool.submit(end, number)
+        by_task = {finished.task: finished for finished in pool.as_finished()}
+    assert [by_task[number].result() for number in (0, 2)] == [0, 2]
+    with pytest.raises(WorkerDiedError, match="worked on 1") as raised:
+        by_task[1].result()
+    assert raised.value.exit_code == -signal.SIGKILL
+
+
+def test_errors_of_a_task_and_of_the_state_are_raised_in_the_caller():
+    for make_state, error in ((partial(counter, 0), KeyError), (broken_state, InvalidArgumentError)):
+        with WorkerPool(1, make_state) as pool:
+            pool.submit(raise_error, 5)
+            (finished,) = pool.as_finished()
+            with pytest.raises(error):
+                finished.result()
+
+
+def test_an_exception_ends_tasks_that_run_and_wait():
+    def fail() -> None:
+        with WorkerPool(1, partial(counter, 0)) as pool:
+            for _ in range(3):
+                pool.submit(sleep, 100)
+            raise ZeroDivisionError
+
+    before = time.monotonic()
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert time.monotonic() - before < 50
+
+
+def test_no_workers_are_refused():
+    with pytest.raises(InvalidArgumentError, match="at least 1"):
+        WorkerPool(0, partial(counter, 0))
