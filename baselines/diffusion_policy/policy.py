@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
@@ -14,21 +14,22 @@ from baselines.common.policy import PolicyConfig, VisuotactilePolicy
 
 @dataclass
 class DiffusionConfig(PolicyConfig):
-    """Defaults: the paper's."""
+    """Settings of the Diffusion Policy; the defaults are the paper's."""
 
     diffusion_steps: int = 100
+    """Number of diffusion steps in training."""
     prediction: Literal["epsilon", "sample"] = "epsilon"
-    """what the network predicts: the noise (the paper's), or the clean actions, which short trainings learn far sooner"""
+    """Output of the network: the noise, as in the paper, or the clean actions, which a short training learns far sooner."""
     sampler: Literal["ddpm", "ddim"] = "ddpm"
-    """with all steps; with fewer it is always DDIM (Song et al. 2021)"""
+    """Sampler if generation takes all diffusion steps; with fewer it is always DDIM (Song et al. 2021)."""
 
 
 class DiffusionPolicy(VisuotactilePolicy):
-    """Denoises an action sequence."""
+    """Diffusion Policy (Chi et al. 2023), the CNN version: denoises an action sequence."""
 
     name = "diffusion_policy"
     Config = DiffusionConfig
-    config: DiffusionConfig
+    config: DiffusionConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
         super().__init__(config, spec, action_dim)
@@ -41,7 +42,7 @@ class DiffusionPolicy(VisuotactilePolicy):
         self.ddpm, self.ddim = DDPMScheduler(**schedule), DDIMScheduler(**schedule)
 
     def generation_loss(self, clean, condition):
-        """Mean squared error of the predicted noise, or clean actions."""
+        """The mean squared error of the predicted noise or clean actions."""
         noise = torch.randn_like(clean)
         step = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
         predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
