@@ -31,7 +31,7 @@ def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy])
         ) from error
 
 
-def _from_json(cls: Any, value: Any) -> Any:
+def _from_json(cls: type, value: Any) -> Any:
     """A dataclass, and the dataclasses that it contains, from the dict that `as_json` made."""
     if is_dataclass(cls):
         types = typing.get_type_hints(cls)

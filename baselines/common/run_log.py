@@ -1,6 +1,7 @@
 """The log of a training run: log.jsonl, tensorboard events, and Weights & Biases."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ class RunLog:
         self._board = SummaryWriter(str(folder))
         self._lines = (folder / "log.jsonl").open("a" if resume else "w")
 
-    def write(self, entry: dict[str, float]) -> None:
+    def write(self, entry: Mapping[str, float]) -> None:
         """Write an entry: values by name, "step" among them."""
         self._lines.write(json.dumps(entry) + "\n")
         self._lines.flush()
@@ -50,11 +51,12 @@ class RunLog:
 
 def _start_wandb(project: str, config: dict[str, Any], folder: Path) -> Any:
     import wandb
+    from wandb.errors import CommError, UsageError
 
     try:
         settings = wandb.Settings(init_timeout=WANDB_TIMEOUT)
         return wandb.init(project=project, config=config, dir=str(folder), settings=settings)
-    except (wandb.errors.CommError, wandb.errors.UsageError) as error:
+    except (CommError, UsageError) as error:
         raise ServerError(
             f"Weights & Biases does not accept the run ({error}); log in with `wandb login`, write it to disk with "
             "WANDB_MODE=offline, or leave out --wandb-project"

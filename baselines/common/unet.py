@@ -34,7 +34,8 @@ class SequenceConv(nn.Conv1d):
     """
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        windows = F.pad(x, 2 * self.padding).unfold(2, *self.kernel_size, *self.stride)  # (B, C, T, kernel)
+        padded = F.pad(x, 2 * self.padding)  # pyright: ignore[reportArgumentType] (padding is never a string here)
+        windows = padded.unfold(2, *self.kernel_size, *self.stride)  # (B, C, T, kernel_size)
         return F.linear(windows.movedim(1, 2).flatten(2), self.weight.flatten(1), self.bias).movedim(1, 2)
 
 

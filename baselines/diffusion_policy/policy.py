@@ -1,7 +1,7 @@
 """Diffusion Policy (Chi et al. 2023, "Diffusion Policy: Visuomotor Policy Learning via Action Diffusion"), CNN version."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
@@ -33,7 +33,7 @@ class DiffusionPolicy(VisuotactilePolicy):
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
         super().__init__(config, spec, action_dim)
-        schedule = dict(
+        schedule: dict[str, Any] = dict(
             num_train_timesteps=config.diffusion_steps,
             beta_schedule="squaredcos_cap_v2",
             prediction_type=config.prediction,
@@ -44,14 +44,14 @@ class DiffusionPolicy(VisuotactilePolicy):
     def generation_loss(self, clean, condition):
         """The mean squared error of the predicted noise or clean actions."""
         noise = torch.randn_like(clean)
-        step = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
+        step: Any = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
         predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
         return F.mse_loss(predicted, noise if self.config.prediction == "epsilon" else clean)
 
     def generate(self, condition, steps, generator):
         actions = self.noise(condition, generator)
         full = self.config.sampler == "ddpm" and steps >= self.config.diffusion_steps
-        scheduler = self.ddpm if full else self.ddim
+        scheduler: Any = self.ddpm if full else self.ddim
         scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
         for step in scheduler.timesteps:
             predicted = self.unet(actions, step.expand(len(actions)), condition)

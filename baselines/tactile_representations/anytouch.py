@@ -3,6 +3,8 @@
 CLIP's ViT-L/14 with additional tokens that name the sensor; an image enters as a video of three equal frames. 305 M parameters.
 """
 
+from typing import Any
+
 import torch
 import torch.nn as nn
 from transformers import CLIPVisionConfig, CLIPVisionModel
@@ -31,7 +33,7 @@ class AnyTouch(TokenRepresentation):
         self.width, self.out_features = config.hidden_size, config.projection_dim
         self.sensor_token = nn.Parameter(torch.zeros(SENSORS, SENSOR_TOKENS, self.width))
         clip = CLIPVisionModel(config)
-        self.touch_model = getattr(clip, "vision_model", clip)  # transformers 4 wraps it
+        self.touch_model: Any = getattr(clip, "vision_model", clip)  # transformers 4 wraps it
         frames = (FRAMES, self.patch, self.patch)
         self.touch_model.embeddings.patch_embedding = nn.Conv3d(3, self.width, frames, frames, bias=False)
         self.touch_projection = nn.Linear(self.width, self.out_features, bias=False)

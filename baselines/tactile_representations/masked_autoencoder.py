@@ -45,7 +45,7 @@ class MaskedAutoencoder(nn.Module):
         hidden = order[:, kept.shape[1] :]
         return F.mse_loss(_pick(predicted, hidden), _pick(target, hidden))
 
-    def _decoded(self, seen: torch.Tensor, kept: torch.Tensor, patches: torch.Tensor) -> torch.Tensor:
+    def _decoded(self, seen: torch.Tensor, kept: torch.Tensor, patches: int) -> torch.Tensor:
         filled = self.mask_token.to(seen.dtype).expand(len(seen), patches, -1)
         narrow = self.narrow(seen)
         filled = filled.scatter(1, kept[..., None].expand_as(narrow), narrow)
