@@ -1,6 +1,6 @@
 """Speed of the training loop beside a plain one: `python benchmarks/train_speed.py`.
 
-The plain loop is the usual first version: a DataLoader that makes one sample at a time, fp32, eager, the library's convolutions.
+The plain loop is a usual first version: a DataLoader that makes one sample at a time, fp32, eager, library convolutions.
 Both train the same Diffusion Policy with the paper's sizes on the same images, with two image encoders (camera and TacRGB).
 """
 

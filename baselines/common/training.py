@@ -290,7 +290,7 @@ class RecentLosses:
             first = int(wrong[0])
             raise TrainingError(
                 f"the loss of step {step - len(batches) + 1 + first} is {float(losses[first])}, on {names(batches[first])}; "
-                "look at these demonstrations, lower --lr, or train with --precision fp32. The saved checkpoints are from before"
+                "look at these demonstrations, lower --lr, or train with --precision fp32. Saved checkpoints are from before"
             )
         self._batches = []
         return float(losses.mean())
