@@ -1,10 +1,11 @@
-"""Two policies that learnt nothing from what they see; what learns must beat them.
+"""Two policies that ignore what they observe; a trained policy must do better than both.
 
-    python -m manifeel_ms3.evaluation.evaluate --policy baselines.references:MeanAction \\
-        --policy-kwargs '{"demos": "trajectory.h5"}' --env-id ManiFeel-PegInsertion-v1 --obs-mode none
-    python -m manifeel_ms3.evaluation.evaluate --policy baselines.references:Untrained \\
-        --policy-kwargs '{"checkpoint": "runs/diffusion_policy/checkpoints/last"}' --env-id ManiFeel-PegInsertion-v1 \\
-        --obs-mode rgb+tacff
+Evaluate them with `manifeel eval`:
+
+    --policy baselines.references:MeanAction --policy-kwargs '{"demos": "trajectory.h5"}'
+    --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/diffusion_policy/checkpoints/last"}'
+
+and with `--env-id` and `--obs-mode`, because neither has a checkpoint that says them.
 """
 
 from pathlib import Path
@@ -21,20 +22,29 @@ from .registry import policy_spec
 
 
 class MeanAction:
-    """Behaviour cloning that sees nothing: the mean action of all steps of the demonstrations, always."""
+    """Behaviour cloning without observations: the action is always the mean over all steps of the demonstrations.
+
+    Args:
+        demos: Trajectory file.
+    """
 
     def __init__(self, demos: str):
         self.action = np.concatenate([episode["actions"] for episode in read_demonstrations(Path(demos), [])]).mean(0)
 
     def reset(self) -> None:
-        pass
+        """Do nothing: there is no state."""
 
     def act(self, _obs: dict[str, Any]) -> np.ndarray:
+        """The mean action (A,)."""
         return self.action
 
 
 class Untrained(PolicyAgent):
-    """A checkpoint's network as it was before training; scales of observations and actions are the data's."""
+    """A checkpoint's network with its weights before training, and with the normalisation of its demonstrations.
+
+    Args:
+        checkpoint: Folder of the checkpoint.
+    """
 
     def __init__(self, checkpoint: str):
         policy_class = policy_spec(checkpoint_config(Path(checkpoint))["policy_name"]).policy_class

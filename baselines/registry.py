@@ -13,9 +13,11 @@ import tyro
 from manifeel_ms3 import plugins
 from manifeel_ms3.errors import PluginError, UnknownNameError
 
+from . import tactile_representations as tactile_representations  # registers its encoders for every policy
 from .common.agent import PolicyAgent
 from .common.policy import VisuotactilePolicy
-from .common.training import TrainArgs, train
+from .common.train_args import TrainArgs
+from .common.training import train
 
 
 @dataclass(frozen=True)
@@ -56,15 +58,33 @@ def all_policies() -> dict[str, PolicySpec]:
     """Every registered policy that these baselines can train, by its name.
 
     Raises:
-        PluginError: A plug-in does not import, or is registered under another name than its own.
+        PluginError: A plug-in does not import, is registered under another name than its own, or shares its class of arguments
+            with another policy.
     """
-    specs = {name: plugins.load(plugins.POLICIES, name) for name in plugins.registered(plugins.POLICIES)}
+    plugged = {name: plugins.load(plugins.POLICIES, name) for name in plugins.registered(plugins.POLICIES)}
+    specs = {name: spec for name, spec in plugged.items() if isinstance(spec, PolicySpec)}
+    require_distinct(specs)
+    return specs
+
+
+def require_distinct(specs: dict[str, PolicySpec]) -> None:
+    """Check that registered names and classes of arguments each belong to one policy.
+
+    Raises:
+        PluginError: A policy is registered under another name than its own, or two policies share a class of arguments.
+    """
+    owners: dict[type[TrainArgs], str] = {}
     for name, spec in specs.items():
-        if isinstance(spec, PolicySpec) and spec.name != name:
+        if spec.name != name:
             raise PluginError(
                 f"the policy {spec.name!r} is registered as {name!r} in {plugins.POLICIES}; register it as {spec.name!r}"
             )
-    return {name: spec for name, spec in specs.items() if isinstance(spec, PolicySpec)}
+        other = owners.setdefault(spec.args_class, name)
+        if other != name:
+            raise PluginError(
+                f"the policies {other!r} and {name!r} share the class of arguments {spec.args_class.__qualname__}, by which "
+                "`manifeel train` tells policies apart; give each policy a subclass of TrainArgs of its own"
+            )
 
 
 def policy_spec(name: str) -> PolicySpec:

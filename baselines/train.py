@@ -8,13 +8,13 @@ from typing import Annotated, Any
 
 import tyro
 
-from baselines.common.training import TrainArgs
+from baselines.common.train_args import TrainArgs
 from baselines.registry import PolicySpec, all_policies
 from manifeel_ms3.command_line import run
 
 
 def _form(spec: PolicySpec) -> Any:
-    """A policy's presets, as a subcommand that tyro can read."""
+    """The presets of a policy, as a subcommand that tyro can read."""
     args = {name: preset.args for name, preset in spec.presets.items()}
     about = {name: preset.about for name, preset in spec.presets.items()}
     settings = tyro.extras.subcommand_type_from_defaults(args, about)
@@ -26,7 +26,7 @@ Args = reduce(or_, map(_form, all_policies().values()))
 
 
 def main(args: TrainArgs) -> Path:
-    """Train the policy that the arguments are of, and return the last checkpoint."""
+    """Train the policy to which the arguments belong, and return the last checkpoint."""
     (spec,) = [spec for spec in all_policies().values() if type(args) is spec.args_class]
     return spec.train(args)
 

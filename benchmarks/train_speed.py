@@ -1,7 +1,7 @@
-"""How much faster the training loop is than a plain one: `python benchmarks/train_speed.py`.
+"""Speed of the training loop beside a plain one: `python benchmarks/train_speed.py`.
 
-The plain one is what one writes first: a DataLoader that makes every sample by itself, fp32, eager, the library's convolutions.
-Both train the same Diffusion Policy with the paper's sizes on the same pictures, of two image encoders (camera and TacRGB).
+The plain loop is a usual first version: a DataLoader that makes one sample at a time, fp32, eager, library convolutions.
+Both train the same Diffusion Policy with the paper's sizes on the same images, with two image encoders (camera and TacRGB).
 """
 
 import time
@@ -20,11 +20,12 @@ from rich.console import Console
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
+from baselines import tactile_representations as tactile_representations  # registers its encoders
 from baselines.common.dataset import Episode, SequenceDataset
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
 from baselines.common.memory import keep_freed_memory, lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
-from baselines.common.training import ON_GPU
+from baselines.common.train_args import ON_GPU
 from baselines.common.unet import SequenceConv
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 
@@ -35,35 +36,38 @@ WARM_UP = 2
 @dataclass
 class Args:
     device: str = "cuda" if ON_GPU else "cpu"
+    """Device that trains, "cuda" or "cpu"."""
     batch_size: int = 64 if ON_GPU else 8
+    """Number of samples in a gradient step."""
     image_size: int = 256
+    """Height and width of the images, pixels; 224 for tactile representations."""
     steps: int = 30 if ON_GPU else 6
-    """timed steps of each"""
+    """Number of timed gradient steps of each loop."""
     precision: Literal["fp32", "bf16"] = "bf16" if ON_GPU else "fp32"
+    """Number format of activations and gradients in our loop."""
     compile: bool = ON_GPU
+    """Compile the networks in our loop."""
     tacrgb: tuple[str, ...] = ("resnet18",)
-    """encoders of TacRGB to time; the paper's four: resnet18 unit t3 anytouch"""
+    """Names of the TacRGB encoders that are timed; the paper's four are resnet18, unit, t3 and anytouch."""
     demos: int = 103
-    """of the paper's runtime set-up, for minutes an epoch"""
+    """Number of demonstrations in an epoch, that of the paper's runtime comparison."""
     demo_steps: int = 84
-    """of a demonstration"""
+    """Number of steps of a demonstration, that of the paper's runtime comparison."""
 
 
 SPEC_SENSORS = ("rgb+tacrgb", ("wrist",), ("right",))
 
 
-def made_up_episodes(spec, count: int, length: int) -> list[Episode]:
+def random_episodes(spec, count: int, length: int) -> list[Episode]:
     def episode() -> Episode:
-        pictures = {
-            key: RNG.integers(0, 255, (length + 1, spec.image_size, spec.image_size, 3), np.uint8) for key in spec.images
-        }
-        return pictures | {POSE: RNG.random((length + 1, 9), np.float32), "actions": RNG.random((length, 6), np.float32)}
+        images = {key: RNG.integers(0, 255, (length + 1, spec.image_size, spec.image_size, 3), np.uint8) for key in spec.images}
+        return images | {POSE: RNG.random((length + 1, 9), np.float32), "actions": RNG.random((length, 6), np.float32)}
 
     return [episode() for _ in range(count)]
 
 
 class PlainDataset(Dataset):
-    """Samples one by one, pictures as floats."""
+    """Samples one by one, images as floats."""
 
     def __init__(self, data: SequenceDataset):
         self.data = data
@@ -93,7 +97,7 @@ def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> It
 
 
 def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
-    """What `baselines.common.training` does between two logs."""
+    """What `baselines.common.training` does between two entries of the log."""
     keep_freed_memory(args.device)
     lay_out_channels_last(policy)
     if args.compile:
@@ -117,7 +121,7 @@ def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) ->
     torch.manual_seed(0)
     size = args.image_size if tacrgb == "resnet18" else 224
     spec = observation_spec(*SPEC_SENSORS, size)
-    data = SequenceDataset(made_up_episodes(spec, 4, 60), spec, 2, 16, torch.device("cpu" if plain_data else args.device))
+    data = SequenceDataset(random_episodes(spec, 4, 60), spec, 2, 16, torch.device("cpu" if plain_data else args.device))
     policy = DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb=tacrgb)), spec, 6).to(args.device)
     steps = loop(args, policy, data)
     for _ in islice(steps, WARM_UP):
@@ -138,12 +142,12 @@ def main(args: Args) -> None:
         f"batch {args.batch_size}, {args.image_size} pixels, {args.device}, {torch.get_num_threads()} threads, {args.precision}"
     )
     table = Table("TacRGB encoder", "plain, img/s", "ours, img/s", "ratio", "ours, min/epoch", title=title)
-    pictures = 2 * 2 * args.batch_size  # two sensors, two steps of observation
+    images = 2 * 2 * args.batch_size  # two sensors, two steps of observation
     batches = args.demos * args.demo_steps / args.batch_size
     plain_seconds = [seconds_a_step(args, plain_loop, tacrgb, plain_data=True) for tacrgb in args.tacrgb]
     our_seconds = [seconds_a_step(args, our_loop, tacrgb, plain_data=False) for tacrgb in args.tacrgb]
     for tacrgb, plain, ours in zip(args.tacrgb, plain_seconds, our_seconds, strict=True):
-        row = (f"{pictures / plain:.1f}", f"{pictures / ours:.1f}", f"{plain / ours:.2f}", f"{batches * ours / 60:.1f}")
+        row = (f"{images / plain:.1f}", f"{images / ours:.1f}", f"{plain / ours:.2f}", f"{batches * ours / 60:.1f}")
         table.add_row(tacrgb, *row)
     Console().print(table)
 

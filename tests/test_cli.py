@@ -98,11 +98,11 @@ def test_training_takes_policy_preset_and_flags(monkeypatch):
 
     trained = []
     monkeypatch.setattr(train, "main", trained.append)
-    cli.main(["train", "flow_matching", "cpu", "--demos", "a.h5", "b.h5", "--policy.kernel", "3"])
+    cli.main(["train", "flow_matching", "cpu", "--demos", "a.h5", "b.h5", "--policy.kernel-size", "3"])
     (args,) = trained
     assert [path.name for path in args.demos] == ["a.h5", "b.h5"]
-    assert args.policy.kernel == 3
-    assert args.policy.channels == train.PRESETS["cpu"][1].policy.channels
+    assert args.policy.kernel_size == 3
+    assert args.policy.down_dims == train.PRESETS["cpu"].args.policy.down_dims
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh"])

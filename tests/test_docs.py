@@ -81,7 +81,7 @@ SMALLER = {  # what follows a command, by its name or module: of a flag the last
     "teleop": "--port 8137",
     "view": "--save peg.rrd",
     "train": "--steps 2 --batch-size 2 --image-size 64 --policy.encoder.image small_cnn --policy.encoder.crop 0 "
-    "--policy.channels 16 32 --device cpu --precision fp32 --no-compile",
+    "--policy.down-dims 16 32 --device cpu --precision fp32 --no-compile",
     "eval": "--episodes 2 --workers 1 --env-kwargs '{\"max_episode_steps\": 5}'",
     "matrix": "--address local",
     "similarity": "--features tests.analysis.test_sim_real_similarity:brightness --resamples 5",

@@ -21,7 +21,7 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     demos = record.main(
         record.Args(PEG, 2, 2, out=tmp_path / "trajectory.h5", obs_mode="rgb+tacff", cameras=("wrist",), env_kwargs=TASK_ARGS)
     )
-    small = DiffusionConfig(encoder=EncoderConfig("small_cnn", "small"), channels=(32, 64), step_embedding=32)
+    small = DiffusionConfig(encoder=EncoderConfig("small_cnn", "small"), down_dims=(32, 64), diffusion_step_embed_dim=32)
     args = train.Args(
         (demos,),
         policy=small,

@@ -39,7 +39,7 @@ def observation() -> dict[str, torch.Tensor]:
 def test_an_encoder_and_a_policy_of_ones_own(example):
     example("encoder")
     encoder = EncoderConfig(tacrgb="flat", force_field="small")
-    policy = example("policy")["RegressionPolicy"](PolicyConfig(encoder=encoder, channels=(32, 64)), SPEC, 6)
+    policy = example("policy")["RegressionPolicy"](PolicyConfig(encoder=encoder, down_dims=(32, 64)), SPEC, 6)
     optimizer = torch.optim.Adam(policy.parameters(), 3e-3)
     obs, actions = observation(), torch.rand(3, 16, 6) * 2 - 1
     losses = []

@@ -1,0 +1,1 @@
+"""Parts that all policies share: observations, encoders, data, training, checkpoints."""

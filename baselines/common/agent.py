@@ -1,4 +1,4 @@
-"""A trained policy as evaluation wants it: an environment's observations in, one action out."""
+"""A trained policy in the form that evaluation needs: it takes an environment's observation and returns one action."""
 
 import typing
 from collections import deque
@@ -13,12 +13,12 @@ from mani_skill.utils import common
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 
 from .checkpoint import WEIGHTS, load_weights, read_tensors
-from .observation import ObservationSpec, observation_spec, prepare
+from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec, prepare
 from .policy import VisuotactilePolicy
 
 
 def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
-    """The untrained network of a checkpoint's config.
+    """The policy of a checkpoint's config, with untrained weights.
 
     Raises:
         CheckpointError: The config is not one of this policy.
@@ -31,8 +31,8 @@ def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy])
         ) from error
 
 
-def _from_json(cls: Any, value: Any) -> Any:
-    """A dataclass, with those inside it, from what `as_json` made of it."""
+def _from_json(cls: type, value: Any) -> Any:
+    """A dataclass, and the dataclasses that it contains, from the dict that `as_json` made."""
     if is_dataclass(cls):
         types = typing.get_type_hints(cls)
         if unknown := set(value) - {f.name for f in fields(cls)}:
@@ -42,18 +42,24 @@ def _from_json(cls: Any, value: Any) -> Any:
 
 
 def spec_of(config: dict[str, Any]) -> ObservationSpec:
+    """The observations of a policy, from its training settings or a checkpoint's config."""
     cameras, pads = tuple(config["cameras"]), tuple(config["tactile_sensors"])
-    return observation_spec(config["obs_mode"], cameras, pads, config["image_size"])
+    rows, columns = config.get("taxel_shape", TAXEL_SHAPE)
+    return observation_spec(config["obs_mode"], cameras, pads, config["image_size"], (rows, columns))
 
 
 class PolicyAgent:
-    """Carries out `action_horizon` actions of a prediction, then predicts anew from the last `obs_horizon` observations.
+    """Executes `action_horizon` actions of a prediction, then predicts again from the last `obs_horizon` observations.
 
     Args:
         checkpoint: Folder with config.json and model.safetensors.
         policy_class: Class of the policy.
-        inference_steps: of generation; None: as trained.
-        seed: of the sampled noise; `reset` starts it anew, so that an episode depends on its observations alone.
+        inference_steps: Number of generation steps; that of the training settings if None.
+        seed: Seed of the sampled noise; `reset` seeds it again, so that an episode depends on its observations alone.
+        device: Device of the policy.
+
+    Raises:
+        CheckpointError: The checkpoint is missing, broken, or not one of this policy.
     """
 
     def __init__(
@@ -72,12 +78,13 @@ class PolicyAgent:
         self.reset()
 
     def reset(self) -> None:
+        """Forget past observations before an episode."""
         self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.policy.config.obs_horizon)
         self._queue: deque[np.ndarray] = deque()
         self._generator = torch.Generator(self.device).manual_seed(self.seed)
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """Action (A,) for an environment's observation (`num_envs=1`)."""
+        """The action (A,) for the observation of an environment with `num_envs=1`."""
         self._window.append(self._prepared(obs))
         if not self._queue:
             window = [self._window[0]] * (self.policy.config.obs_horizon - len(self._window)) + list(self._window)
@@ -90,7 +97,7 @@ class PolicyAgent:
     def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
         prepared = {}
         for key in self.policy.spec.keys:
-            value = obs
+            value: Any = obs
             for part in key.split("/"):
                 value = value[part]
             prepared[key] = prepare(key, common.to_numpy(value), self.policy.spec)[0]

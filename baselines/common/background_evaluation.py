@@ -1,4 +1,4 @@
-"""Checkpoints are evaluated in a process of their own, while training goes on."""
+"""Evaluation of checkpoints in a separate process while training goes on."""
 
 import json
 import logging
@@ -11,7 +11,14 @@ log = logging.getLogger(__name__)
 
 
 class BackgroundEvaluation:
-    """Evaluates checkpoints one after the other, into `folder`/<step>.json; what fails is reported and left out."""
+    """Evaluates checkpoints one after another; a failed evaluation is logged and does not stop the training.
+
+    Args:
+        folder: Folder of the results, <step>.json, and of the evaluations' output, <step>.log.
+        episodes: Number of episodes for each checkpoint.
+        workers: Number of processes of an evaluation.
+        env_kwargs: Arguments of the task, as a json object.
+    """
 
     def __init__(self, folder: Path, episodes: int, workers: int, env_kwargs: str):
         self.folder = folder
@@ -21,14 +28,22 @@ class BackgroundEvaluation:
 
     @property
     def in_use(self) -> set[Path]:
-        """Checkpoints that must stay."""
+        """Checkpoints that are being evaluated or wait for it, and must not be deleted."""
         return {*self._waiting, *([self._running[0]] if self._running else [])}
 
     def submit(self, checkpoint: Path) -> None:
+        """Queue a checkpoint."""
         self._waiting.append(checkpoint)
 
     def finished(self, wait: bool = False) -> list[dict[str, float]]:
-        """Success rates, of what has been evaluated since the last call; starts the next."""
+        """Start the next evaluation if none is running, and return the results that finished since the last call.
+
+        Args:
+            wait: Whether to wait until all queued checkpoints have been evaluated.
+
+        Returns:
+            For each checkpoint its "evaluated_step" and its rate "success_once".
+        """
         rates = []
         while self._running or self._waiting:
             checkpoint, process = self._running = self._running or self._start(self._waiting.popleft())
@@ -50,7 +65,7 @@ class BackgroundEvaluation:
     def _read(self, checkpoint: Path, code: int) -> list[dict[str, float]]:
         path = self._result(checkpoint)
         if code != 0:
-            log.warning("evaluating %s failed; %s says why", checkpoint, path.with_suffix(".log"))
+            log.warning("the evaluation of %s failed; %s says why", checkpoint, path.with_suffix(".log"))
             return []
         return [dict(evaluated_step=int(checkpoint.name), success_once=json.loads(path.read_text())["success_once"]["rate"])]
 

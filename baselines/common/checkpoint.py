@@ -1,4 +1,4 @@
-"""Checkpoints: a folder with config.json and safetensors. Nothing in them is code."""
+"""Checkpoints: folders with config.json and safetensors files, which hold no code."""
 
 import dataclasses
 import json
@@ -13,17 +13,19 @@ from safetensors.torch import load_file, save_file
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
+"""Files of a checkpoint: the policy's weights, the state of training, the settings."""
 
 
 def save_checkpoint(
     folder: Path, config: dict[str, Any], weights: dict[str, torch.Tensor], training: dict[str, torch.Tensor]
 ) -> None:
-    """Write a checkpoint that appears whole or not at all.
+    """Write a checkpoint; it appears complete or not at all.
 
     Args:
-        config: all that is needed to build the policy, plus "step"; json.
-        weights: the policy's (EMA) weights.
-        training: what resuming needs besides, from `pack`.
+        folder: Folder of the checkpoint; it is replaced if it exists.
+        config: Everything that is needed to build the policy, and "step", in types that json knows.
+        weights: The (EMA) weights of the policy.
+        training: The state of training that only resuming needs, from `pack`.
     """
     partial = folder.with_name(folder.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
@@ -36,7 +38,7 @@ def save_checkpoint(
 
 
 def make_last(folder: Path) -> None:
-    """Let `last`, beside a checkpoint, point to it."""
+    """Make the link `last`, beside a checkpoint, point to it."""
     link = folder.with_name("last.partial")
     link.unlink(missing_ok=True)
     link.symlink_to(folder.name)
@@ -44,7 +46,13 @@ def make_last(folder: Path) -> None:
 
 
 def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
-    """Delete all checkpoints but the newest `keep` and those in use; of older ones, what only resuming needs."""
+    """Delete old checkpoints, and the state of training of all but the newest.
+
+    Args:
+        checkpoints: Folder of the checkpoints.
+        keep: Number of the newest checkpoints that stay.
+        in_use: Older checkpoints that stay, too.
+    """
     folders = sorted(path for path in checkpoints.iterdir() if path.name.isdigit())
     for folder in folders[:-1]:
         (folder / TRAINING).unlink(missing_ok=True)
@@ -54,6 +62,11 @@ def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """The tensors of a safetensors file.
+
+    Raises:
+        CheckpointError: The file is missing or broken.
+    """
     try:
         return load_file(path)
     except (OSError, SafetensorError) as error:
@@ -61,10 +74,15 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
 
 
 def load_weights(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:
-    """Load weights that must fit.
+    """Load weights whose names and shapes must be the module's.
+
+    Args:
+        module: The module.
+        weights: The weights by their names.
+        source: The checkpoint or file that they are from, for the error's message.
 
     Raises:
-        CheckpointError: names or shapes differ: the checkpoint is of another architecture.
+        CheckpointError: Names or shapes differ, so the weights belong to another architecture.
     """
     own = module.state_dict()
     wrong = [n for n in own if n not in weights or weights[n].shape != own[n].shape] + [n for n in weights if n not in own]
@@ -77,10 +95,16 @@ def load_weights(module: torch.nn.Module, weights: dict[str, torch.Tensor], sour
 
 
 def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set[str], source: Path) -> None:
-    """Refuse to resume a run with other settings, but for those in `free`.
+    """Refuse to resume a run with other settings.
+
+    Args:
+        saved: Settings of the checkpoint.
+        wanted: Settings of the run that resumes.
+        free: Names of the settings that may differ.
+        source: The checkpoint, for the error's message.
 
     Raises:
-        CheckpointError: a setting differs; all that do are named.
+        CheckpointError: Some settings differ; the message lists them.
     """
     saved, wanted = json.loads(json.dumps(saved)), json.loads(json.dumps(wanted))
     differing = {k: (saved.get(k), v) for k, v in wanted.items() if k not in free and saved.get(k) != v}
@@ -92,7 +116,7 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
 
 
 def pack(optimizer: torch.optim.Optimizer, model: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Optimiser state, raw weights and torch's random states as named tensors."""
+    """The optimiser's state, the weights without EMA and the states of torch's random number generators, as named tensors."""
     packed = {f"model.{name}": t for name, t in model.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         packed |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
@@ -103,14 +127,24 @@ def pack(optimizer: torch.optim.Optimizer, model: torch.nn.Module) -> dict[str, 
 
 
 def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, model: torch.nn.Module, source: Path) -> None:
-    """Undo `pack`."""
+    """Restore what `pack` saved.
+
+    Args:
+        packed: The named tensors.
+        optimizer: The optimiser.
+        model: The policy.
+        source: The checkpoint, for the error's message.
+
+    Raises:
+        CheckpointError: The weights belong to another architecture.
+    """
     load_weights(model, {n.removeprefix("model."): t for n, t in packed.items() if n.startswith("model.")}, source)
     state: dict[int, dict[str, torch.Tensor]] = {}
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for name, tensor in packed.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".", 2)
-            own = parameters[int(index)]  # fused optimisers take it that moments lie in memory as their weights do
+            own = parameters[int(index)]  # fused optimisers expect moments in the memory layout of their weights
             state.setdefault(int(index), {})[key] = torch.empty_like(own).copy_(tensor) if tensor.shape == own.shape else tensor
     optimizer.load_state_dict(optimizer.state_dict() | dict(state=state))
     torch.set_rng_state(packed["random"])
@@ -119,5 +153,5 @@ def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, mo
 
 
 def as_json(config: Any) -> dict[str, Any]:
-    """A dataclass as what json can hold."""
+    """A dataclass as a dict of types that json knows."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))

@@ -1,4 +1,4 @@
-"""Demonstrations in memory, and sequences of them by index arithmetic."""
+"""Demonstrations in memory, and sequences of their steps by index arithmetic."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -17,21 +17,25 @@ Episode = dict[str, np.ndarray]
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
-    """Episodes of a task: what a policy sees (T + 1, ...), and "actions" (T, A).
+    """Episodes of a task: observations as a policy takes them, (T + 1, ...), and "actions", (T, A).
 
     Args:
-        files: trajectory files, LeRobot datasets, zarr stores of the paper's layout.
-        num_demos: how many to take, over all files; None: all.
+        files: Trajectory files, LeRobot datasets, and zarr stores of the paper's layout.
+        env_id: Environment id of the task.
+        spec: Observations of the policy.
+        num_demos: Number of episodes over all files; all episodes if None.
 
     Raises:
-        DemonstrationError: a file is missing, broken, of another task or obs mode, or there are too few episodes.
+        DemonstrationError: A file is missing, broken, of another task or observation mode, or there are too few episodes.
     """
     files, episodes = list(files), []
     formats = [format_of(file) for file in files]
     held = [known.count(file) for file, known in zip(files, formats, strict=True)]
     wanted = sum(held) if num_demos is None else num_demos
     if not 0 < wanted <= sum(held):
-        raise DemonstrationError(f"{wanted} demonstrations are wanted, the files hold {held}; record more, or ask for fewer")
+        raise DemonstrationError(
+            f"{wanted} demonstrations are wanted, but the files hold {held}; record more, or ask for fewer"
+        )
     with progress_bar() as bar:
         for file, count, known in zip(files, held, formats, strict=True):
             left = min(count, wanted - len(episodes))
@@ -46,8 +50,15 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
 class SequenceDataset:
     """All frames of all episodes on one device, images as uint8; a sample is an index into them.
 
-    A sample at step t holds the observations t - obs_horizon + 1 .. t and the actions that begin with the first of them,
-    `pred_horizon` in all. Before the start and after the end, the first and last are repeated.
+    A sample at step t holds the observations t - obs_horizon + 1 to t, and the `pred_horizon` actions that begin with the first
+    of them. Before the start of an episode its first step is repeated, after the end its last.
+
+    Args:
+        episodes: Episodes from `read_episodes`.
+        spec: Observations of the policy.
+        obs_horizon: Number of observations of a sample.
+        pred_horizon: Number of actions of a sample.
+        device: Device that holds the frames.
     """
 
     def __init__(
@@ -56,7 +67,7 @@ class SequenceDataset:
         self.spec, self.device, self.num_episodes = spec, device, len(episodes)
         lengths = np.array([len(episode["actions"]) for episode in episodes])
         self.actions = self._load([episode["actions"] for episode in episodes])  # (S, A)
-        # the observation after the last action has no action: it is left out, so that frames and actions share an index
+        # no action follows the last observation, so it is left out and frames and actions share an index
         self.observations = {key: self._load([episode[key][:-1] for episode in episodes]) for key in spec.keys}
         ends = np.cumsum(lengths)
         starts = ends - lengths
@@ -72,7 +83,7 @@ class SequenceDataset:
         return torch.as_tensor(np.concatenate(parts), device=self.device)
 
     def names(self, index: torch.Tensor) -> str:
-        """Where samples are in the files, for messages."""
+        """The episodes and steps of samples, for messages."""
         episode, step = self._place[index.cpu()].T
         return ", ".join(f"episode {e} step {t}" for e, t in zip(episode.tolist(), step.tolist(), strict=True))
 
@@ -80,6 +91,6 @@ class SequenceDataset:
         return len(self._obs_index)
 
     def sample(self, index: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """Observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) at sample numbers `index` (B,)."""
+        """The observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) of the samples `index` (B,)."""
         obs_index = self._obs_index[index]
         return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]

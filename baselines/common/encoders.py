@@ -1,4 +1,4 @@
-"""Observation encoders: one network per camera, pad and modality, their features joined."""
+"""Observation encoders: one network per camera, tactile sensor and modality; their features are concatenated."""
 
 import math
 from collections.abc import Callable
@@ -9,29 +9,28 @@ import torch
 import torch.nn as nn
 from transformers import ResNetConfig, ResNetModel
 
-from baselines.tactile_representations.anytouch import AnyTouch
-from baselines.tactile_representations.representation import Representation
-from baselines.tactile_representations.sparsh import Sparsh
-from baselines.tactile_representations.t3 import T3
-from baselines.tactile_representations.unit import UniT
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
 from .observation import POSE, POSE_FEATURES, ObservationSpec, is_tactile
 
-IMAGE_FEATURES = 64  # per image: 32 key points
+IMAGE_FEATURES = 64
+"""Features of each image and of each force field: 32 key points of two coordinates, as in Diffusion Policy."""
 
 
 @dataclass
 class EncoderConfig:
+    """The networks that encode a policy's observations."""
+
     image: str = "resnet18"
-    """network of each camera, by its name in IMAGE_ENCODERS"""
+    """Network of each camera, by its name in `IMAGE_ENCODERS`."""
     tacrgb: str = "resnet18"
-    """network of each TacRGB image, by its name in TACRGB_ENCODERS"""
+    """Network of each TacRGB image, by its name in `TACRGB_ENCODERS`."""
     freeze_tacrgb: bool = False
-    """leave a tactile representation as it was loaded, and train what follows it"""
+    """Keep the weights of a pretrained TacRGB network as they were loaded, and train only the layers after it."""
     force_field: str = "resnet18"
-    """network of each TacFF field, by its name in FIELD_ENCODERS"""
+    """Network of each TacFF force field, by its name in `FIELD_ENCODERS`."""
     crop: int = 0
-    """random crops of this size in training, the middle in evaluation; 0: whole images"""
+    """Side of the square crops of images, pixels: random in training, central in evaluation; whole images if 0."""
 
 
 class SpatialSoftmax(nn.Module):
@@ -49,37 +48,43 @@ class SpatialSoftmax(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy (EMA and batch statistics do not go together)."""
+    """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy: batch statistics and an EMA do not go together."""
+
+    out_channels = 512
 
     def __init__(self):
         super().__init__()
-        config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", hidden_sizes=[64, 128, 256, 512], embedding_size=64)
+        widths = [64, 128, 256, self.out_channels]
+        config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", hidden_sizes=widths, embedding_size=widths[0])
         self.net = _with_group_norm(ResNetModel(config))
-        self.out_channels = 512
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         return self.net(image).last_hidden_state
 
 
+CHANNELS_PER_GROUP = 16
+"""Channels that GroupNorm normalises together in ResNet-18, as in the public code of Diffusion Policy."""
+
+
 def _with_group_norm(module: nn.Module) -> nn.Module:
     for name, child in module.named_children():
         if isinstance(child, nn.BatchNorm2d):
-            setattr(module, name, nn.GroupNorm(child.num_features // 16, child.num_features))
+            setattr(module, name, nn.GroupNorm(child.num_features // CHANNELS_PER_GROUP, child.num_features))
         else:
             _with_group_norm(child)
     return module
 
 
 class SmallCNN(nn.Sequential):
-    """A small image network for a CPU: four convolutions, stride 8 in all, then every place at once.
+    """A small image network for a CPU: four convolutions with a total stride of 8, then one layer over all places.
 
-    On a few demonstrations it finds a part in the picture in a quarter of the steps that key points take.
+    On a few demonstrations it learns to locate a part in the image in a quarter of the steps that key points need.
     """
 
     def __init__(self, size: int):
         places = math.ceil(size / 8) ** 2
         super().__init__(
-            *_conv(3, 24, kernel=5, stride=2),
+            *_conv(3, 24, kernel_size=5, stride=2),
             *_conv(24, 48, stride=2),
             *_conv(48, 64, stride=2),
             *_conv(64, 64),
@@ -90,144 +95,175 @@ class SmallCNN(nn.Sequential):
         )
 
 
-def _conv(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
-
-
-class RepresentationEncoder(nn.Module):
-    """A tactile representation, and a layer to as many features as other images have."""
-
-    def __init__(self, representation: Representation, size: int):
-        super().__init__()
-        if size % representation.patch:
-            name, patch = type(representation).__name__, representation.patch
-            raise ValueError(f"{name} takes pictures whose sides are a multiple of {patch}, not {size}; give --image-size 224")
-        self.representation, self.frozen = representation, False
-        self.out = nn.Linear(representation.out_features, IMAGE_FEATURES)
-
-    def freeze(self) -> None:
-        self.representation.requires_grad_(False)
-        self.frozen = True
-
-    def forward(self, image: torch.Tensor) -> torch.Tensor:
-        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            features = self.representation(image)
-        return self.out(features)
-
-
-def load_representations(policy: nn.Module, weights: Path) -> None:
-    """Load weights into every tactile representation of a policy.
-
-    Raises:
-        ValueError: it has none.
-        CheckpointError: the weights are of something else.
-    """
-    encoders = [module for module in policy.modules() if isinstance(module, RepresentationEncoder)]
-    if not encoders:
-        raise ValueError(f"{weights} are given for TacRGB, but no network takes them; give --policy.encoder.tacrgb t3, say")
-    for encoder in encoders:
-        encoder.representation.load(weights)
+def _conv(inputs: int, outputs: int, kernel_size: int = 3, stride: int = 1) -> list[nn.Module]:
+    return [nn.Conv2d(inputs, outputs, kernel_size, stride, kernel_size // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
 
 
 class SmallFieldNet(nn.Module):
-    """A force field's 10 x 14 taxels through two convolutions, then all of them at once: its places carry meaning."""
+    """A small force field network: two convolutions, then one layer over all places, because places carry meaning."""
 
-    def __init__(self):
+    def __init__(self, taxel_shape: tuple[int, int]):
         super().__init__()
+        rows, columns = (math.ceil(side / 2) for side in taxel_shape)
         self.net = nn.Sequential(
-            *_conv(3, 32), *_conv(32, 32, stride=2), nn.Flatten(), nn.Linear(32 * 5 * 7, IMAGE_FEATURES), nn.SiLU()
+            *_conv(3, 32),
+            *_conv(32, 32, stride=2),
+            nn.Flatten(),
+            nn.Linear(32 * rows * columns, IMAGE_FEATURES),
+            nn.SiLU(),
         )
 
     def forward(self, field: torch.Tensor) -> torch.Tensor:
         return self.net(field)
 
 
-def _key_points(backbone: nn.Module) -> nn.Module:
+class PretrainedEncoder(nn.Module):
+    """An image encoder with a part that is pretrained. Subclasses define both methods."""
+
+    def freeze(self) -> None:
+        """Exclude the pretrained part from training."""
+        raise NotImplementedError
+
+    def load(self, weights: Path) -> None:
+        """Load the weights of the pretrained part."""
+        raise NotImplementedError
+
+
+def load_pretrained(policy: nn.Module, weights: Path) -> None:
+    """Load weights into the pretrained part of every TacRGB encoder of a policy.
+
+    Raises:
+        InvalidArgumentError: No encoder of the policy has a pretrained part.
+        CheckpointError: The weights belong to another architecture.
+    """
+    encoders = [module for module in policy.modules() if isinstance(module, PretrainedEncoder)]
+    if not encoders:
+        raise InvalidArgumentError(
+            f"tacrgb_weights={weights}: no network of this policy takes them; choose one that does, such as "
+            "--policy.encoder.tacrgb t3"
+        )
+    for encoder in encoders:
+        encoder.load(weights)
+
+
+def _key_points(backbone: ResNet18) -> nn.Module:
     return nn.Sequential(backbone, SpatialSoftmax(backbone.out_channels))
 
 
-def _pooled(backbone: nn.Module) -> nn.Module:
-    """A field of 10 x 14 shrinks to one place, which leaves no key points: its features themselves."""
+def _pooled(backbone: ResNet18) -> nn.Module:
+    """Mean features instead of key points: ResNet-18 shrinks a field of 10 x 14 taxels to a single place."""
     return nn.Sequential(backbone, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(backbone.out_channels, IMAGE_FEATURES))
 
 
-IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {  # of the picture's size, pixels
+IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {
     "resnet18": lambda size: _key_points(ResNet18()),
     "small_cnn": SmallCNN,
 }
-TACRGB_ENCODERS: dict[str, Callable[[int], nn.Module]] = IMAGE_ENCODERS | {
-    "unit": lambda size: RepresentationEncoder(UniT(), size),
-    "unit_released": lambda size: RepresentationEncoder(UniT(attention=True), size),
-    "t3": lambda size: RepresentationEncoder(T3(), size),
-    "anytouch": lambda size: RepresentationEncoder(AnyTouch(), size),
-    "sparsh": lambda size: RepresentationEncoder(Sparsh(), size),
-}
-FIELD_ENCODERS: dict[str, Callable[[], nn.Module]] = {
-    "resnet18": lambda: _pooled(ResNet18()),  # the paper's: the field as a small image
+"""Functions from the side of the image, pixels, to a network (B, 3, size, size) -> (B, 64)."""
+TACRGB_ENCODERS: dict[str, Callable[[int], nn.Module]] = dict(IMAGE_ENCODERS)
+"""As `IMAGE_ENCODERS`, for TacRGB images; other packages add theirs with `register_tacrgb_encoder`."""
+FIELD_ENCODERS: dict[str, Callable[[tuple[int, int]], nn.Module]] = {
+    "resnet18": lambda taxel_shape: _pooled(ResNet18()),  # the paper's: the force field as a small image
     "small": SmallFieldNet,
 }
+"""Functions from the rows and columns of taxels to a network (B, 3, rows, columns) -> (B, 64)."""
+
+
+def register_tacrgb_encoder(name: str, make: Callable[[int], nn.Module]) -> None:
+    """Add a network for TacRGB images that every policy can use.
+
+    Args:
+        name: Name by which `EncoderConfig.tacrgb` chooses it.
+        make: Function from the side of the image, pixels, to a network (B, 3, size, size) -> (B, 64).
+
+    Raises:
+        InvalidArgumentError: The name is taken.
+    """
+    if name in TACRGB_ENCODERS:
+        raise InvalidArgumentError(f"the TacRGB encoder {name!r} is registered already; choose another name")
+    TACRGB_ENCODERS[name] = make
 
 
 def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.Module:
     """The network of one camera or TacRGB image.
 
     Raises:
-        ValueError: its name is unknown, or it does not take pictures of this size.
+        UnknownNameError: No network has the configured name.
+        InvalidArgumentError: The network does not take images of this size, or cannot be frozen.
     """
     size = config.crop or spec.image_size
     if not is_tactile(key):
-        return _known(IMAGE_ENCODERS, config.image)(size)
-    encoder = _known(TACRGB_ENCODERS, config.tacrgb)(size)
+        return _by_name(IMAGE_ENCODERS, config.image)(size)
+    encoder = _by_name(TACRGB_ENCODERS, config.tacrgb)(size)
     if config.freeze_tacrgb:
-        if not isinstance(encoder, RepresentationEncoder):
-            raise ValueError(f"freeze_tacrgb: {config.tacrgb!r} is no representation that could be loaded; leave it False")
+        if not isinstance(encoder, PretrainedEncoder):
+            raise InvalidArgumentError(
+                f"freeze_tacrgb=True: {config.tacrgb!r} is no representation that could be loaded; leave freeze_tacrgb False"
+            )
         encoder.freeze()
     return encoder
 
 
-def field_encoder(config: EncoderConfig) -> nn.Module:
-    """The network of one TacFF field.
+def field_encoder(config: EncoderConfig, spec: ObservationSpec) -> nn.Module:
+    """The network of one TacFF force field.
 
     Raises:
-        ValueError: its name is unknown.
+        UnknownNameError: No network has the configured name.
     """
-    return _known(FIELD_ENCODERS, config.force_field)()
+    return _by_name(FIELD_ENCODERS, config.force_field)(spec.taxel_shape)
 
 
-def _known(table: dict, name: str) -> Callable:
+def _by_name(table: dict[str, Callable], name: str) -> Callable:
     if name not in table:
-        raise ValueError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
+        raise UnknownNameError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
     return table[name]
 
 
 class ObservationEncoder(nn.Module):
-    """Features (B, obs_horizon * F) of a window of observations; networks are shared over time, not over sensors.
+    """Features (B, obs_horizon * F) of a window of observations; a sensor's network is shared over time steps.
+
+    Args:
+        config: Names of the networks.
+        spec: Observations of the policy.
+        obs_horizon: Number of time steps in a window.
 
     Raises:
-        ValueError: an encoder's name is unknown, or it does not take pictures of this size.
+        UnknownNameError: No network has a configured name.
+        InvalidArgumentError: A network does not take images of this size, or cannot be frozen.
     """
 
     def __init__(self, config: EncoderConfig, spec: ObservationSpec, obs_horizon: int):
         super().__init__()
         self.crop, self.spec = config.crop, spec
         self.images = nn.ModuleList(image_encoder(config, spec, key) for key in spec.images)
-        self.fields = nn.ModuleList(field_encoder(config) for _ in spec.force_fields)
+        self.fields = nn.ModuleList(field_encoder(config, spec) for _ in spec.force_fields)
         per_step = IMAGE_FEATURES * (len(self.images) + len(self.fields)) + POSE_FEATURES
         self.out_features = obs_horizon * per_step
 
     def forward(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
-        """`obs`: {key: (B, obs_horizon, ...)}: images uint8, the rest normalised floats."""
+        """Encode observations {key: (B, obs_horizon, ...)}: images as uint8, the rest as normalised floats."""
         batch, horizon = obs[POSE].shape[:2]
         features = [obs[POSE].flatten(0, 1)]
         for key, net in zip(self.spec.images, self.images, strict=True):
-            features.append(net(cropped(obs[key], self.crop, self.training).flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0))
+            features.append(net(network_images(cropped(obs[key], self.crop, self.training))))
         for key, net in zip(self.spec.force_fields, self.fields, strict=True):
             features.append(net(obs[key].flatten(0, 1).movedim(-1, 1)))
         return torch.cat(features, dim=-1).view(batch, horizon, -1).flatten(1)
 
 
+def network_images(images: torch.Tensor) -> torch.Tensor:
+    """Images (B, T, H, W, 3) uint8 as networks take them: (B * T, 3, H, W) in [-1, 1]."""
+    return images.flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0
+
+
 def cropped(images: torch.Tensor, size: int, at_random: bool) -> torch.Tensor:
-    """Crop (B, T, H, W, 3) to squares: at random, the same over a window's time, or the middle; 0: leave it whole."""
+    """Square crops of images.
+
+    Args:
+        images: Windows of images, (B, T, H, W, 3).
+        size: Side of the crops, pixels; if it is 0 or not smaller than the images, they are returned whole.
+        at_random: Whether each window is cropped at a random place, the same for all its time steps; else the centre is taken.
+    """
     free = images.shape[2] - size
     if not 0 < size < images.shape[2]:
         return images

@@ -1,4 +1,4 @@
-"""How a training process lays its weights out, and what it does with memory that it freed."""
+"""Memory of a training process: its freed blocks, and the layout of weights."""
 
 import ctypes
 import sys
@@ -6,23 +6,27 @@ import sys
 import torch
 import torch.nn as nn
 
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # mallopt(3)
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
+"""Parameters of glibc's mallopt(3)."""
+IMAGE_DIMENSIONS = 4
+"""Number of dimensions of the weights of a two-dimensional convolution."""
 
 
 def keep_freed_memory(device: torch.device | str) -> None:
-    """Let this process keep what it frees, where it trains on the CPU, on Linux with glibc.
+    """Let this process keep the memory that it frees, if it trains on the CPU on Linux with glibc.
 
-    glibc gives every large block back at once; the system clears it before it hands it out anew, at each step of training.
+    By default glibc returns every large block to the system at once, and the system clears the block before the process gets
+    it again, at each training step.
     """
-    concerned = torch.device(device).type == "cpu" and sys.platform == "linux"
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if concerned else None
+    applies = torch.device(device).type == "cpu" and sys.platform == "linux"
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if applies else None
     if mallopt:
         mallopt(M_MMAP_MAX, 0)
         mallopt(M_TRIM_THRESHOLD, -1)
 
 
 def lay_out_channels_last(module: nn.Module) -> None:
-    """Weights of two-dimensional convolutions as the libraries' fast ones want them; before the optimiser is made."""
+    """Store the weights of two-dimensional convolutions channels last, which is faster; before the optimiser is made."""
     for parameter in module.parameters():
-        if parameter.dim() == 4:
+        if parameter.dim() == IMAGE_DIMENSIONS:
             parameter.data = parameter.data.to(memory_format=torch.channels_last)

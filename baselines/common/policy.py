@@ -1,7 +1,7 @@
-"""What every policy shares: an observation encoder, normalisers, and how a prediction becomes actions."""
+"""The base of all policies: an observation encoder, normalisers, and the way from a prediction to actions."""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 import torch.nn as nn
@@ -14,32 +14,50 @@ from .unet import ConditionalUnet1D
 
 @dataclass
 class PolicyConfig:
-    """Defaults: the paper's."""
+    """Settings of a policy; the defaults are the paper's, which are those of Diffusion Policy."""
 
     obs_horizon: int = 2
+    """Number of observations, the present one included, that condition a prediction."""
     pred_horizon: int = 16
+    """Number of actions in a prediction."""
     action_horizon: int = 8
-    """actions of a prediction that are carried out before the next"""
+    """Number of actions of a prediction that are executed before the next prediction."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    channels: tuple[int, ...] = (512, 1024, 2048)
-    kernel: int = 5
-    groups: int = 8
-    step_embedding: int = 128
+    """Networks that encode the observations."""
+    down_dims: tuple[int, ...] = (512, 1024, 2048)
+    """Channels of the U-Net, from the finest to the coarsest scale."""
+    kernel_size: int = 5
+    """Kernel size of the U-Net's convolutions, time steps."""
+    n_groups: int = 8
+    """Number of groups of the U-Net's GroupNorm."""
+    diffusion_step_embed_dim: int = 128
+    """Size of the embedding of the diffusion step (or of the flow's time)."""
     pose_noise: float = 0.0
-    """standard deviation added to the normalised tool pose in training: a few demonstrations are else told apart by it alone"""
+    """Standard deviation of the noise that training adds to the normalised tool pose; without noise, a policy trained on a few
+    demonstrations can recognise each of them by the pose alone."""
     noise_draws: int = 1
-    """noises per observation in a loss; more is cheap where the encoder is the cost"""
+    """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
 
 class VisuotactilePolicy(nn.Module):
     """Generates an action sequence, conditioned on a window of observations.
 
-    Subclasses define `generation_loss` and `generate`, and may make other networks of their own.
+    Subclasses define `generation_loss` and `generate`, and can build other networks in `make_networks`.
+
+    Args:
+        config: Settings.
+        spec: Observations that the policy takes.
+        action_dim: Numbers of an action, A.
+
+    Raises:
+        InvalidArgumentError: An encoder's name is unknown, or the encoder does not take images of this size.
     """
 
     name: ClassVar[str]
     """Name under which the policy is registered (`baselines.registry`)."""
-    Config = PolicyConfig
+    Config: ClassVar[type[PolicyConfig]] = PolicyConfig
+    """Class of the settings."""
+    config: PolicyConfig
 
     def __init__(self, config: PolicyConfig, spec: ObservationSpec, action_dim: int):
         super().__init__()
@@ -50,54 +68,61 @@ class VisuotactilePolicy(nn.Module):
         self.action_normalizer = Normalizer(action_dim)
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:
-        """The encoder of observations, and the network over action sequences."""
+        """The observation encoder, and the network over action sequences."""
         config = self.config
         encoder = ObservationEncoder(config.encoder, self.spec, config.obs_horizon)
-        shape = (config.channels, config.kernel, config.groups, config.step_embedding)
-        return encoder, ConditionalUnet1D(self.action_dim, encoder.out_features, *shape)
+        return encoder, ConditionalUnet1D(self.action_dim, encoder.out_features, **unet_settings(config))
 
     def generation_loss(self, clean: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """A scalar, for normalised actions (B, pred_horizon, A) under conditions (B, ...)."""
+        """The loss, a scalar, of normalised actions (B, pred_horizon, A) given conditions (B, ...)."""
         raise NotImplementedError
 
     def generate(self, condition: torch.Tensor, steps: int, generator: torch.Generator) -> torch.Tensor:
-        """Normalised actions (B, pred_horizon, A), in so many steps."""
+        """Normalised actions (B, pred_horizon, A), generated in `steps` steps given conditions (B, ...)."""
         raise NotImplementedError
 
     def fit_normalizers(self, observations: dict[str, torch.Tensor], actions: torch.Tensor) -> None:
-        """Take the ranges of observations {key: (S, ...)} and actions (S, A) from the demonstrations."""
+        """Fit the normalisers to the observations {key: (S, ...)} and actions (S, A) of the demonstrations."""
         for key in (POSE, *self.spec.force_fields):
-            self.obs_normalizers[module_name(key)].fit(observations[key])
+            self.obs_normalizer(key).fit(observations[key])
         self.action_normalizer.fit(actions)
+
+    def obs_normalizer(self, key: str) -> Normalizer:
+        """The normaliser of an observation."""
+        return cast(Normalizer, self.obs_normalizers[module_name(key)])
 
     def condition(self, obs: dict[str, torch.Tensor], pose_noise: float = 0.0) -> torch.Tensor:
         """Features (B, ...) of observations {key: (B, obs_horizon, ...)}."""
-        normalised = {
-            key: self.obs_normalizers[module_name(key)].normalize(obs[key]) for key in (POSE, *self.spec.force_fields)
-        }
+        normalised = {key: self.obs_normalizer(key).normalize(obs[key]) for key in (POSE, *self.spec.force_fields)}
         if pose_noise > 0:
             normalised[POSE] = normalised[POSE] + pose_noise * torch.randn_like(normalised[POSE])
         return self.encoder({**obs, **normalised})
 
     def forward(self, obs: dict[str, torch.Tensor], actions: torch.Tensor) -> torch.Tensor:
-        """The loss of a batch; actions (B, pred_horizon, A)."""
+        """The loss of a batch of observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A)."""
         draws = self.config.noise_draws
         condition = self.condition(obs, self.config.pose_noise).repeat_interleave(draws, dim=0)
         return self.generation_loss(self.action_normalizer.normalize(actions).repeat_interleave(draws, dim=0), condition)
 
     @torch.no_grad()
     def sample(self, obs: dict[str, torch.Tensor], inference_steps: int, generator: torch.Generator) -> torch.Tensor:
-        """Actions (B, action_horizon, A) to carry out next."""
+        """The actions (B, action_horizon, A) to execute next."""
         actions = self.generate(self.condition(obs), inference_steps, generator)
         first = self.config.obs_horizon - 1
         return self.action_normalizer.restore(actions)[:, first : first + self.config.action_horizon]
 
     def noise(self, condition: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """What generation begins with, (B, pred_horizon, A)."""
+        """The noise (B, pred_horizon, A) from which generation starts."""
         shape = (len(condition), self.config.pred_horizon, self.action_dim)
         return torch.randn(shape, generator=generator, device=condition.device)
 
 
+def unet_settings(config: PolicyConfig) -> dict[str, Any]:
+    """The arguments of `ConditionalUnet1D` that a policy's settings hold."""
+    names = ("down_dims", "kernel_size", "n_groups", "diffusion_step_embed_dim")
+    return {name: getattr(config, name) for name in names}
+
+
 def module_name(key: str) -> str:
-    """Module names must not hold dots; slashes become underscores for looks."""
+    """The name of a module that belongs to an observation; the slashes of the key become underscores."""
     return key.replace("/", "_")

@@ -1,4 +1,4 @@
-"""Training on several devices at once, one process each, as `torchrun` starts them."""
+"""Training on several devices at once, with one process for each, started by `torchrun`."""
 
 import os
 
@@ -8,7 +8,11 @@ import torch.nn as nn
 
 
 class Processes:
-    """This process among those of a run; alone if `torchrun` did not start it."""
+    """This process among those of a training run; the only one if `torchrun` did not start it.
+
+    Args:
+        device: Type of the device, "cuda" or "cpu".
+    """
 
     def __init__(self, device: str):
         self.rank, self.count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
@@ -19,17 +23,19 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this one writes logs and checkpoints."""
+        """Whether this process is the one that writes logs and checkpoints."""
         return self.rank == 0
 
-    def joined(self, model: nn.Module) -> nn.Module:
-        """The model, its gradients the mean over all processes."""
+    def with_mean_gradients(self, model: nn.Module) -> nn.Module:
+        """The model, wrapped so that its gradients are the mean over all processes."""
         return nn.parallel.DistributedDataParallel(model) if self.count > 1 else model
 
     def wait(self) -> None:
+        """Wait until all processes have come here."""
         if self.count > 1:
             dist.barrier()
 
     def close(self) -> None:
+        """Leave the group of processes."""
         if self.count > 1:
             dist.destroy_process_group()

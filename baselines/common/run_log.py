@@ -1,19 +1,29 @@
-"""Where training writes how it goes: log.jsonl, tensorboard events, Weights & Biases."""
+"""The log of a training run: log.jsonl, tensorboard events, and Weights & Biases."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage] (torch does not list it)
 
-WANDB_TIMEOUT = 30  # s
+from manifeel_ms3.errors import ServerError
+
+WANDB_TIMEOUT = 30
+"""Longest wait for Weights & Biases, s."""
 
 
 class RunLog:
-    """A run's log; `resume` adds to what is there.
+    """The log of a training run.
+
+    Args:
+        folder: Folder of the run.
+        config: Settings of the run, for Weights & Biases.
+        resume: Whether to append to the log in the folder; else it is replaced.
+        wandb_project: Project of Weights & Biases; not used if None.
 
     Raises:
-        ConnectionError: Weights & Biases cannot be reached.
+        ServerError: Weights & Biases cannot be reached.
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], resume: bool, wandb_project: str | None):
@@ -22,8 +32,8 @@ class RunLog:
         self._board = SummaryWriter(str(folder))
         self._lines = (folder / "log.jsonl").open("a" if resume else "w")
 
-    def write(self, entry: dict[str, float]) -> None:
-        """An entry with its "step"."""
+    def write(self, entry: Mapping[str, float]) -> None:
+        """Write an entry: values by name, "step" among them."""
         self._lines.write(json.dumps(entry) + "\n")
         self._lines.flush()
         for name, value in entry.items():
@@ -32,6 +42,7 @@ class RunLog:
             self._wandb.log(entry, step=int(entry["step"]))
 
     def close(self) -> None:
+        """Finish the log."""
         self._lines.close()
         self._board.close()
         if self._wandb:
@@ -40,12 +51,13 @@ class RunLog:
 
 def _start_wandb(project: str, config: dict[str, Any], folder: Path) -> Any:
     import wandb
+    from wandb.errors import CommError, UsageError
 
     try:
         settings = wandb.Settings(init_timeout=WANDB_TIMEOUT)
         return wandb.init(project=project, config=config, dir=str(folder), settings=settings)
-    except (wandb.errors.CommError, wandb.errors.UsageError) as error:
-        raise ConnectionError(
-            f"Weights & Biases does not take the run ({error}); log in with `wandb login`, write it to disk with "
+    except (CommError, UsageError) as error:
+        raise ServerError(
+            f"Weights & Biases does not accept the run ({error}); log in with `wandb login`, write it to disk with "
             "WANDB_MODE=offline, or leave out --wandb-project"
         ) from error

@@ -1,17 +1,19 @@
-"""The training loop that all policies share."""
+"""The training loop that all policies share: set up, step, save, resume."""
 
 import math
 import random
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
-from diffusers.optimization import get_scheduler
+from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
+from torch.optim.lr_scheduler import LambdaLR
 
+from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.progress import progress_bar
@@ -30,214 +32,297 @@ from .checkpoint import (
     save_checkpoint,
     unpack,
 )
-from .dataset import SequenceDataset, read_episodes
-from .encoders import load_representations
+from .dataset import Episode, SequenceDataset, read_episodes
+from .encoders import load_pretrained
 from .memory import keep_freed_memory, lay_out_channels_last
-from .policy import PolicyConfig, VisuotactilePolicy
+from .observation import ObservationSpec
+from .policy import VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog
+from .train_args import FREE_ON_RESUME, TrainArgs, default_steps
 
-PAPER_EPOCHS = 50_000
-ON_GPU = torch.cuda.is_available()
-
-
-class TrainingError(RuntimeError):
-    """Training cannot go on."""
+RANK_SEED_STRIDE = 1_000_003
+"""Distance of the noise seeds of processes: a prime that is larger than usual seeds and numbers of steps."""
 
 
-@dataclass
-class TrainArgs:
-    """What all policies' scripts take; the defaults are the paper's."""
-
-    demos: tuple[Path, ...]
-    """trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout"""
-    env_id: str = "ManiFeel-PegInsertion-v1"
-    """task; the files must be of it"""
-    obs_mode: str = "rgb+tacff"
-    """modalities: "rgb", "rgb+tacrgb", "rgb+tacff", "rgb+tacrgb+tacff", "tacff", ..."""
-    cameras: tuple[str, ...] = ("wrist",)
-    tactile_sensors: tuple[str, ...] = ("right",)
-    image_size: int = 256
-    tacrgb_weights: Path | None = None
-    """weights of the tactile representation to begin with: as its authors released them, or from pretrain.py"""
-    num_demos: int | None = None
-    """episodes to train on; default: all"""
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
-    inference_steps: int = 100
-    """of generation, in evaluation"""
-    batch_size: int = 8
-    """samples a step, of each process"""
-    steps: int | None = None
-    """gradient steps; default: the paper's 50,000 epochs over all demonstrations, divided by their number"""
-    lr: float = 1e-4
-    betas: tuple[float, float] = (0.95, 0.999)
-    weight_decay: float = 1e-6
-    warmup_steps: int = 500
-    ema_power: float = 0.75
-    ema_max_decay: float = 0.9999
-    seed: int = 0
-    device: str = "cuda" if ON_GPU else "cpu"
-    precision: Literal["fp32", "bf16"] = "bf16" if ON_GPU else "fp32"
-    """of activations and gradients; weights are fp32"""
-    compile: bool = ON_GPU
-    """compile the networks; a minute or two, once"""
-    run_dir: Path = Path("runs/policy")
-    """log.jsonl, tensorboard events, checkpoints and evaluations go here"""
-    save_every: int = 5000
-    """gradient steps between checkpoints; the last is always written"""
-    keep: int = 10
-    """checkpoints kept"""
-    eval_episodes: int = 0
-    """evaluate every checkpoint on so many of the task's seeds, in processes of their own; 0: none"""
-    eval_workers: int = 1
-    eval_env_kwargs: str = "{}"
-    """arguments of the task in evaluation, as json"""
-    log_every: int = 50
-    resume: bool = False
-    """go on from the last checkpoint in run_dir"""
-    wandb_project: str | None = None
-    """log to Weights & Biases too; offline with WANDB_MODE=offline"""
-
-
-FREE_ON_RESUME = {
-    *("demos", "tacrgb_weights", "run_dir", "resume", "device", "compile", "log_every", "wandb_project"),
-    *("steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
-    *("eval_episodes", "eval_workers", "eval_env_kwargs"),
-}
-
-
-def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:
-    """Number of gradient steps of the paper's public code: 50,000 epochs over all demonstrations, divided by their number."""
-    return round(PAPER_EPOCHS / num_demos) * math.ceil(num_samples / batch_size)
+class TrainingError(WorkFailedError):
+    """Training cannot continue."""
 
 
 def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
-    """Train, and return the last checkpoint.
+    """Train a policy, and return the last checkpoint.
+
+    Args:
+        args: Settings of the run.
+        policy_class: Class of the policy.
 
     Raises:
-        DemonstrationError: the demonstrations are not what the arguments ask for.
-        CheckpointError: the run that should go on was made with other settings, or is broken.
-        TrainingError: the loss is not a number.
+        DemonstrationError: The demonstrations are not what the settings ask for.
+        CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
+        TrainingError: The loss is not a finite number.
     """
-    processes = Processes(args.device)
-    device = processes.device
-    keep_freed_memory(device)
-    random.seed(args.seed)
-    np.random.seed(args.seed)  # noqa: NPY002 (libraries draw from it)
-    torch.manual_seed(args.seed)
-    last = args.run_dir / "checkpoints/last"
+    return Trainer(args, policy_class).run()
 
-    # data
-    config = as_json(args)
-    spec = spec_of(config)
-    episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
-    dataset = SequenceDataset(episodes, spec, args.policy.obs_horizon, args.policy.pred_horizon, device)
-    batch_size = args.batch_size * processes.count
-    steps_per_epoch = math.ceil(len(dataset) / batch_size)
-    total_steps = args.steps or default_steps(dataset.num_episodes, len(dataset), batch_size)
-    action_dim = dataset.actions.shape[1]
-    config |= dict(policy_name=policy_class.name, action_dim=action_dim)
-    config |= dict(num_demos=dataset.num_episodes, num_samples=len(dataset))
 
-    # policy, optimiser, schedule, EMA
-    policy = policy_class(args.policy, spec, action_dim).to(device)
-    lay_out_channels_last(policy)
-    if args.tacrgb_weights and not args.resume:
-        load_representations(policy, args.tacrgb_weights)
-    policy.fit_normalizers(dataset.observations, dataset.actions)
-    if args.compile:
-        policy.encoder.compile()
-        policy.unet.compile()
-    optimizer = torch.optim.AdamW(policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay, fused=True)
-    order_generator = torch.Generator().manual_seed(args.seed)
-    start, order = 0, torch.empty(0, dtype=torch.long)  # samples left of this epoch
-    begin = time.time()
-    if args.resume:
-        saved = checkpoint_config(last)
-        require_same_config(saved, config, FREE_ON_RESUME, last)
-        training = read_tensors(last / TRAINING)
-        order = training.pop("order")
-        order_generator.set_state(training.pop("order_random"))
-        unpack(training, optimizer, policy, last)
-        start = saved["step"]
-        begin -= saved["training_seconds"]
-    if not processes.first:
-        torch.manual_seed(args.seed + 1_000_003 * processes.rank + start)  # noise of its own
-    schedule = get_scheduler("cosine", optimizer, num_warmup_steps=args.warmup_steps, num_training_steps=total_steps)
-    schedule.last_epoch = start
-    for group in optimizer.param_groups:
-        group["lr"] = args.lr * schedule.lr_lambdas[0](start)
-    ema = EMAModel(
-        policy.parameters(), args.ema_max_decay, use_ema_warmup=True, power=args.ema_power, inv_gamma=1.0, foreach=True
-    )
-    if args.resume:
-        weights = read_tensors(last / WEIGHTS)
-        ema.shadow_params = [weights[name].to(device) for name, _ in policy.named_parameters()]
-        ema.optimization_step = start
+class Trainer:
+    """A training run: the data, the policy and all that changes while it learns.
 
-    def save(step: int) -> Path:
-        weights = dict(policy.state_dict())
-        weights |= {name: s for (name, _), s in zip(policy.named_parameters(), ema.shadow_params, strict=True)}
-        state = pack(optimizer, policy) | dict(order=order, order_random=order_generator.get_state())
-        folder = args.run_dir / f"checkpoints/{step:08d}"
-        cost = dict(trained_on=machine(), training_seconds=round(time.time() - begin, 1))
-        save_checkpoint(folder, config | cost | dict(step=step), weights, state)
+    Args:
+        args: Settings of the run.
+        policy_class: Class of the policy.
+
+    Raises:
+        DemonstrationError: The demonstrations are not what the settings ask for.
+        CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
+    """
+
+    def __init__(self, args: TrainArgs, policy_class: type[VisuotactilePolicy]):
+        self.args = args
+        self.processes = Processes(args.device)
+        self.device = self.processes.device
+        keep_freed_memory(self.device)
+        seed_everything(args.seed)
+
+        spec = spec_of(vars(args))
+        episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
+        spec = with_taxel_shape(spec, episodes[0])
+        self.dataset = SequenceDataset(episodes, spec, args.policy.obs_horizon, args.policy.pred_horizon, self.device)
+        self.batch_size = args.batch_size * self.processes.count
+        self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
+        self.config = run_config(args, policy_class, self.dataset)
+
+        self.policy = self._make_policy(policy_class)
+        self.optimizer = torch.optim.AdamW(
+            self.policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay, fused=True
+        )
+        self.schedule = get_cosine_schedule_with_warmup(self.optimizer, args.warmup_steps, self.total_steps)
+        self.ema = EMAModel(
+            self.policy.parameters(), args.ema_max_decay, use_ema_warmup=True, power=args.ema_power, inv_gamma=1.0, foreach=True
+        )
+        self.order = SampleOrder(len(self.dataset), args.seed)
+        self.losses = RecentLosses(args.log_every, self.device)
+        self.step, self.begin = 0, time.time()
+        if args.resume:
+            self._resume()
+        if not self.processes.first:  # each process draws its own noise
+            torch.manual_seed(args.seed + RANK_SEED_STRIDE * self.processes.rank + self.step)
+
+        self.model = self.processes.with_mean_gradients(self.policy).train()
+        self.log = RunLog(args.run_dir, self.config, args.resume, args.wandb_project) if self.processes.first else None
+        self.evaluation = BackgroundEvaluation(
+            args.run_dir / "evaluations", args.eval_episodes, args.eval_workers, args.eval_env_kwargs
+        )
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the checkpoints."""
+        return self.args.run_dir / "checkpoints"
+
+    def run(self) -> Path:
+        """Train to the last step, and return the last checkpoint.
+
+        Raises:
+            TrainingError: The loss is not a finite number.
+        """
+        with progress_bar(disable=not self.processes.first) as bar:
+            task = bar.add_task("training", total=self.total_steps, completed=self.step)
+            while self.step < self.total_steps:
+                self.take_step()
+                due = self.step % self.args.save_every == 0 or self.step == self.total_steps
+                if self.losses.full or due:  # the only place that waits for the device
+                    bar.update(task, description=f"training, loss {self._log_loss():.4f}")
+                if due:
+                    self._save_and_evaluate()
+                if self.step % self.args.log_every == 0:
+                    self._log_evaluations()
+                bar.update(task, completed=self.step)
+        return self._finish()
+
+    def take_step(self) -> None:
+        """Take one gradient step on the next batch."""
+        batch = self.order.take(self.batch_size)[self.processes.rank :: self.processes.count]
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.precision == "bf16"):
+            loss = self.model(*self.dataset.sample(batch.to(self.device)))
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizer.step()
+        self.schedule.step()
+        self.ema.step(self.policy.parameters())
+        self.losses.add(loss, batch)
+        self.step += 1
+
+    def save(self) -> Path:
+        """Write a checkpoint of the present step, make it the last, and return its folder."""
+        weights = dict(self.policy.state_dict())
+        for (name, _), averaged in zip(self.policy.named_parameters(), self.ema.shadow_params, strict=True):
+            weights[name] = averaged
+        state = pack(self.optimizer, self.policy) | self.order.state_dict()
+        cost = dict(trained_on=machine(), training_seconds=round(time.time() - self.begin, 1))
+        folder = self.checkpoints / f"{self.step:08d}"
+        save_checkpoint(folder, self.config | cost | dict(step=self.step), weights, state)
         make_last(folder)
         return folder
 
-    # training
-    log = RunLog(args.run_dir, config, args.resume, args.wandb_project) if processes.first else None
-    evaluation = BackgroundEvaluation(args.run_dir / "evaluations", args.eval_episodes, args.eval_workers, args.eval_env_kwargs)
-    model = processes.joined(policy).train()
-    precision = torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16")
-    losses, batches = torch.zeros(args.log_every, device=device), []
-    with progress_bar(disable=not processes.first) as bar:
-        task = bar.add_task("training", total=total_steps, completed=start)
-        for step in range(start + 1, total_steps + 1):
-            if len(order) < batch_size:
-                order = torch.cat([order, torch.randperm(len(dataset), generator=order_generator)])
-            batch, order = order[processes.rank : batch_size : processes.count], order[batch_size:]
-            with precision:
-                loss = model(*dataset.sample(batch.to(device)))
-            optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            ema.step(policy.parameters())
-            losses[len(batches)] = loss.detach()
-            batches.append(batch)
-            due = step % args.save_every == 0 or step == total_steps
-            if len(batches) == args.log_every or due:  # the device is waited for only here
-                _require_numbers(losses[: len(batches)], batches, step, dataset, args.run_dir)
-                mean = float(losses[: len(batches)].mean())
-                batches = []
-                if log:
-                    log.write(dict(step=step, loss=mean, lr=schedule.get_last_lr()[0], epoch=step / steps_per_epoch))
-                bar.update(task, description=f"training, loss {mean:.4f}")
-            if due and log:
-                checkpoint = save(step)
-                if args.eval_episodes:
-                    evaluation.submit(checkpoint)
-                prune(checkpoint.parent, args.keep, evaluation.in_use)
-            if log and step % args.log_every == 0:
-                for rate in evaluation.finished():
-                    log.write(dict(step=step) | rate)
-            bar.update(task, completed=step)
-    if log:
-        for rate in evaluation.finished(wait=True):
-            log.write(dict(step=total_steps) | rate)
-        prune(last.parent, args.keep, set())
-        log.close()
-    processes.wait()
-    processes.close()
-    return last
+    def _make_policy(self, policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
+        """The policy before training, on the device."""
+        policy = policy_class(self.args.policy, self.dataset.spec, self.config["action_dim"]).to(self.device)
+        lay_out_channels_last(policy)
+        if self.args.tacrgb_weights and not self.args.resume:
+            load_pretrained(policy, self.args.tacrgb_weights)
+        policy.fit_normalizers(self.dataset.observations, self.dataset.actions)
+        if self.args.compile:
+            policy.encoder.compile()
+            policy.unet.compile()
+        return policy
+
+    def _resume(self) -> None:
+        """Continue from the last checkpoint, bit for bit as if the run had not stopped."""
+        last = self.checkpoints / "last"
+        saved = checkpoint_config(last)
+        require_same_config(saved, self.config, FREE_ON_RESUME, last)
+        state = read_tensors(last / TRAINING)
+        self.order.load_state_dict(state)
+        unpack(state, self.optimizer, self.policy, last)
+        averaged = read_tensors(last / WEIGHTS)
+        self.ema.shadow_params = [averaged[name].to(self.device) for name, _ in self.policy.named_parameters()]
+        self.ema.optimization_step = self.step = saved["step"]
+        fast_forward(self.schedule, self.step)
+        self.begin -= saved["training_seconds"]
+
+    def _log_loss(self) -> float:
+        """Log the mean loss since the last entry, and return it."""
+        mean = self.losses.take_mean(self.step, self.dataset.names)
+        if self.log:
+            epoch = self.step / math.ceil(len(self.dataset) / self.batch_size)
+            self.log.write(dict(step=self.step, loss=mean, lr=self.schedule.get_last_lr()[0], epoch=epoch))
+        return mean
+
+    def _save_and_evaluate(self) -> None:
+        """Write a checkpoint, queue its evaluation, and delete old checkpoints."""
+        if not self.processes.first:
+            return
+        checkpoint = self.save()
+        if self.args.eval_episodes:
+            self.evaluation.submit(checkpoint)
+        prune(self.checkpoints, self.args.keep, self.evaluation.in_use)
+
+    def _log_evaluations(self, wait: bool = False) -> None:
+        """Log the evaluations that have finished; wait for all of them if asked."""
+        if self.log:
+            for rate in self.evaluation.finished(wait):
+                self.log.write(dict(step=self.step) | rate)
+
+    def _finish(self) -> Path:
+        """Wait for the evaluations and for the other processes, and return the last checkpoint."""
+        if self.log:
+            self._log_evaluations(wait=True)
+            prune(self.checkpoints, self.args.keep, set())
+            self.log.close()
+        self.processes.wait()
+        self.processes.close()
+        return self.checkpoints / "last"
 
 
-def _require_numbers(losses: torch.Tensor, batches: list[torch.Tensor], step: int, dataset: SequenceDataset, run: Path) -> None:
-    wrong = (~torch.isfinite(losses)).nonzero()
-    if len(wrong):
-        first = int(wrong[0])
-        where = f"step {step - len(batches) + 1 + first} is {float(losses[first])}, on {dataset.names(batches[first])}"
-        raise TrainingError(
-            f"the loss of {where}; look at these, lower --lr, or train with --precision fp32; what {run} holds is from before"
-        )
+class SampleOrder:
+    """Indices of samples, in an order that is shuffled anew for each epoch.
+
+    Args:
+        num_samples: Number of samples of an epoch.
+        seed: Seed of the order.
+    """
+
+    def __init__(self, num_samples: int, seed: int):
+        self.num_samples = num_samples
+        self._generator = torch.Generator().manual_seed(seed)
+        self._left = torch.empty(0, dtype=torch.long)
+
+    def take(self, count: int) -> torch.Tensor:
+        """The next `count` indices; those left of an epoch are followed by the first of the next."""
+        if len(self._left) < count:
+            self._left = torch.cat([self._left, torch.randperm(self.num_samples, generator=self._generator)])
+        taken, self._left = self._left[:count], self._left[count:]
+        return taken
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The indices left of this epoch, and the state of the random number generator."""
+        return dict(order=self._left, order_random=self._generator.get_state())
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Continue from a state of `state_dict`; further entries are ignored."""
+        self._left = state["order"]
+        self._generator.set_state(state["order_random"])
+
+
+class RecentLosses:
+    """The losses since the last entry of the log, kept on the device so that steps need not wait for it.
+
+    Args:
+        size: Largest number of losses.
+        device: Device that computes them.
+    """
+
+    def __init__(self, size: int, device: torch.device):
+        self._losses, self._batches = torch.zeros(size, device=device), []
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for another loss."""
+        return len(self._batches) == len(self._losses)
+
+    def add(self, loss: torch.Tensor, batch: torch.Tensor) -> None:
+        """Keep the loss of a batch of samples, given by their indices."""
+        self._losses[len(self._batches)] = loss.detach()
+        self._batches.append(batch)
+
+    def take_mean(self, step: int, names: Callable[[torch.Tensor], str]) -> float:
+        """The mean of the losses, which are then forgotten.
+
+        Args:
+            step: Gradient step of the last loss.
+            names: Function from a batch to the names of its samples, for the error's message.
+
+        Raises:
+            TrainingError: A loss is not a finite number; the message names the step and the samples of the first such loss.
+        """
+        losses, batches = self._losses[: len(self._batches)], self._batches
+        wrong = (~torch.isfinite(losses)).nonzero()
+        if len(wrong):
+            first = int(wrong[0])
+            raise TrainingError(
+                f"the loss of step {step - len(batches) + 1 + first} is {float(losses[first])}, on {names(batches[first])}; "
+                "look at these demonstrations, lower --lr, or train with --precision fp32. Saved checkpoints are from before"
+            )
+        self._batches = []
+        return float(losses.mean())
+
+
+def seed_everything(seed: int) -> None:
+    """Seed every global random number generator that training or a library draws from."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 (libraries draw from it)
+    torch.manual_seed(seed)
+
+
+def with_taxel_shape(spec: ObservationSpec, episode: Episode) -> ObservationSpec:
+    """The observations, with the shape of force fields that an episode has."""
+    shapes = {episode[key].shape[1:3] for key in spec.force_fields}
+    return replace(spec, taxel_shape=shapes.pop()) if shapes else spec
+
+
+def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
+    """The settings of a run, and the facts of its data that its policy depends on, in types that json knows."""
+    return as_json(args) | dict(
+        policy_name=policy_class.name,
+        action_dim=dataset.actions.shape[1],
+        taxel_shape=list(dataset.spec.taxel_shape),
+        num_demos=dataset.num_episodes,
+        num_samples=len(dataset),
+    )
+
+
+def fast_forward(schedule: LambdaLR, steps: int) -> None:
+    """Set a new schedule, and its optimiser's learning rates, to where they are after a number of steps."""
+    schedule.last_epoch = steps
+    groups = zip(schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True)
+    for group, base_lr, factor in groups:
+        group["lr"] = base_lr * factor(steps)

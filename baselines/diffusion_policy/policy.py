@@ -1,10 +1,10 @@
 """Diffusion Policy (Chi et al. 2023, "Diffusion Policy: Visuomotor Policy Learning via Action Diffusion"), CNN version."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
@@ -14,25 +14,26 @@ from baselines.common.policy import PolicyConfig, VisuotactilePolicy
 
 @dataclass
 class DiffusionConfig(PolicyConfig):
-    """Defaults: the paper's."""
+    """Settings of the Diffusion Policy; the defaults are the paper's."""
 
     diffusion_steps: int = 100
+    """Number of diffusion steps in training."""
     prediction: Literal["epsilon", "sample"] = "epsilon"
-    """what the network predicts: the noise (the paper's), or the clean actions, which short trainings learn far sooner"""
+    """Output of the network: the noise, as in the paper, or the clean actions, which a short training learns far sooner."""
     sampler: Literal["ddpm", "ddim"] = "ddpm"
-    """with all steps; with fewer it is always DDIM (Song et al. 2021)"""
+    """Sampler if generation takes all diffusion steps; with fewer it is always DDIM (Song et al. 2021)."""
 
 
 class DiffusionPolicy(VisuotactilePolicy):
-    """Denoises an action sequence."""
+    """Diffusion Policy (Chi et al. 2023), the CNN version: denoises an action sequence."""
 
     name = "diffusion_policy"
     Config = DiffusionConfig
-    config: DiffusionConfig
+    config: DiffusionConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
         super().__init__(config, spec, action_dim)
-        schedule = dict(
+        schedule: dict[str, Any] = dict(
             num_train_timesteps=config.diffusion_steps,
             beta_schedule="squaredcos_cap_v2",
             prediction_type=config.prediction,
@@ -41,16 +42,16 @@ class DiffusionPolicy(VisuotactilePolicy):
         self.ddpm, self.ddim = DDPMScheduler(**schedule), DDIMScheduler(**schedule)
 
     def generation_loss(self, clean, condition):
-        """Mean squared error of the predicted noise, or clean actions."""
+        """The mean squared error of the predicted noise or clean actions."""
         noise = torch.randn_like(clean)
-        step = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
+        step: Any = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
         predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
         return F.mse_loss(predicted, noise if self.config.prediction == "epsilon" else clean)
 
     def generate(self, condition, steps, generator):
         actions = self.noise(condition, generator)
         full = self.config.sampler == "ddpm" and steps >= self.config.diffusion_steps
-        scheduler = self.ddpm if full else self.ddim
+        scheduler: Any = self.ddpm if full else self.ddim
         scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
         for step in scheduler.timesteps:
             predicted = self.unet(actions, step.expand(len(actions)), condition)

@@ -3,7 +3,7 @@
     python baselines/diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
     python baselines/diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
 
-`paper` has the paper's hyperparameters, `cpu` a small network that learns on two cores in minutes.
+The preset `paper` has the paper's hyperparameters, `cpu` a small network that learns on two CPU cores in minutes.
 """
 
 import sys
@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from baselines.common.presets import for_cpu
-from baselines.common.training import TrainArgs
+from baselines.common.train_args import TrainArgs
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.registry import PolicySpec, Preset, preset_cli
 from manifeel_ms3.command_line import run
@@ -19,16 +19,21 @@ from manifeel_ms3.command_line import run
 
 @dataclass
 class Args(TrainArgs):
+    """Settings of a training run; the defaults are the paper's."""
+
     policy: DiffusionConfig = field(default_factory=DiffusionConfig)
     inference_steps: int = 100
-    """denoising steps in evaluation: as many as diffusion steps is DDPM, fewer is DDIM"""
+    """Number of denoising steps in evaluation; with as many as diffusion steps the sampler is DDPM, with fewer DDIM."""
     lr: float = 8e-5
     run_dir: Path = Path("runs/diffusion_policy")
 
 
 PRESETS = {
-    "paper": Preset("the paper's hyperparameters", Args(demos=())),
-    "cpu": Preset("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, prediction="sample")),
+    "paper": Preset("The paper's hyperparameters.", Args(demos=())),
+    "cpu": Preset(
+        "A small network that learns on two CPU cores in minutes.",
+        for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
+    ),
 }
 
 SPEC = PolicySpec(DiffusionPolicy, Args, PRESETS)

@@ -1,0 +1,1 @@
+"""Equivariant Diffusion Policy (Wang et al. 2024)."""

@@ -1,8 +1,8 @@
-"""Layers that turn with what they see, by eighths of a turn: the cyclic group C8 (Cohen & Welling 2016).
+"""Layers that are equivariant under eighths of a turn, the cyclic group C8 (Cohen & Welling 2016).
 
-A regular field holds, for each of its channels, one value for every rotation g: (B, C, 8, ...). When what is seen turns by h,
-the values of a regular field move from g to g + h. Rotations are counter-clockwise, of images as they are looked at (columns to
-the right, rows down) and of vectors with x to the right and y up.
+A regular field holds one value for every rotation g in each of its channels: (B, C, 8, ...). If the input turns by h, the
+values of a regular field move from g to g + h. Rotations are counter-clockwise, both of images as displayed (columns to the
+right, rows down) and of vectors with x to the right and y up.
 """
 
 import math
@@ -10,20 +10,22 @@ import math
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 
 ORDER = 8
-RING_WIDTH = 0.6  # pixels
+"""Number of rotations in the group."""
+RING_WIDTH = 0.6
+"""Standard deviation of a filter ring's radial profile, pixels, as in the public code of Weiler & Cesa (2019)."""
 
 
 def rotation(g: int) -> np.ndarray:
-    """(2, 2): turns vectors by g eighths of a turn."""
+    """The matrix (2, 2) that turns vectors by g eighths of a turn."""
     c, s = math.cos(2 * math.pi * g / ORDER), math.sin(2 * math.pi * g / ORDER)
     return np.array([[c, -s], [s, c]])
 
 
 def representation(size: int, pairs: tuple[tuple[int, int], ...]) -> torch.Tensor:
-    """(8, size, size): how numbers turn of which these pairs are vectors and the others are scalars."""
+    """The matrices (8, size, size) that turn `size` numbers, of which the given pairs are vectors and the others scalars."""
     turns = np.tile(np.eye(size), (ORDER, 1, 1))
     for g in range(ORDER):
         for pair in pairs:
@@ -31,20 +33,20 @@ def representation(size: int, pairs: tuple[tuple[int, int], ...]) -> torch.Tenso
     return torch.as_tensor(turns, dtype=torch.float32)
 
 
-def in_every_frame(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """Numbers (..., D) as they look from frames turned by every g: (8, ..., D). They are regular, along the first axis."""
+def to_regular(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """Numbers (..., D) in the frames that are turned by every g: a regular field (8, ..., D) along the first axis."""
     return torch.einsum("gba,...b->g...a", turns, values)  # the inverse of a rotation is its transpose
 
 
-def from_every_frame(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
-    """The mean (..., D) of numbers (8, ..., D) that were said in every frame."""
+def from_regular(values: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """The mean (..., D) over all frames of numbers (8, ..., D), each turned back from its frame."""
     return torch.einsum("gab,g...b->...a", turns, values) / ORDER
 
 
 def filter_basis(size: int) -> torch.Tensor:
-    """(8, n, size^2): rings of n circular waves, of unit norm, turned by every g (Weiler & Cesa 2019, section 2.7).
+    """Filters (8, n, size^2): n circular waves on rings, of unit norm, turned by every g (Weiler & Cesa 2019, section 2.7).
 
-    What is made of them turns as smoothly as they do, where a free filter of 3 x 3 has nothing between its weights.
+    Sums of these filters turn as smoothly as the waves do, whereas a free filter of 3 x 3 is not defined between its weights.
     """
     half = size // 2
     row, column = np.divmod(np.arange(size * size), size)
@@ -62,10 +64,15 @@ def filter_basis(size: int) -> torch.Tensor:
 
 
 class GroupConv(nn.Module):
-    """Convolution of regular fields, or of an image's plain channels (`lifting`), into regular fields.
+    """Convolution (B, C * 8, H, W) of regular fields, or (B, C, H, W) of an image, to regular fields (B, C * 8, H, W).
 
-    Takes and gives (B, C * 8, H, W), the rotations of a channel side by side; lifting takes (B, C, H, W). Its sides keep their
-    lengths.
+    The rotations of a channel lie next to each other. Height and width stay the same.
+
+    Args:
+        inputs: Number of input channels.
+        outputs: Number of output channels.
+        size: Side of the filters, pixels.
+        lifting: Whether the input is an image, not a regular field.
     """
 
     basis: torch.Tensor
@@ -80,7 +87,7 @@ class GroupConv(nn.Module):
         self.weight = nn.Parameter(torch.randn(outputs, inputs, seen, waves) * math.sqrt(2 / (inputs * seen * waves)))
         self.bias = nn.Parameter(torch.zeros(outputs))
         g = torch.arange(ORDER)
-        self.register_buffer("shift", (g - g[:, None]) % ORDER, persistent=False)  # of the input's rotation, seen from g
+        self.register_buffer("shift", (g - g[:, None]) % ORDER, persistent=False)  # the input's rotation relative to g
 
     def forward(self, fields: torch.Tensor) -> torch.Tensor:
         turned = torch.einsum("gqp,oihq->goihp", self.basis, self.weight)
@@ -90,13 +97,18 @@ class GroupConv(nn.Module):
         outputs, inputs, seen, _ = self.weight.shape
         kernel = turned.movedim(0, 1).reshape(outputs * ORDER, inputs * seen, self.size, self.size)
         rim = self.size // 2
-        if rim:  # zeros would draw a square, which no turn but a quarter leaves as it is
+        if rim:  # padding with zeros would draw a square border, which only quarter turns leave unchanged
             fields = F.pad(fields, (rim, rim, rim, rim), mode="replicate")
         return F.conv2d(fields, kernel, self.bias.repeat_interleave(ORDER))
 
 
 class FieldNorm(nn.Module):
-    """GroupNorm that treats the rotations of a channel alike."""
+    """GroupNorm whose scale and shift are the same for all rotations of a channel.
+
+    Args:
+        groups: Number of groups.
+        channels: Number of regular channels.
+    """
 
     def __init__(self, groups: int, channels: int):
         super().__init__()
@@ -108,7 +120,7 @@ class FieldNorm(nn.Module):
 
 
 def halve(fields: torch.Tensor) -> torch.Tensor:
-    """Half the height and width, by means over places that lie symmetrically, of even and of odd sides."""
+    """Fields (B, C, H, W) of half the height and width, by means over windows that are symmetric for even and odd sides."""
     if fields.shape[-1] % 2 == 0:
         return F.avg_pool2d(fields, 2)
     return F.avg_pool2d(fields, 3, stride=2, padding=1, count_include_pad=False)

@@ -1,34 +1,43 @@
-"""Encoder and denoiser of an equivariant policy: when the scene turns about the vertical, what they say turns with it."""
+"""Encoder and denoiser of the equivariant policy: if the scene turns about the vertical axis, their outputs turn with it."""
+
+from itertools import pairwise
+from typing import Any
 
 import torch
 import torch.nn as nn
 
-from baselines.common.encoders import IMAGE_FEATURES, EncoderConfig, cropped, field_encoder, image_encoder
+from baselines.common.encoders import IMAGE_FEATURES, EncoderConfig, cropped, field_encoder, image_encoder, network_images
 from baselines.common.observation import POSE, POSE_FEATURES, ObservationSpec, is_tactile
 from baselines.common.unet import ConditionalUnet1D
+from manifeel_ms3.errors import InvalidArgumentError
 
-from .groups import ORDER, FieldNorm, GroupConv, from_every_frame, halve, in_every_frame, representation
+from .groups import ORDER, FieldNorm, GroupConv, from_regular, halve, representation, to_regular
 
-POSE_PAIRS = ((0, 1), (3, 4), (6, 7))  # position, and the rotation matrix's first two columns: x and y turn, z does not
-ACTION_PAIRS = {  # of positions and rotation vectors, by the number of actions; 5: turning about the vertical alone
-    5: ((0, 1),),
-    6: ((0, 1), (3, 4)),
-    7: ((0, 1), (3, 4)),
+POSE_PAIRS = ((0, 1), (3, 4), (6, 7))
+"""Indices of x and y, which turn, in the position and the two columns of the rotation matrix that encode a pose."""
+ACTION_PAIRS = {
+    5: ((0, 1),),  # position, rotation about the vertical axis, gripper
+    6: ((0, 1), (3, 4)),  # position, rotation vector
+    7: ((0, 1), (3, 4)),  # position, rotation vector, gripper
 }
+"""Indices of x and y, which turn, in the positions and rotation vectors of actions, by the number of an action's numbers."""
+CHANNELS_PER_GROUP = 16
+"""Channels that the blocks normalise together."""
 XY = representation(2, ((0, 1),))
 
 
 class GroupBlock(nn.Module):
-    """Two convolutions of regular fields with a skip."""
+    """Two convolutions of regular fields with a skip connection."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__()
+        groups = max(outputs // CHANNELS_PER_GROUP, 1)
         self.net = nn.Sequential(
             GroupConv(inputs, outputs, 3),
-            FieldNorm(max(outputs // 16, 1), outputs),
+            FieldNorm(groups, outputs),
             nn.ReLU(),
             GroupConv(outputs, outputs, 3),
-            FieldNorm(max(outputs // 16, 1), outputs),
+            FieldNorm(groups, outputs),
         )
         self.skip = GroupConv(inputs, outputs, 1)
 
@@ -37,9 +46,12 @@ class GroupBlock(nn.Module):
 
 
 class EquivariantImageEncoder(nn.Module):
-    """Key points of a picture (B, 3, H, W) as every frame sees them: (8, B, 64).
+    """Key points of an image (B, 3, H, W) in every frame: (8, B, 64).
 
-    Each of 32 heat maps per frame gives its expected place (`SpatialSoftmax`), in that frame's axes.
+    In each frame, 32 heat maps give their expected coordinates (`SpatialSoftmax`) along the frame's axes.
+
+    Args:
+        hidden: Number of regular channels of the last block.
     """
 
     axes: torch.Tensor
@@ -48,29 +60,34 @@ class EquivariantImageEncoder(nn.Module):
         super().__init__()
         widths = [max(hidden // k, 1) for k in (8, 4, 2, 1)]
         self.lift = nn.Sequential(GroupConv(3, widths[0], 5, lifting=True), FieldNorm(1, widths[0]), nn.ReLU())
-        self.blocks = nn.ModuleList(GroupBlock(i, o) for i, o in zip(widths, widths[1:], strict=False))
+        self.blocks = nn.ModuleList(GroupBlock(i, o) for i, o in pairwise(widths))
         self.score = GroupConv(hidden, IMAGE_FEATURES // 2, 1)
         self.register_buffer("axes", XY, persistent=False)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         fields = self.lift(halve(image))
         for k, block in enumerate(self.blocks):
-            fields = block(halve(fields) if k < 2 else fields)  # an eighth of the picture's size, at the end
+            fields = block(halve(fields) if k < 2 else fields)  # an eighth of the image's size at the end
         right = torch.linspace(-1, 1, fields.shape[3], device=image.device)
         up = torch.linspace(1, -1, fields.shape[2], device=image.device)
-        heat = self.score(fields).masked_fill(
-            torch.hypot(right, up[:, None]) > 1, -torch.inf
-        )  # a turn does not move the circle
+        outside = torch.hypot(right, up[:, None]) > 1  # turns leave the inscribed circle unchanged
+        heat = self.score(fields).masked_fill(outside, -torch.inf)
         weight = heat.flatten(2).softmax(-1).view(len(image), -1, ORDER, *fields.shape[2:])
         place = torch.stack([(weight.sum(3) * right).sum(-1), (weight.sum(4) * up).sum(-1)], dim=-1)  # (B, 32, 8, 2)
         return torch.einsum("gba,ncgb->gnca", self.axes, place).flatten(2)
 
 
 class EquivariantObservationEncoder(nn.Module):
-    """Features (B, 8, obs_horizon * F) of a window of observations, as every frame sees them.
+    """Features (B, 8, obs_horizon * F) of a window of observations in every frame.
 
-    Cameras turn with the scene, and so does the tool's pose. A pad turns with the hand that it is on: what it feels is the same
-    from every frame, and goes through the encoders that all policies use.
+    Camera images and the tool pose turn with the scene. A tactile sensor turns with the hand that carries it, so its
+    observations are the same in every frame; their encoders are those of all policies.
+
+    Args:
+        config: Names of the networks.
+        spec: Observations of the policy.
+        hidden: Number of regular channels of the camera encoders.
+        obs_horizon: Number of time steps in a window.
     """
 
     turns: torch.Tensor
@@ -82,22 +99,21 @@ class EquivariantObservationEncoder(nn.Module):
         self.pads = [key for key in spec.images if is_tactile(key)]
         self.views = nn.ModuleList(EquivariantImageEncoder(hidden) for _ in self.cameras)
         self.images = nn.ModuleList(image_encoder(config, spec, key) for key in self.pads)
-        self.fields = nn.ModuleList(field_encoder(config) for _ in spec.force_fields)
+        self.fields = nn.ModuleList(field_encoder(config, spec) for _ in spec.force_fields)
         sensors = len(self.views) + len(self.images) + len(self.fields)
         self.out_features = obs_horizon * (IMAGE_FEATURES * sensors + POSE_FEATURES)
         self.register_buffer("turns", representation(POSE_FEATURES, POSE_PAIRS), persistent=False)
 
     def forward(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
-        """`obs`: {key: (B, obs_horizon, ...)}: images uint8, the rest normalised floats."""
+        """Encode observations {key: (B, obs_horizon, ...)}: images as uint8, the rest as normalised floats."""
         batch, horizon = obs[POSE].shape[:2]
 
-        def picture(key: str) -> torch.Tensor:
-            shown = cropped(obs[key], self.crop, self.training)
-            return shown.flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0
+        def image(key: str) -> torch.Tensor:
+            return network_images(cropped(obs[key], self.crop, self.training))
 
-        turning = [in_every_frame(obs[POSE].flatten(0, 1), self.turns)]
-        turning += [net(picture(key)) for key, net in zip(self.cameras, self.views, strict=True)]
-        still = [net(picture(key)) for key, net in zip(self.pads, self.images, strict=True)]
+        turning = [to_regular(obs[POSE].flatten(0, 1), self.turns)]
+        turning += [net(image(key)) for key, net in zip(self.cameras, self.views, strict=True)]
+        still = [net(image(key)) for key, net in zip(self.pads, self.images, strict=True)]
         still += [
             net(obs[key].flatten(0, 1).movedim(-1, 1)) for key, net in zip(self.spec.force_fields, self.fields, strict=True)
         ]
@@ -106,19 +122,31 @@ class EquivariantObservationEncoder(nn.Module):
 
 
 class EquivariantUnet(nn.Module):
-    """One U-Net says in every frame what it makes of the actions and the condition there; the answer is the mean of all."""
+    """One U-Net predicts in every frame from the actions and the condition in that frame; the output is the mean of all frames.
+
+    Args:
+        action_dim: Numbers of an action.
+        condition_dim: Numbers of the condition in a frame.
+        **unet: Further arguments of `ConditionalUnet1D`.
+
+    Raises:
+        InvalidArgumentError: It is not known how actions of so many numbers turn.
+    """
 
     turns: torch.Tensor
 
-    def __init__(self, action_dim: int, *args):
+    def __init__(self, action_dim: int, condition_dim: int, **unet: Any):
         super().__init__()
         if action_dim not in ACTION_PAIRS:
-            raise ValueError(f"{action_dim} actions: it is known how {sorted(ACTION_PAIRS)} turn; add yours to ACTION_PAIRS")
-        self.unet = ConditionalUnet1D(action_dim, *args)
+            raise InvalidArgumentError(
+                f"action_dim={action_dim}: it is only known how actions of {sorted(ACTION_PAIRS)} numbers turn; add yours to "
+                "ACTION_PAIRS"
+            )
+        self.unet = ConditionalUnet1D(action_dim, condition_dim, **unet)
         self.register_buffer("turns", representation(action_dim, ACTION_PAIRS[action_dim]), persistent=False)
 
     def forward(self, actions: torch.Tensor, step: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """(B, T, A), at steps (B,), under conditions (B, 8, C)."""
-        seen = in_every_frame(actions, self.turns).flatten(0, 1)
-        said = self.unet(seen, step.repeat(ORDER), condition.movedim(1, 0).flatten(0, 1))
-        return from_every_frame(said.view(ORDER, *actions.shape), self.turns)
+        """The prediction (B, T, A) for actions (B, T, A) at steps (B,), given conditions (B, 8, C)."""
+        regular = to_regular(actions, self.turns).flatten(0, 1)
+        predicted = self.unet(regular, step.repeat(ORDER), condition.movedim(1, 0).flatten(0, 1))
+        return from_regular(predicted.view(ORDER, *actions.shape), self.turns)

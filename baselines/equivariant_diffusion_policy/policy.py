@@ -1,4 +1,4 @@
-"""Equivariant Diffusion Policy (Wang et al. 2024): Diffusion Policy with networks that turn with the scene, by C8."""
+"""Equivariant Diffusion Policy (Wang et al. 2024): Diffusion Policy with networks that are equivariant under C8."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -7,7 +7,7 @@ import torch
 
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE
-from baselines.common.policy import module_name
+from baselines.common.policy import unet_settings
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 
 from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantObservationEncoder, EquivariantUnet
@@ -15,38 +15,45 @@ from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantObservationEncoder, E
 
 @dataclass
 class EquivariantConfig(DiffusionConfig):
-    """Defaults: the paper's."""
+    """Settings of the Equivariant Diffusion Policy; the defaults are the paper's."""
 
     prediction: Literal["epsilon", "sample"] = "sample"
     sampler: Literal["ddpm", "ddim"] = "ddim"
     hidden: int = 128
-    """regular channels of the cameras' encoder at its end; each holds eight numbers"""
+    """Number of regular channels at the end of the camera encoder; each has eight numbers, one for every rotation of C8."""
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):
+    """Equivariant Diffusion Policy (Wang et al. 2024): its actions turn with the scene about the vertical axis."""
+
     name = "equivariant_diffusion_policy"
     Config = EquivariantConfig
-    config: EquivariantConfig
+    config: EquivariantConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def make_networks(self):
         config = self.config
         encoder = EquivariantObservationEncoder(config.encoder, self.spec, config.hidden, config.obs_horizon)
-        shape = (config.channels, config.kernel, config.groups, config.step_embedding)
-        return encoder, EquivariantUnet(self.action_dim, encoder.out_features, *shape)
+        return encoder, EquivariantUnet(self.action_dim, encoder.out_features, **unet_settings(config))
 
     def fit_normalizers(self, observations, actions):
         super().fit_normalizers(observations, actions)
-        pose = self.obs_normalizers[module_name(POSE)]
+        pose = self.obs_normalizer(POSE)
         position, *columns = POSE_PAIRS
-        _alike(pose, position)
+        _share_scale(pose, position)
         for pair in columns:
-            _alike(pose, pair, centred=True)
+            _share_scale(pose, pair, centred=True)
         for pair in ACTION_PAIRS[self.action_dim]:
-            _alike(self.action_normalizer, pair, centred=True)
+            _share_scale(self.action_normalizer, pair, centred=True)
 
 
-def _alike(normalizer: Normalizer, pair: tuple[int, int], centred: bool = False) -> None:
-    """Scale both numbers of a vector alike, around the origin or around the middle of their ranges, so that it can turn."""
+def _share_scale(normalizer: Normalizer, pair: tuple[int, int], centred: bool = False) -> None:
+    """Scale the x and y of a vector by the same factor, so that the scaled vector turns as the vector does.
+
+    Args:
+        normalizer: Normaliser whose ranges are changed.
+        pair: Indices of x and y.
+        centred: Whether the ranges are centred on 0; else on the middle of the data's ranges.
+    """
     low, high = normalizer.low[list(pair)], normalizer.high[list(pair)]
     centre = torch.zeros_like(low) if centred else (low + high) / 2
     half = torch.maximum(high - centre, centre - low).max()

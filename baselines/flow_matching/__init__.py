@@ -1,0 +1,1 @@
+"""Flow Matching (Lipman et al. 2023)."""

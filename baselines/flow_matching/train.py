@@ -4,8 +4,8 @@
     python baselines/flow_matching/train.py consistency --demos trajectory.h5 --obs-mode rgb+tacff
     python baselines/flow_matching/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
 
-`paper` has the paper's hyperparameters, `consistency` is trained for generation in one step, `cpu` is a small network that
-learns on two cores in minutes.
+The preset `paper` has the paper's hyperparameters, `consistency` trains for generation in one step, and `cpu` has a small
+network that learns on two CPU cores in minutes.
 """
 
 import sys
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from baselines.common.presets import for_cpu
-from baselines.common.training import TrainArgs
+from baselines.common.train_args import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
 from baselines.registry import PolicySpec, Preset, preset_cli
 from manifeel_ms3.command_line import run
@@ -21,16 +21,24 @@ from manifeel_ms3.command_line import run
 
 @dataclass
 class Args(TrainArgs):
+    """Settings of a training run; the defaults are the paper's."""
+
     policy: FlowConfig = field(default_factory=FlowConfig)
     inference_steps: int = 10
-    """Euler steps from noise to actions, in evaluation"""
+    """Number of Euler steps from noise to actions in evaluation."""
     run_dir: Path = Path("runs/flow_matching")
 
 
 PRESETS = {
-    "paper": Preset("the paper's hyperparameters", Args(demos=())),
-    "consistency": Preset("for one-step generation", Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1)),
-    "cpu": Preset("a small network for two CPU cores", for_cpu(Args(demos=()), inference_steps=8, prediction="sample")),
+    "paper": Preset("The paper's hyperparameters.", Args(demos=())),
+    "consistency": Preset(
+        "Consistency training, for generation in one step.",
+        Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1),
+    ),
+    "cpu": Preset(
+        "A small network that learns on two CPU cores in minutes.",
+        for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
+    ),
 }
 
 SPEC = PolicySpec(FlowMatchingPolicy, Args, PRESETS)

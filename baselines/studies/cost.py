@@ -16,7 +16,7 @@ import torch
 import manifeel_ms3  # noqa: F401
 from baselines.common.agent import spec_of
 from baselines.common.observation import POSE, POSE_FEATURES
-from baselines.common.training import default_steps
+from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation.provenance import machine

@@ -57,7 +57,7 @@ class Grid:
     """demonstrations recorded; null: the paper's number, or as many as are trained on"""
     preset: str = "paper"
     train: dict[str, Any] = field(default_factory=dict)
-    """further flags of train.py, such as {steps: 2000, policy.channels: [64, 128]}"""
+    """further flags of train.py, such as {steps: 2000, policy.down-dims: [64, 128]}"""
     encoder_flags: dict[str, dict[str, Any]] = field(default_factory=dict)
     """flags that come with an encoder of TacRGB, such as {t3: {image-size: 224}}"""
     episodes: int = 50

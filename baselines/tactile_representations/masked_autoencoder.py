@@ -1,45 +1,57 @@
-"""Masked autoencoding (He et al. 2022): a transformer sees a part of a picture's patches and tells the others."""
+"""Masked autoencoding (He et al. 2022): a transformer encodes some patches of an image, a decoder predicts the others."""
 
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 
 from .representation import TokenRepresentation
 from .vit import EPS, Block
 
-WIDTH, DEPTH, HEADS = 256, 2, 8  # of the decoder, which is thrown away
+WIDTH, DEPTH, HEADS = 256, 2, 8
+"""Size of the decoder, which only pretraining needs."""
+VARIANCE_EPS = 1e-4
+"""Added to the variance of a patch before the division by it, so that uniform patches stay small."""
 
 
 class MaskedAutoencoder(nn.Module):
-    """The loss of a batch of TacRGB pictures (B, 3, H, W) in [-1, 1], of `size` pixels a side; `masked`: share of patches."""
+    """The loss of a batch of TacRGB images (B, 3, size, size) in [-1, 1].
+
+    Args:
+        representation: The transformer that is trained.
+        size: Side of the images, pixels.
+        masked: Share of the patches that is hidden; 0.75 as in the paper.
+    """
+
+    mask_token: torch.Tensor
 
     def __init__(self, representation: TokenRepresentation, size: int, masked: float = 0.75):
         super().__init__()
         self.representation, self.masked = representation, masked
-        self.patch, patches = representation.patch, (size // representation.patch) ** 2
+        patches = (size // representation.patch) ** 2
         self.narrow, self.mask_token = nn.Linear(representation.width, WIDTH), nn.Parameter(torch.zeros(1, 1, WIDTH))
-        self.places = nn.Parameter(0.02 * torch.randn(1, patches, WIDTH))
+        self.pos_embed = nn.Parameter(0.02 * torch.randn(1, patches, WIDTH))
         self.decoder = nn.Sequential(*(Block(WIDTH, HEADS) for _ in range(DEPTH)), nn.LayerNorm(WIDTH, EPS))
-        self.out = nn.Linear(WIDTH, 3 * self.patch**2)
+        self.out = nn.Linear(WIDTH, 3 * representation.patch**2)
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
-        """Mean squared error of the hidden patches, each brought to mean 0 and deviation 1."""
+        """Mean squared error of the hidden patches, each normalised to mean 0 and standard deviation 1."""
         tokens = self.representation.embed(image)
         order = torch.rand(tokens.shape[:2], device=image.device).argsort(1)
         kept = order[:, : round((1 - self.masked) * tokens.shape[1])]
-        told = self._decoded(self.representation.encode(_pick(tokens, kept)), kept, tokens.shape[1])
-        patches = F.unfold(image, self.patch, stride=self.patch).transpose(1, 2)
-        wanted = (patches - patches.mean(-1, keepdim=True)) / (patches.var(-1, keepdim=True) + 1e-4).sqrt()
+        predicted = self._decoded(self.representation.encode(_pick(tokens, kept)), kept, tokens.shape[1])
+        patch = self.representation.patch
+        patches = F.unfold(image, patch, stride=patch).transpose(1, 2)
+        target = (patches - patches.mean(-1, keepdim=True)) / (patches.var(-1, keepdim=True) + VARIANCE_EPS).sqrt()
         hidden = order[:, kept.shape[1] :]
-        return F.mse_loss(_pick(told, hidden), _pick(wanted, hidden))
+        return F.mse_loss(_pick(predicted, hidden), _pick(target, hidden))
 
-    def _decoded(self, seen: torch.Tensor, kept: torch.Tensor, patches: torch.Tensor) -> torch.Tensor:
+    def _decoded(self, seen: torch.Tensor, kept: torch.Tensor, patches: int) -> torch.Tensor:
         filled = self.mask_token.to(seen.dtype).expand(len(seen), patches, -1)
         narrow = self.narrow(seen)
         filled = filled.scatter(1, kept[..., None].expand_as(narrow), narrow)
-        return self.out(self.decoder(filled + self.places))
+        return self.out(self.decoder(filled + self.pos_embed))
 
 
 def _pick(tokens: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-    """Tokens (B, n, D) at indices (B, n)."""
+    """The tokens (B, n, D) at indices (B, n)."""
     return tokens.gather(1, index[..., None].expand(-1, -1, tokens.shape[-1]))

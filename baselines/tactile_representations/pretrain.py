@@ -1,9 +1,10 @@
-"""Train a tactile representation on TacRGB pictures alone, from demonstrations or any trajectory file that holds some.
+"""Train a tactile representation on TacRGB images alone, from demonstrations or any other trajectory file that holds them.
 
     python -m baselines.tactile_representations.pretrain unit --demos a.h5 b.h5 --out unit.safetensors
     python -m baselines.tactile_representations.pretrain t3 --demos a.h5 --out t3.safetensors
 
-UniT as a VQGAN (Esser et al. 2021), the transformers by masked autoencoding; `train.py --tacrgb-weights` takes the result.
+UniT is trained as a VQGAN (Esser et al. 2021), the transformers by masked autoencoding; the option `--tacrgb-weights` of a
+policy's training takes the result.
 """
 
 import logging
@@ -16,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 import tyro
 from safetensors.torch import save_file
 
@@ -29,124 +30,153 @@ from manifeel_ms3.progress import progress_bar
 
 from .anytouch import AnyTouch
 from .masked_autoencoder import MaskedAutoencoder
-from .representation import Representation
+from .representation import TokenRepresentation
 from .sparsh import Sparsh
 from .t3 import T3
 from .unit import UniT
 
 log = logging.getLogger(__name__)
-REPRESENTATIONS: dict[str, Callable[[], Representation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
+MAE_BETAS, MAE_WEIGHT_DECAY = (0.9, 0.95), 0.05
+"""Decay rates of AdamW's moments, and its weight decay (He et al. 2022, table 8)."""
+VQGAN_BETAS = (0.5, 0.9)
+"""Decay rates of Adam's moments, as in the public code of Esser et al. (2021)."""
+ADVERSARY_WEIGHT = 0.1
+"""Weight of the discriminator's judgement in the loss; constant, whereas Esser et al. (2021, eq. 7) adapt theirs."""
+REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
 
 
 @dataclass
 class Args:
+    """Settings of the training of a tactile representation."""
+
     representation: tyro.conf.Positional[Literal["unit", "t3", "anytouch", "sparsh"]]
+    """Name of the representation."""
     demos: tuple[Path, ...]
-    """trajectory files with TacRGB"""
+    """Trajectory files with TacRGB images."""
     out: Path = Path("representation.safetensors")
+    """File of the trained weights."""
     image_size: int = 224
-    """pixels a side, as the policy will see them"""
+    """Height and width to which images are resized, pixels; the same as in the policy's training."""
     batch_size: int = 32
+    """Number of images in a gradient step."""
     steps: int = 20_000
+    """Number of gradient steps."""
     lr: float = 1e-4
+    """Learning rate of the optimiser."""
     adversary_from: int = 5000
-    """step from which UniT's pictures are judged by a discriminator"""
+    """Gradient step from which a discriminator judges the images that UniT reconstructs."""
     seed: int = 0
+    """Seed of the initial weights and of the order of the images."""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
-    every: int = 10
-    """steps between losses kept"""
+    """Device that trains, "cuda" or "cpu"."""
+    log_every: int = 10
+    """Number of gradient steps between the losses that are shown and returned."""
 
 
 def main(args: Args) -> list[float]:
-    """Train, write the weights, and return the losses, one of `every` steps.
+    """Train, write the weights, and return every `log_every`-th loss.
 
     Raises:
-        DemonstrationError: the files hold no TacRGB.
+        DemonstrationError: The files hold no TacRGB images.
     """
     torch.manual_seed(args.seed)
-    pictures = torch.as_tensor(tacrgb_pictures(args.demos, args.image_size))
+    images = torch.as_tensor(tacrgb_images(args.demos, args.image_size))
     keep_freed_memory(args.device)
     representation = REPRESENTATIONS[args.representation]().to(args.device)
-    objective = VqganObjective(representation, args) if isinstance(representation, UniT) else MaeObjective(representation, args)
+    training = VqganTraining(representation, args) if isinstance(representation, UniT) else MaeTraining(representation, args)
     losses = []
     with progress_bar() as bar:
         task = bar.add_task("training", total=args.steps)
         for step in range(args.steps):
-            batch = pictures[torch.randint(len(pictures), (args.batch_size,))].to(args.device)
-            loss = objective.step(batch.movedim(-1, 1).float() / 127.5 - 1, step)
-            if step % args.every == 0:
+            batch = images[torch.randint(len(images), (args.batch_size,))].to(args.device)
+            loss = training.step(batch.movedim(-1, 1).float() / 127.5 - 1, step)
+            if step % args.log_every == 0:
                 losses.append(float(loss))
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: t.contiguous() for name, t in objective.result.state_dict().items()}, args.out)
+    save_file({name: t.contiguous() for name, t in training.result.state_dict().items()}, args.out)
     log.info("%s", args.out)
     return losses
 
 
-def tacrgb_pictures(files: Iterable[Path], size: int) -> np.ndarray:
-    """All TacRGB pictures of trajectory files, uint8 (N, size, size, 3).
+def tacrgb_images(files: Iterable[Path], size: int) -> np.ndarray:
+    """All TacRGB images of trajectory files, uint8 (N, size, size, 3).
+
+    Args:
+        files: Trajectory files.
+        size: Height and width to which images are resized, pixels.
 
     Raises:
-        DemonstrationError: there are none.
+        DemonstrationError: The files hold no TacRGB images.
     """
-    pictures = []
+    images = []
     for path in files:
         with open_trajectories(path) as file:
             for i in range(len(read_header(path)["episodes"])):
-                sensors: Any = file[f"traj_{i}"].get("obs/sensor_data", {})
+                trajectory: Any = file[f"traj_{i}"]
+                sensors = trajectory.get("obs/sensor_data", {})
                 pads = [
                     sensors[name]["rgb"] for name in sensors if is_tactile(f"sensor_data/{name}") and "rgb" in sensors[name]
                 ]
-                pictures += [prepare_images(pad[()], size) for pad in pads]
-    if not pictures:
-        raise DemonstrationError(f"{[str(f) for f in files]} hold no TacRGB; record them with --obs-mode tacrgb")
-    return np.concatenate(pictures)
+                images += [prepare_images(pad[()], size) for pad in pads]
+    if not images:
+        raise DemonstrationError(f"{[str(f) for f in files]} hold no TacRGB images; record them with --obs-mode tacrgb")
+    return np.concatenate(images)
 
 
-class MaeObjective:
-    def __init__(self, representation: Representation, args: Args):
+class MaeTraining:
+    """Training of a transformer by masked autoencoding.
+
+    Args:
+        representation: The transformer.
+        args: Settings of the training.
+    """
+
+    def __init__(self, representation: TokenRepresentation, args: Args):
         self.result = representation
         self.model = MaskedAutoencoder(representation, args.image_size).to(args.device)
-        self.optimizer = torch.optim.AdamW(self.model.parameters(), args.lr, (0.9, 0.95), weight_decay=0.05)
+        self.optimizer = torch.optim.AdamW(self.model.parameters(), args.lr, MAE_BETAS, weight_decay=MAE_WEIGHT_DECAY)
 
     def step(self, image: torch.Tensor, step: int) -> torch.Tensor:
+        """Take gradient step number `step` on images (B, 3, H, W) in [-1, 1], and return the loss."""
         loss = self.model(image)
         _descend(self.optimizer, loss)
         return loss.detach()
 
 
-class VqganObjective:
-    """Pictures through the quantised code and back: absolute error, codebook, and, later, a discriminator of patches.
+class VqganTraining:
+    """Training of UniT's VQGAN by its absolute error, its codebook loss and, later, a discriminator of patches.
 
-    The perceptual loss of the original is left out: it needs a network trained on photographs.
+    The perceptual loss of the original is left out, because it needs a network that was trained on photographs.
+
+    Args:
+        unit: The representation.
+        args: Settings of the training.
     """
 
     def __init__(self, unit: UniT, args: Args):
         self.result, self.vqgan, self.adversary_from = unit.saved, unit.vqgan, args.adversary_from
         self.discriminator = patch_discriminator().to(args.device)
-        adam = dict(lr=args.lr, betas=(0.5, 0.9))
-        self.optimizer = torch.optim.Adam(self.vqgan.parameters(), **adam)
-        self.adversary = torch.optim.Adam(self.discriminator.parameters(), **adam)
+        self.optimizer = torch.optim.Adam(self.vqgan.parameters(), args.lr, VQGAN_BETAS)
+        self.adversary = torch.optim.Adam(self.discriminator.parameters(), args.lr, VQGAN_BETAS)
 
     def step(self, image: torch.Tensor, step: int) -> torch.Tensor:
-        told = self.vqgan(image)
-        error = F.l1_loss(told.sample, image)
-        loss = error + told.commit_loss.mean()
+        """Take gradient step number `step` on images (B, 3, H, W) in [-1, 1], and return the loss."""
+        decoded = self.vqgan(image)
+        error = F.l1_loss(decoded.sample, image)
+        loss = error + decoded.commit_loss.mean()
         if step >= self.adversary_from:
-            loss = loss + ADVERSARY_WEIGHT * -self.discriminator(told.sample).mean()
+            loss = loss + ADVERSARY_WEIGHT * -self.discriminator(decoded.sample).mean()
         _descend(self.optimizer, loss)
         if step >= self.adversary_from:
-            real, fake = self.discriminator(image), self.discriminator(told.sample.detach())
+            real, fake = self.discriminator(image), self.discriminator(decoded.sample.detach())
             _descend(self.adversary, 0.5 * (F.relu(1 - real).mean() + F.relu(1 + fake).mean()))
         return error.detach()
 
 
-ADVERSARY_WEIGHT = 0.1
-
-
 def patch_discriminator(width: int = 64) -> nn.Sequential:
-    """Judges patches of 70 pixels (Isola et al. 2017)."""
+    """A network that judges patches of 70 x 70 pixels, each as real or reconstructed (Isola et al. 2017)."""
     layers: list[nn.Module] = [nn.Conv2d(3, width, 4, 2, 1), nn.LeakyReLU(0.2)]
     for inputs, outputs, stride in ((width, 2 * width, 2), (2 * width, 4 * width, 2), (4 * width, 8 * width, 1)):
         layers += [nn.Conv2d(inputs, outputs, 4, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(0.2)]

@@ -1,4 +1,4 @@
-"""What tactile representations share: they look at TacRGB, take published weights, and can be trained on pictures alone."""
+"""The base of tactile representations: networks over TacRGB images that take published weights or are trained here."""
 
 from pathlib import Path
 
@@ -9,51 +9,55 @@ from baselines.common.checkpoint import load_weights, read_tensors
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of the colour channels in ImageNet, as torchvision documents them."""
 
 
 class Representation(nn.Module):
-    """Features (B, out_features) of TacRGB pictures (B, 3, H, W) in [-1, 1].
+    """Features (B, out_features) of TacRGB images (B, 3, H, W) in [-1, 1].
 
-    Subclasses define `forward` and `published`; `patch`: the sides of its pictures are a multiple of it, pixels.
+    Subclasses define `forward` and `convert_state_dict`.
     """
 
     out_features: int
+    """Number of features."""
     patch: int
+    """Number of pixels of which both sides of the images are a multiple."""
 
-    def published(self, weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Our names for the weights of a checkpoint that its authors released."""
+    def convert_state_dict(self, weights: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """The weights of a checkpoint that the authors released, under the names of this module."""
         raise NotImplementedError
 
     def load(self, path: Path) -> None:
-        """Load weights of ours (.safetensors) or of the authors.
+        """Load weights that `pretrain.py` wrote (.safetensors) or that the authors released (any other suffix).
 
         Raises:
-            CheckpointError: the file cannot be read, or is of something else.
+            CheckpointError: The file cannot be read, or belongs to another architecture.
         """
         if path.suffix == ".safetensors":
             load_weights(self, read_tensors(path), path)
         else:
-            load_weights(self, self.published(self.read_published(path)), path)
+            load_weights(self, self.convert_state_dict(self.read_released(path)), path)
 
-    def read_published(self, path: Path) -> dict[str, torch.Tensor]:
-        """The authors' weights by their names for them."""
+    def read_released(self, path: Path) -> dict[str, torch.Tensor]:
+        """The weights that the authors released, under the authors' names."""
         return read_pickled(path)
 
 
 class TokenRepresentation(Representation):
-    """A transformer over patches: its features are the mean of what it makes of them.
+    """A transformer over image patches; its features are the mean of the output tokens.
 
     Subclasses define `embed` and `encode`.
     """
 
     width: int
+    """Number of features of a token."""
 
     def embed(self, image: torch.Tensor) -> torch.Tensor:
-        """Patches with their places (B, N, width)."""
+        """Tokens (B, N, width) of an image's patches, their position embeddings added."""
         raise NotImplementedError
 
     def encode(self, tokens: torch.Tensor) -> torch.Tensor:
-        """Any of those patches (B, n, width) through all layers, the last norm included: (B, n, width)."""
+        """Output tokens (B, n, width) of any subset of the patch tokens (B, n, width), after the last layer norm."""
         raise NotImplementedError
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
@@ -61,10 +65,14 @@ class TokenRepresentation(Representation):
 
 
 def read_pickled(path: Path) -> dict[str, torch.Tensor]:
-    """Tensors of a .pth or .ckpt file; nothing else in it is loaded, and nothing run."""
+    """The tensors of a .pth or .ckpt file; no other object is loaded and no code of the file runs.
+
+    Raises:
+        CheckpointError: The file cannot be read.
+    """
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many
+    except Exception as error:  # torch raises many kinds
         raise CheckpointError(f"{path} cannot be read as weights ({error}); give the file that the authors released") from error
     for key in ("model", "state_dict"):
         content = content.get(key, content)
@@ -72,12 +80,12 @@ def read_pickled(path: Path) -> dict[str, torch.Tensor]:
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:
-    """Pictures in [-1, 1] as networks trained on ImageNet's statistics want them."""
+    """Images in [-1, 1], normalised by the statistics of ImageNet."""
     mean, std = (torch.tensor(values, device=image.device)[:, None, None] for values in (IMAGENET_MEAN, IMAGENET_STD))
     return ((image + 1) / 2 - mean) / std
 
 
 def sines_and_cosines(positions: torch.Tensor, frequencies: torch.Tensor) -> torch.Tensor:
-    """(N, 4 F) of positions (N, 2) and frequencies (2, F): sines, then cosines, axis by axis."""
+    """Embeddings (N, 4 F) of positions (N, 2) by frequencies (2, F): for each axis the sines, then the cosines."""
     phase = positions[..., None] * frequencies
     return torch.cat([phase.sin(), phase.cos()], dim=-1).flatten(1)

@@ -1,6 +1,7 @@
 """T3-medium (Zhao et al. 2024, "Transferable Tactile Transformers for Representation Learning Across Diverse Sensors").
 
-An encoder of its own for each sensor, three layers, and a trunk of nine that all sensors share: ViT-B, 86 M parameters.
+Each sensor has its own encoder of three layers; all sensors share a trunk of nine. Both together are a ViT-B with 86 M
+parameters.
 """
 
 from pathlib import Path
@@ -11,10 +12,12 @@ import torch.nn as nn
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 from .representation import TokenRepresentation, imagenet_normalised, read_pickled
-from .vit import EPS, Block, PatchEmbed, stretched
+from .vit import EPS, Block, PatchEmbed, interpolate_pos_embed
 
-SENSOR = "gs_green"  # whose encoder the authors take for a sensor that has none
-SIZE = 224  # pixels, that it was trained with
+SENSOR = "gs_green"
+"""Name of the released encoder that the authors use for a sensor without an encoder of its own."""
+SIZE = 224
+"""Side of the images that the published weights were trained on, pixels."""
 
 
 class _Encoder(nn.Module):
@@ -34,6 +37,14 @@ class _Trunk(nn.Module):
 
 
 class T3(TokenRepresentation):
+    """T3 with the encoder of one sensor.
+
+    Args:
+        width: Number of features of a token.
+        depth: Number of layers of the encoder and of the trunk.
+        heads: Number of attention heads.
+    """
+
     patch = 16
 
     def __init__(self, width: int = 768, depth: tuple[int, int] = (3, 9), heads: int = 12):
@@ -44,7 +55,7 @@ class T3(TokenRepresentation):
     def embed(self, image):
         patches = self.encoder.patch_embed(imagenet_normalised(image))
         grid = [side // self.patch for side in image.shape[2:]]
-        return patches + stretched(self.encoder.pos_embed[:, 1:], grid)
+        return patches + interpolate_pos_embed(self.encoder.pos_embed[:, 1:], grid)
 
     def encode(self, tokens):
         first = (self.encoder.cls_token + self.encoder.pos_embed[:, :1]).expand(len(tokens), -1, -1)
@@ -53,12 +64,12 @@ class T3(TokenRepresentation):
             tokens = block(tokens)
         return self.trunk.norm(tokens)[:, 1:]
 
-    def read_published(self, path: Path):
-        """The authors release a folder with encoders/<sensor>.pth and trunk.pth."""
+    def read_released(self, path: Path):
+        """The weights of the released folder, which holds encoders/<sensor>.pth and trunk.pth."""
         files = dict(encoder=path / f"encoders/{SENSOR}.pth", trunk=path / "trunk.pth")
         if missing := [str(file) for file in files.values() if not file.is_file()]:
             raise CheckpointError(f"{path} lacks {missing}; give the folder t3_medium that the authors released")
         return {f"{part}.{name}": t for part, file in files.items() for name, t in read_pickled(file).items()}
 
-    def published(self, weights):
+    def convert_state_dict(self, weights):
         return weights

@@ -1,6 +1,6 @@
 """UniT (Xu et al. 2025, "Data Efficient Tactile Representation with Generalization to Unseen Objects"): a VQGAN's encoder.
 
-Trained by `pretrain.py` on TacRGB of a few simple objects; a policy takes what the encoder says before it is quantised.
+It is trained on TacRGB images of a few simple objects (`pretrain.py`); a policy takes the latents before their quantisation.
 """
 
 import re
@@ -8,19 +8,30 @@ from pathlib import Path
 
 import torch
 import torch.nn as nn
-from diffusers import VQModel
+from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (diffusers imports lazily)
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 from .representation import Representation
 
 LATENT_CHANNELS, CODES = 3, 1024
+"""Channels of the latents and size of the codebook, as in the released checkpoint."""
 CHANNELS = (128, 128, 256, 512)
-IN_ATTENTION = {"norm": "group_norm", "q": "to_q", "k": "to_k", "v": "to_v", "proj_out": "to_out.0"}
+"""Channels from the finest to the coarsest scale, as in the released checkpoint."""
+HEAD_GROUPS = 4
+"""Groups of the normalisation in the head."""
+DIFFUSERS_ATTENTION = {"norm": "group_norm", "q": "to_q", "k": "to_k", "v": "to_v", "proj_out": "to_out.0"}
+"""Names of attention layers: taming-transformers' to diffusers'."""
 
 
 class UniT(Representation):
-    """`attention`: also at the coarsest scale, as in the weights that its authors released (trained at 128 x 160)."""
+    """UniT's VQGAN, and a head over its latents.
+
+    Args:
+        channels: Channels from the finest to the coarsest scale.
+        attention: Whether the coarsest scale has attention, as in the released weights (trained at 128 x 160).
+        out_features: Number of features.
+    """
 
     patch = 8
 
@@ -52,7 +63,7 @@ class UniT(Representation):
 
     @property
     def saved(self) -> Representation:
-        """What is kept of it for other policies: the VQGAN; the head is a policy's own."""
+        """The part that is saved after pretraining: the VQGAN without the head, which each policy trains anew."""
         return _Vqgan(self.vqgan)
 
     def load(self, path: Path) -> None:
@@ -64,25 +75,30 @@ class _Vqgan(Representation):
         super().__init__()
         self.vqgan = vqgan
 
-    def published(self, weights):
+    def convert_state_dict(self, weights):
         if has_attention(weights) and not has_attention(self.state_dict()):
             raise CheckpointError(
-                "these weights have attention at the coarsest scale; give --policy.encoder.tacrgb unit_released"
+                "the weights have attention at the coarsest scale; give --policy.encoder.tacrgb unit_released"
             )
         return {f"vqgan.{n}": t for n, t in from_taming(weights, len(self.vqgan.config["block_out_channels"])).items()}
 
 
 def _block(inputs: int, outputs: int) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, 3, padding=1), nn.GroupNorm(4, outputs), nn.LeakyReLU()]
+    return [nn.Conv2d(inputs, outputs, 3, padding=1), nn.GroupNorm(HEAD_GROUPS, outputs), nn.LeakyReLU()]
 
 
 def has_attention(weights: dict[str, torch.Tensor]) -> bool:
-    """Whether there is attention at the coarsest scale, by the names of either taming-transformers or diffusers."""
+    """Whether weights named by taming-transformers or by diffusers have attention at the coarsest scale."""
     return any(re.search(r"encoder\.down(\.\d+\.attn|_blocks\.\d+\.attentions)\.", name) for name in weights)
 
 
 def from_taming(weights: dict[str, torch.Tensor], levels: int) -> dict[str, torch.Tensor]:
-    """Diffusers' names for the weights of a VQGAN that was trained with taming-transformers; its losses are left out."""
+    """Weights of a VQGAN trained with taming-transformers under diffusers' names, without those of its losses.
+
+    Args:
+        weights: The weights under the names of taming-transformers.
+        levels: Number of scales.
+    """
     renamed = {}
     for name, tensor in weights.items():
         if name.startswith("loss."):
@@ -96,8 +112,8 @@ def from_taming(weights: dict[str, torch.Tensor], levels: int) -> dict[str, torc
         name = name.replace(".mid.attn_1.", ".mid_block.attentions.0.")
         name = re.sub(r"\.attn\.(\d+)\.", r".attentions.\1.", name)
         if ".attentions." in name:
-            stem, part, kind = re.match(r"(.*\.attentions\.\d+)\.(\w+)\.(\w+)", name).groups()
-            name = f"{stem}.{IN_ATTENTION[part]}.{kind}"
-            tensor = tensor.flatten(1) if tensor.ndim == 4 else tensor  # convolutions of one pixel
+            stem, part, kind = name.rsplit(".", 2)
+            name = f"{stem}.{DIFFUSERS_ATTENTION[part]}.{kind}"
+            tensor = tensor.flatten(1) if tensor.ndim == 4 else tensor  # convolutions of one pixel become linear layers
         renamed[name] = tensor
     return renamed

@@ -1,13 +1,20 @@
-"""A vision transformer whose weights have the names of timm's, which published tactile representations were saved with."""
+"""A vision transformer with timm's weight names, which the published checkpoints of tactile representations have.
+
+timm itself needs torchvision, which cannot be installed beside the CPU build of torch, and transformers' ViT has other weight
+names and no layer scale.
+"""
 
 import torch
 import torch.nn as nn
-import torch.nn.functional as F
+import torch.nn.functional as F  # noqa: N812
 
-EPS = 1e-6  # of the layer norms, timm's
+EPS = 1e-6
+"""Epsilon of the layer norms, as in timm."""
 
 
 class Attention(nn.Module):
+    """Multi-head self-attention over tokens (B, N, width)."""
+
     def __init__(self, width: int, heads: int):
         super().__init__()
         self.heads = heads
@@ -19,6 +26,8 @@ class Attention(nn.Module):
 
 
 class Mlp(nn.Module):
+    """The two-layer network of a transformer block, four times as wide inside."""
+
     def __init__(self, width: int):
         super().__init__()
         self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
@@ -28,6 +37,8 @@ class Mlp(nn.Module):
 
 
 class LayerScale(nn.Module):
+    """Learned factors of each feature (Touvron et al. 2021)."""
+
     def __init__(self, width: int):
         super().__init__()
         self.gamma = nn.Parameter(torch.ones(width))
@@ -37,7 +48,7 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """A layer (B, N, width) -> (B, N, width), each half scaled by learned factors if asked for (Touvron et al. 2021)."""
+    """A transformer block (B, N, width) -> (B, N, width), with layer scale if `scaled`."""
 
     def __init__(self, width: int, heads: int, scaled: bool = False):
         super().__init__()
@@ -51,7 +62,7 @@ class Block(nn.Module):
 
 
 class PatchEmbed(nn.Module):
-    """Patches (B, N, width) of pictures (B, C, H, W), row by row."""
+    """Embeddings (B, N, width) of the patches of images (B, C, H, W), row by row."""
 
     def __init__(self, channels: int, width: int, patch: int):
         super().__init__()
@@ -61,8 +72,8 @@ class PatchEmbed(nn.Module):
         return self.proj(image).flatten(2).transpose(1, 2)
 
 
-def stretched(learned: torch.Tensor, grid: list[int]) -> torch.Tensor:
-    """Places (1, N, width) learned on a square grid, for another."""
+def interpolate_pos_embed(learned: torch.Tensor, grid: list[int]) -> torch.Tensor:
+    """Position embeddings (1, N, width) that were learned on a square grid, interpolated for another grid of patches."""
     side = round(learned.shape[1] ** 0.5)
     if grid == [side, side]:
         return learned

@@ -47,7 +47,7 @@ def test_windows_do_not_cross_episodes(demos, dataset):
 def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
     assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
-    with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, the files hold"):
+    with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, but the files hold"):
         read_episodes([demos], PEG, SPEC, 9)
 
 
@@ -133,12 +133,12 @@ def test_crops_are_random_in_training_and_central_in_evaluation():
 def test_unknown_encoder_names_those_there_are():
     spec = observation_spec("rgb+tacrgb+tacff", ("wrist",), ("right",), 64)
     for wrong in (dict(image="resnet1800"), dict(tacrgb="resnet1800"), dict(force_field="resnet1800")):
-        with pytest.raises(ValueError, match="'resnet1800' is unknown; choose from .*resnet18"):
+        with pytest.raises(ValueError, match=r"'resnet1800' is unknown; choose from .*resnet18"):
             ObservationEncoder(EncoderConfig(**wrong), spec, 2)
 
 
 def test_unet_maps_actions_to_noise_and_uses_step_and_condition():
-    net = ConditionalUnet1D(6, 10, channels=(16, 32, 64)).eval()
+    net = ConditionalUnet1D(6, 10, down_dims=(16, 32, 64)).eval()
     actions, condition = torch.randn(3, 16, 6), torch.randn(3, 10)
     out = net(actions, torch.tensor([0, 50, 99]), condition)
     assert out.shape == actions.shape

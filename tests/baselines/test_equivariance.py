@@ -71,7 +71,7 @@ def test_key_points_turn_with_the_picture(g):
 def policy():
     torch.manual_seed(0)
     small = EncoderConfig(image="small_cnn", force_field="small")
-    config = EquivariantConfig(encoder=small, hidden=16, channels=(32, 64), step_embedding=32, diffusion_steps=10)
+    config = EquivariantConfig(encoder=small, hidden=16, down_dims=(32, 64), diffusion_step_embed_dim=32, diffusion_steps=10)
     policy = EquivariantDiffusionPolicy(config, SPEC, action_dim=6)
     poses = torch.as_tensor(pose_features(poses_of(40)))
     fields, actions = torch.rand(40, 10, 14, 3), torch.randn(40, 6) * torch.arange(1, 7)

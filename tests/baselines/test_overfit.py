@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from baselines.common.agent import PolicyAgent
 from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
@@ -28,12 +27,12 @@ def demonstration(tmp_path_factory) -> Path:
 @pytest.mark.parametrize("mode", ["rgb", "rgb+tacrgb", "rgb+tacff"])
 @pytest.mark.parametrize("script", [diffusion, equivariant, flow], ids=["diffusion", "equivariant", "flow"])
 def test_one_demonstration_is_learnt_by_heart(make_env, demonstration, tmp_path, script, mode):
-    cpu = script.PRESETS["cpu"][1]
+    cpu = script.PRESETS["cpu"].args
     # nothing that is to help with other starts: no crops, no noise on the pose, and the paper's horizons
     alike = dict(encoder=dataclasses.replace(cpu.policy.encoder, crop=0), pose_noise=0.0, noise_draws=1)
     policy = dataclasses.replace(cpu.policy, obs_horizon=2, action_horizon=8, **alike)
     run = dict(demos=(demonstration,), env_id=TASK, obs_mode=mode, run_dir=tmp_path, **SENSORS)
     checkpoint = script.main(dataclasses.replace(cpu, policy=policy, batch_size=16, steps=1500, **run))
     env = make_env(TASK, obs_mode=mode, **SENSORS)
-    outcome = evaluate_episode(env, PolicyAgent(checkpoint), SEED)
+    outcome = evaluate_episode(env, script.SPEC.load(checkpoint), SEED)
     assert outcome.success_once

@@ -8,17 +8,12 @@ import pytest
 import torch
 from transformers import CLIPVisionConfig, ViTConfig, ViTModel
 
-from baselines.common.encoders import (
-    TACRGB_ENCODERS,
-    EncoderConfig,
-    ObservationEncoder,
-    RepresentationEncoder,
-    load_representations,
-)
+from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig, ObservationEncoder, load_pretrained
 from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
 from baselines.tactile_representations import pretrain
 from baselines.tactile_representations.anytouch import AnyTouch
+from baselines.tactile_representations.encoder import RepresentationEncoder
 from baselines.tactile_representations.pretrain import patch_discriminator
 from baselines.tactile_representations.sparsh import Sparsh
 from baselines.tactile_representations.t3 import T3
@@ -141,7 +136,7 @@ def test_published_weights_fit_name_by_name(make, published):
         representation = make()
         weights = {name: torch.empty(shape) for name, shape in published.items()}
     own = {name: tuple(tensor.shape) for name, tensor in representation.state_dict().items()}
-    assert {name: tuple(tensor.shape) for name, tensor in representation.published(weights).items()} == own
+    assert {name: tuple(tensor.shape) for name, tensor in representation.convert_state_dict(weights).items()} == own
 
 
 def millions(module: torch.nn.Module) -> float:
@@ -224,7 +219,7 @@ def test_released_unit_asks_for_its_own_architecture():
     with torch.device("meta"):
         weights = {name: torch.empty(shape) for name, shape in published_unit(attention=True).items()}
         with pytest.raises(CheckpointError, match="unit_released"):
-            UniT().saved.published(weights)
+            UniT().saved.convert_state_dict(weights)
 
 
 def test_weights_of_something_else_are_refused(tmp_path):
@@ -270,12 +265,12 @@ def test_pictures_alone_train_a_representation(name, pictures, tmp_path, monkeyp
     make, size = SMALL[name]
     monkeypatch.setitem(pretrain.REPRESENTATIONS, name, make)
     steps = 60
-    sizes = dict(image_size=size, batch_size=8, steps=steps, lr=2e-3, adversary_from=50, every=1, device="cpu")
+    sizes = dict(image_size=size, batch_size=8, steps=steps, lr=2e-3, adversary_from=50, log_every=1, device="cpu")
     losses = pretrain.main(pretrain.Args(name, (pictures,), tmp_path / "weights.safetensors", **sizes))
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:3])
     fresh = RepresentationEncoder(make(), size)
     before = [parameter.clone() for parameter in fresh.parameters()]
-    load_representations(torch.nn.Sequential(fresh), tmp_path / "weights.safetensors")
+    load_pretrained(torch.nn.Sequential(fresh), tmp_path / "weights.safetensors")
     assert any(not torch.equal(old, new) for old, new in zip(before, fresh.parameters(), strict=True))
     assert fresh(torch.zeros(2, 3, size, size)).shape == (2, 64)
 
@@ -291,7 +286,7 @@ def observation() -> dict[str, torch.Tensor]:
 
 @pytest.mark.parametrize("frozen", [True, False])
 def test_a_frozen_representation_stays_as_it_was(frozen, monkeypatch):
-    monkeypatch.setattr("baselines.common.encoders.T3", small_t3)
+    monkeypatch.setattr("baselines.tactile_representations.encoder.T3", small_t3)
     encoder = ObservationEncoder(EncoderConfig(tacrgb="t3", freeze_tacrgb=frozen), SPEC, 1)
     encoder(observation()).square().mean().backward()
     (network,) = encoder.images
@@ -306,7 +301,7 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
     with pytest.raises(ValueError, match="'resnet18' is no representation"):
         ObservationEncoder(EncoderConfig(freeze_tacrgb=True), SPEC, 1)
     with pytest.raises(ValueError, match="no network takes them"):
-        load_representations(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")
+        load_pretrained(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")
 
 
 @pytest.mark.parametrize("name", TACRGB_ENCODERS)

@@ -5,22 +5,22 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
 from baselines.common import training
-from baselines.common.agent import PolicyAgent
 from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.encoders import EncoderConfig
-from baselines.common.training import TrainArgs, TrainingError
+from baselines.common.train_args import TrainArgs
+from baselines.common.training import TrainingError
 from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from baselines.references import MeanAction, Untrained
+from baselines.registry import PolicySpec
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from tests.conftest import PEG
@@ -33,18 +33,18 @@ POLICIES["consistency"] = (flow, dict(consistency=True))
 class Run:
     """A policy's training on the recorded episodes."""
 
-    train: Callable[[TrainArgs], Path]
+    spec: PolicySpec
     args: TrainArgs
 
     def again(self, **changes) -> Path:
-        return self.train(dataclasses.replace(self.args, **changes))
+        return self.spec.train(dataclasses.replace(self.args, **changes))
 
 
 @pytest.fixture(scope="module", params=POLICIES)
 def run(request, demos, tmp_path_factory):
     script, own = POLICIES[request.param]
-    paper = script.PRESETS["paper"][1]
-    small = dict(encoder=EncoderConfig(force_field="small"), channels=(32, 64), step_embedding=32, **own)
+    paper = script.PRESETS["paper"].args
+    small = dict(encoder=EncoderConfig(force_field="small"), down_dims=(32, 64), diffusion_step_embed_dim=32, **own)
     if script is not flow:
         small |= dict(diffusion_steps=20)
     args = dataclasses.replace(
@@ -65,7 +65,7 @@ def run(request, demos, tmp_path_factory):
         compile=False,
         run_dir=tmp_path_factory.mktemp("run"),
     )
-    return Run(script.main, args)
+    return Run(script.SPEC, args)
 
 
 @pytest.fixture(scope="module")
@@ -79,13 +79,13 @@ def log_of(folder: Path) -> list[dict[str, float]]:
 
 def test_presets_hold_the_papers_hyperparameters():
     for script, lr in ((diffusion, 8e-5), (equivariant, 1e-4), (flow, 1e-4)):
-        paper = script.PRESETS["paper"][1]
+        paper = script.PRESETS["paper"].args
         policy = paper.policy
         assert (policy.obs_horizon, policy.action_horizon, policy.pred_horizon) == (2, 8, 16)
         assert (paper.lr, paper.betas, paper.weight_decay, paper.warmup_steps) == (lr, (0.95, 0.999), 1e-6, 500)
-        assert (paper.batch_size, paper.image_size, policy.channels) == (8, 256, (512, 1024, 2048))
+        assert (paper.batch_size, paper.image_size, policy.down_dims) == (8, 256, (512, 1024, 2048))
         assert (policy.encoder.image, policy.encoder.force_field) == ("resnet18", "resnet18")
-    ddpm, ddim = diffusion.PRESETS["paper"][1].policy, equivariant.PRESETS["paper"][1].policy
+    ddpm, ddim = diffusion.PRESETS["paper"].args.policy, equivariant.PRESETS["paper"].args.policy
     assert (ddpm.diffusion_steps, ddpm.sampler, ddpm.prediction, ddpm.encoder.crop) == (100, "ddpm", "epsilon", 0)
     assert (ddim.diffusion_steps, ddim.sampler, ddim.prediction, ddim.encoder.crop) == (100, "ddim", "sample", 230)
     assert ddim.hidden == 128
@@ -111,15 +111,13 @@ def test_only_the_last_checkpoints_are_kept(run, tmp_path):
 
 
 def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkeypatch):
-    class Stop(Exception):
-        pass
+    def stop(*_):
+        raise KeyboardInterrupt
 
-    def save_then_stop(*_):
-        raise Stop
-
-    with monkeypatch.context() as patch, pytest.raises(Stop):
-        patch.setattr(training, "prune", save_then_stop)  # what follows the first checkpoint
-        run.again(run_dir=tmp_path)
+    with monkeypatch.context() as patch:
+        patch.setattr(training, "prune", stop)  # it is called after the first checkpoint
+        with pytest.raises(KeyboardInterrupt):
+            run.again(run_dir=tmp_path)
     assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60
     resumed = run.again(run_dir=tmp_path, resume=True)
     assert checkpoint_config(resumed)["step"] == 120
@@ -137,12 +135,12 @@ def test_the_seed_fixes_everything(run, tmp_path):
 
 
 def test_resume_with_other_settings_names_them(run, checkpoint):
-    with pytest.raises(CheckpointError, match=r"lr: 0.001 there, 0.5 now"):
+    with pytest.raises(CheckpointError, match=r"lr: 0\.001 there, 0.5 now"):
         run.again(resume=True, lr=0.5)
 
 
 def test_resume_without_a_checkpoint(run, tmp_path):
-    with pytest.raises(CheckpointError, match="config.json"):
+    with pytest.raises(CheckpointError, match=r"config\.json"):
         run.again(resume=True, run_dir=tmp_path)
 
 
@@ -159,15 +157,15 @@ def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
         assert half["loss"] == pytest.approx(full["loss"], rel=0.1)
 
 
-def test_agent_acts_and_repeats_itself_after_reset(make_env, checkpoint):
+def test_agent_acts_and_repeats_itself_after_reset(make_env, run, checkpoint):
     env = make_env(PEG, obs_mode="tacff", render_backend="none")
-    agent = PolicyAgent(checkpoint)
+    agent = run.spec.load(checkpoint)
     obs, _ = env.reset(seed=0)
     first = [agent.act(obs) for _ in range(10)]
     agent.reset()
     second = [agent.act(obs) for _ in range(10)]
     assert all(a.shape == (6,) and (a == b).all() for a, b in zip(first, second, strict=True))
-    few = PolicyAgent(checkpoint, inference_steps=4)
+    few = run.spec.load(checkpoint, inference_steps=4)
     assert few.act(obs).shape == (6,)
 
 
@@ -187,30 +185,30 @@ def test_mean_action_is_that_of_all_steps(demos):
     assert policy.act({}) == pytest.approx(sum(episode["actions"].sum(0) for episode in episodes) / steps, rel=1e-4)
 
 
-def test_checkpoint_of_another_architecture_is_refused(checkpoint, tmp_path):
+def test_checkpoint_of_another_architecture_is_refused(run, checkpoint, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(checkpoint, other)
     config = checkpoint_config(other)
-    config["policy"]["channels"] = [16, 32]
+    config["policy"]["down_dims"] = [16, 32]
     (other / "config.json").write_text(json.dumps(config))
     with pytest.raises(CheckpointError, match="another architecture"):
-        PolicyAgent(other)
+        run.spec.load(other)
 
 
-def test_checkpoint_of_another_policy_is_refused(checkpoint, tmp_path):
+def test_checkpoint_of_another_policy_is_refused(run, checkpoint, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(checkpoint, other)
     (other / "config.json").write_text(json.dumps(dict(kind="something:Else")))
-    with pytest.raises(CheckpointError, match="not one of a policy"):
-        PolicyAgent(other)
+    with pytest.raises(CheckpointError, match=f"not one of the policy {run.spec.name!r}"):
+        run.spec.load(other)
 
 
-def test_truncated_weights_are_refused(checkpoint, tmp_path):
+def test_truncated_weights_are_refused(run, checkpoint, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(checkpoint, other)
     (other / "model.safetensors").write_bytes((checkpoint / "model.safetensors").read_bytes()[:1000])
     with pytest.raises(CheckpointError, match="cannot be read"):
-        PolicyAgent(other)
+        run.spec.load(other)
 
 
 @pytest.fixture
@@ -247,7 +245,7 @@ def test_an_evaluation_that_fails_does_not_stop_training(evaluation, tmp_path, c
 def test_two_processes_train_one_policy(run, tmp_path):
     arguments = ["cpu", "--demos", str(run.args.demos[0]), "--obs-mode", "tacff", "--steps", "60", "--batch-size", "16"]
     arguments += ["--save-every", "60", "--log-every", "20", "--run-dir", str(tmp_path)]
-    arguments += ["--policy.channels", "32", "64", "--policy.step-embedding", "32"]
+    arguments += ["--policy.down-dims", "32", "64", "--policy.diffusion-step-embed-dim", "32"]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
         [*command, "baselines/diffusion_policy/train.py", *arguments], capture_output=True, text=True, check=False

@@ -1,0 +1,163 @@
+"""The pieces of the training loop, each alone."""
+
+import dataclasses
+from itertools import pairwise
+
+import pytest
+import torch
+from diffusers.optimization import get_cosine_schedule_with_warmup
+
+from baselines.common.checkpoint import TRAINING, prune
+from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
+from baselines.common.observation import TAXEL_SHAPE, observation_spec
+from baselines.common.train_args import PAPER_EPOCHS, default_steps
+from baselines.common.training import RecentLosses, SampleOrder, Trainer, TrainingError, fast_forward, with_taxel_shape
+from baselines.diffusion_policy import train as diffusion
+from baselines.registry import PolicySpec, require_distinct
+from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
+
+CPU = torch.device("cpu")
+SPEC = observation_spec("tacff", (), ("right",), 64)
+
+
+@pytest.mark.parametrize(("num_demos", "num_samples", "batch_size", "steps"), [(50, 4200, 8, 525_000), (2, 9, 4, 75_000)])
+def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, num_samples, batch_size, steps):
+    assert default_steps(num_demos, num_samples, batch_size) == steps
+    epochs = steps / -(-num_samples // batch_size)
+    assert epochs * num_demos == PAPER_EPOCHS
+
+
+def test_each_epoch_holds_every_sample_once():
+    order = SampleOrder(12, seed=0)
+    first, second = (torch.cat([order.take(4) for _ in range(3)]) for _ in range(2))
+    assert sorted(first.tolist()) == sorted(second.tolist()) == list(range(12))
+    assert first.tolist() != second.tolist()
+
+
+def test_an_order_continues_from_its_state():
+    order = SampleOrder(7, seed=0)
+    order.take(4)
+    state = {name: tensor.clone() for name, tensor in order.state_dict().items()}
+    expected = [order.take(4).tolist() for _ in range(5)]
+    other = SampleOrder(7, seed=1)
+    other.load_state_dict(state)
+    assert [other.take(4).tolist() for _ in range(5)] == expected
+
+
+def schedule_of(steps: int) -> torch.optim.lr_scheduler.LambdaLR:
+    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], 1e-3)
+    return get_cosine_schedule_with_warmup(optimizer, 10, steps)
+
+
+def test_a_resumed_schedule_has_the_learning_rates_of_an_uninterrupted_one():
+    whole, resumed = schedule_of(40), schedule_of(40)
+    rates = []
+    for _ in range(30):
+        whole.optimizer.step()
+        whole.step()
+        rates.append(whole.optimizer.param_groups[0]["lr"])
+    fast_forward(resumed, 12)
+    assert resumed.optimizer.param_groups[0]["lr"] == rates[11]
+    for rate in rates[12:]:
+        resumed.optimizer.step()
+        resumed.step()
+        assert resumed.optimizer.param_groups[0]["lr"] == rate
+
+
+def test_a_schedule_rises_and_then_falls_to_zero():
+    schedule = schedule_of(40)
+    rates = []
+    for step in range(41):
+        fast_forward(schedule, step)
+        rates.append(schedule.optimizer.param_groups[0]["lr"])
+    assert rates[0] == 0
+    assert rates[10] == 1e-3
+    assert rates[40] == pytest.approx(0, abs=1e-12)
+    assert all(a < b for a, b in pairwise(rates[:11]))
+    assert all(a > b for a, b in pairwise(rates[10:]))
+
+
+def test_recent_losses_give_their_mean_and_start_again():
+    losses = RecentLosses(3, CPU)
+    for value in (1.0, 2.0, 6.0):
+        assert not losses.full
+        losses.add(torch.tensor(value), torch.tensor([0]))
+    assert losses.full
+    assert losses.take_mean(3, str) == 3.0
+    losses.add(torch.tensor(5.0), torch.tensor([0]))
+    assert losses.take_mean(4, str) == 5.0
+
+
+def test_a_loss_that_is_no_number_names_the_first_step_and_its_samples():
+    losses = RecentLosses(4, CPU)
+    for value, sample in ((1.0, 10), (float("nan"), 20), (float("inf"), 30)):
+        losses.add(torch.tensor(value), torch.tensor([sample]))
+    with pytest.raises(TrainingError, match=r"the loss of step 42 is nan, on samples \[20\]") as raised:
+        losses.take_mean(43, lambda batch: f"samples {batch.tolist()}")
+    assert isinstance(raised.value, WorkFailedError)
+
+
+def test_prune_keeps_the_newest_and_those_in_use(tmp_path):
+    folders = [tmp_path / f"{step:08d}" for step in range(1, 6)]
+    for folder in folders:
+        folder.mkdir()
+        (folder / TRAINING).touch()
+    prune(tmp_path, 2, {folders[0]})
+    assert sorted(tmp_path.iterdir()) == [folders[0], *folders[3:]]
+    assert [folder for folder in folders if (folder / TRAINING).exists()] == folders[-1:]
+
+
+@pytest.fixture
+def trainer_args(demos, tmp_path):
+    paper = diffusion.PRESETS["paper"].args
+    policy = dataclasses.replace(
+        paper.policy, encoder=EncoderConfig(force_field="small"), down_dims=(16, 32), diffusion_step_embed_dim=16
+    )
+    run = dict(
+        demos=(demos,), obs_mode="tacff", cameras=(), policy=policy, run_dir=tmp_path, batch_size=4, steps=6, log_every=4
+    )
+    return dataclasses.replace(paper, **run, device="cpu", precision="fp32", compile=False)
+
+
+def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(trainer_args):
+    first = Trainer(trainer_args, diffusion.DiffusionPolicy)
+    before = [parameter.clone() for parameter in first.policy.parameters()]
+    for _ in range(3):
+        first.take_step()
+    assert any(not torch.equal(old, new) for old, new in zip(before, first.policy.parameters(), strict=True))
+    assert first.save().name == "00000003"
+    second = Trainer(dataclasses.replace(trainer_args, resume=True), diffusion.DiffusionPolicy)
+    assert second.step == 3
+    own, other = first.policy.state_dict(), second.policy.state_dict()
+    assert all(torch.equal(own[name], other[name]) for name in own)
+    pairs = zip(first.ema.shadow_params, second.ema.shadow_params, strict=True)
+    assert all(torch.equal(own, other) for own, other in pairs)
+    assert second.optimizer.param_groups[0]["lr"] == first.optimizer.param_groups[0]["lr"]
+    assert torch.equal(second.order.take(4), first.order.take(4))
+
+
+def test_force_field_encoders_take_the_taxels_of_the_data():
+    (key,) = SPEC.force_fields
+    spec = with_taxel_shape(SPEC, {key: torch.zeros(5, 7, 9, 3).numpy()})
+    assert (SPEC.taxel_shape, spec.taxel_shape) == (TAXEL_SHAPE, (7, 9))
+    for name in ("small", "resnet18"):
+        assert field_encoder(EncoderConfig(force_field=name), spec)(torch.zeros(2, 3, 7, 9)).shape == (2, 64)
+
+
+def test_a_name_of_an_encoder_is_given_once():
+    with pytest.raises(InvalidArgumentError, match="'t3' is registered already"):
+        register_tacrgb_encoder("t3", lambda size: torch.nn.Identity())
+
+
+def test_two_policies_with_one_class_of_arguments_are_refused():
+    class Other(diffusion.DiffusionPolicy):
+        name = "other"
+
+    specs = {"diffusion_policy": diffusion.SPEC, "other": PolicySpec(Other, diffusion.Args, diffusion.PRESETS)}
+    with pytest.raises(PluginError, match=r"'diffusion_policy' and 'other' share the class of arguments Args"):
+        require_distinct(specs)
+
+
+def test_a_policy_under_another_name_than_its_own_is_refused():
+    with pytest.raises(PluginError, match="register it as 'diffusion_policy'"):
+        require_distinct({"mine": diffusion.SPEC})
