@@ -13,6 +13,7 @@ import torch
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.sensors.visualisation import pictures_of
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
@@ -47,7 +48,7 @@ def _tile(picture: np.ndarray) -> np.ndarray:
     return cv2.resize(picture, (round(TILE * width / height), TILE), interpolation=cv2.INTER_AREA)
 
 
-def video(frames: list[Frame], fps: int = 10) -> bytes:
+def video(frames: list[Frame], fps: int = CONTROL_FREQ) -> bytes:
     """An MP4 with all pictures side by side."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "episode.mp4"

@@ -1,4 +1,4 @@
-"""The tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
+"""Show the tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
 
 import inspect
 import sys
@@ -17,18 +17,20 @@ from .registry import PREFIX, SUFFIX, all_tasks, task_spec
 
 @dataclass
 class Args:
+    """Show what a task is, what is random in it and what counts as success; or all tasks in a table."""
+
     task: Annotated[str | None, tyro.conf.Positional] = None
-    """id or short name, such as PegInsertion: what it is, what is random, what counts as success; default: all, in a table"""
+    """Id or short name of a task, such as PegInsertion; all tasks in a table if not given."""
 
 
 def main(args: Args) -> None:
-    """Print them.
+    """Print the description of a task, or the table of all tasks.
 
     Raises:
-        UnknownNameError: there is no such task.
+        UnknownNameError: There is no such task.
     """
     if args.task is None:
-        table = Table("task", "category", "steps", "camera", "what is to be done", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
+        table = Table("task", "category", "steps", "camera", "description", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
         for spec in all_tasks().values():
             steps = str(spec.max_episode_steps)
             table.add_row(spec.name, spec.category, steps, spec.policy_camera, _description(spec.env_class))
@@ -40,7 +42,7 @@ def main(args: Args) -> None:
 
 
 def _description(cls: type) -> str:
-    """The first paragraph."""
+    """The first paragraph of a task's documentation."""
     text = (inspect.getdoc(cls) or "").removeprefix("**Task Description:**")
     return " ".join(text.partition("\n\n")[0].split())
 

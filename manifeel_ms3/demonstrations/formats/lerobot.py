@@ -13,11 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
+
 from .maniskill_h5 import DemonstrationError, each_demonstration, observed, read_header, write_json
 
 INFO = "meta/info.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-FPS = 10
+FPS = CONTROL_FREQ
 
 
 def is_lerobot(path: Path) -> bool:

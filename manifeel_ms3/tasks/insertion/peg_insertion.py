@@ -1,4 +1,4 @@
-"""ManiFeel-PegInsertion-v1"""
+"""The task ManiFeel-PegInsertion-v1."""
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import peg_fit

@@ -1,9 +1,13 @@
-"""ManiFeel-PowerPlugInsertion-v1"""
+"""The task ManiFeel-PowerPlugInsertion-v1."""
 
 from manifeel_ms3.geometry import power_fit
+from manifeel_ms3.geometry.plugs import BLADE
 from manifeel_ms3.tasks.registry import register_task
 
 from .base import InsertionEnv
+
+NOT_INSERTED = 0.1
+"""Share of the blades' length that may be outside the socket at success."""
 
 
 @register_task(
@@ -28,5 +32,5 @@ class PowerPlugInsertionEnv(InsertionEnv):
     """
 
     fit = power_fit()
-    max_gap = 0.1 * 0.0175  # of the blades' length
+    max_gap = NOT_INSERTED * BLADE[2]
     lift = 0.03
