@@ -33,7 +33,7 @@ def main(args: Args) -> None:
         table = Table("task", "category", "steps", "camera", "description", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
         for spec in all_tasks().values():
             steps = str(spec.max_episode_steps)
-            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _description(spec.env_class))
+            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _summary(spec.env_class))
         Console().print(table)
         return
     by_name = {spec.name: env_id for env_id, spec in all_tasks().items()}
@@ -41,10 +41,9 @@ def main(args: Args) -> None:
     Console().print(Markdown(f"# {spec.env_id}\n\n{inspect.getdoc(spec.env_class)}"))
 
 
-def _description(cls: type) -> str:
-    """The first paragraph of a task's documentation."""
-    text = (inspect.getdoc(cls) or "").removeprefix("**Task Description:**")
-    return " ".join(text.partition("\n\n")[0].split())
+def _summary(env_class: type) -> str:
+    """The first line of a task's documentation."""
+    return (inspect.getdoc(env_class) or "").partition("\n")[0]
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ NO_RENDERER = (
 
 
 FORKED = (
-    "{wanted} needs a renderer, and this process was forked from one that has its own, which does not survive a fork. Start the "
-    "process anew: multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no image works here: "
+    "{wanted} needs a renderer, and this process was forked from one that has its own, which does not survive a fork. Start "
+    "it anew: multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no image works here: "
     "obs_mode='state' or 'tacff'."
 )
 _IMPORTED_IN = os.getpid()

@@ -32,8 +32,9 @@ HOLD_SECONDS = 0.5
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s."""
 IMAGE_SIZE = 256
-"""Width and height of the cameras' images, in pixels."""
+"""Width and height of the cameras' images, in pixels (public code of the paper)."""
 FIELD_OF_VIEW = np.deg2rad(75)
+"""Field of view of the cameras, in rad (public code of the paper)."""
 SIDE_CAMERA_AT = (0.5, -0.17, 0.17)  # m
 AMBIENT_LIGHT, KEY_LIGHT, FILL_LIGHT = 0.3, 0.8, 0.35  # intensities, chosen by eye
 KEY_DIRECTION, FILL_DIRECTION = [0.4, 0.6, -1], [-0.5, -0.3, -1]

@@ -57,7 +57,7 @@ def test_target_is_precise_in_the_air(env):
     assert np.linalg.norm(after - before) < 1e-5  # it neither sags nor creeps
 
 
-def test_leash_bounds_the_force_however_long_one_pushes(env):
+def test_target_lead_limit_bounds_the_force_however_long_one_pushes(env):
     env.reset(seed=2)
     down = -np.eye(6)[2]
     forces = [float(env.step(0.3 * down)[-1]["contact_force"]) for _ in range(100)]

@@ -56,7 +56,8 @@ class BallSortingRewardConfig:
     "ManiFeel-BallSorting-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("II", "III")
 )
 class BallSortingEnv(VisuotactileEnv):
-    """
+    """Tell a golf ball from a table-tennis ball by touch, and lift it.
+
     **Task Description:**
     A table-tennis ball and a golf ball of the same size and colour sit on a stand. The gripper lifts the golf ball and leaves
     the other. Only touch can tell which is which: the golf ball's 336 dimples are there for the pads, and not for the cameras.

@@ -50,7 +50,8 @@ class ObjectSearchRewardConfig:
     "ManiFeel-ObjectSearch-v1", max_episode_steps=400, category="exploration", paper_demos=50, paper_tables=("I", "II", "III")
 )
 class ObjectSearchEnv(VisuotactileEnv):
-    """
+    """Find a battery in a container that the camera cannot see into, and lift it.
+
     **Task Description:**
     A battery block, a cube of 25 mm, lies in one of two places on the floor of an opaque container, 322 x 281 x 161 mm, that
     the policy's camera, in front of it, cannot look into. The gripper finds it by touch and lifts it.

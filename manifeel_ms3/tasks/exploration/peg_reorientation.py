@@ -17,7 +17,7 @@ NOT_INSERTED = 0.1
 
 @dataclass(frozen=True)
 class PegReorientationRandomization(InsertionRandomization):
-    """Half ranges of the uniform distributions; the defaults are the paper's: the rim's place is fixed, the peg's angle is not."""
+    """Half ranges of the uniform distributions; the defaults are the paper's, which fixes the place of the rim."""
 
     socket_xy: float = 0.0
     start_xy: float = 0.03
@@ -30,7 +30,8 @@ class PegReorientationRandomization(InsertionRandomization):
     "ManiFeel-PegReorientation-v1", max_episode_steps=300, category="exploration", paper_demos=50, paper_tables=("I",)
 )
 class PegReorientationEnv(InsertionEnv):
-    """
+    """Stand a tilted peg up in a rim that the camera cannot see.
+
     **Task Description:**
     The gripper holds a peg, 16 x 10 x 50 mm, at an angle, over a rim in an opaque box that the policy's camera cannot see into.
     It finds the rim, stands the peg up in it and presses it in.

@@ -32,7 +32,8 @@ class GearRandomization(InsertionRandomization):
     "ManiFeel-GearAssembly-v1", max_episode_steps=300, category="insertion", paper_demos=100, paper_tables=("I", "II", "III")
 )
 class GearAssemblyEnv(InsertionEnv):
-    """
+    """Put a gear onto its shaft between two others, with which its teeth mesh.
+
     **Task Description:**
     The gripper holds the medium one of three gears (19 teeth, 42 mm across) by a handle and puts it on the middle shaft of a
     base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.

@@ -14,7 +14,8 @@ NOT_INSERTED = 0.1
     "ManiFeel-PowerPlugInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",)
 )
 class PowerPlugInsertionEnv(InsertionEnv):
-    """
+    """Insert a NEMA 5-15 plug into a socket that looks up.
+
     **Task Description:**
     The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that looks up. The holes leave
     0.2 mm on each side; the ground pin, 3 mm longer than the blades, finds its hole first.

@@ -11,7 +11,8 @@ NOT_INSERTED = 0.1
 
 @register_task("ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
 class USBInsertionEnv(InsertionEnv):
-    """
+    """Insert a USB-A plug into a port that looks up.
+
     **Task Description:**
     The gripper holds a USB-A plug by its handle and puts it into a port that looks up. Shell and tongue have 0.1 mm around them
     on each side; the plug fits only one way round, which is the way it is held.

@@ -48,7 +48,8 @@ class BulbRandomization(ScrewingRandomization):
     demo_megabytes=70.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
-    """
+    """Screw a light bulb into its holder.
+
     **Task Description:**
     The gripper holds a light bulb by its glass and screws its E27 cap (pitch 3.63 mm) into a holder that hides the thread,
     until it is tight. The hand turns 310 degrees at most; then it lets go, turns back, and takes the bulb again.

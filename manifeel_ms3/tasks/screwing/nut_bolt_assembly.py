@@ -22,7 +22,8 @@ MAX_TILT = np.deg2rad(2.0)
     demo_megabytes=70.0,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):
-    """
+    """Screw an M16 nut onto a bolt.
+
     **Task Description:**
     The gripper holds an M16 nut and screws it onto a bolt that stands up. Both have real threads, 2 mm of pitch. The hand turns
     310 degrees at most; then it lets go, turns back, and takes the nut again.
