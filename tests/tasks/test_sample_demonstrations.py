@@ -18,8 +18,8 @@ SAME_PLACE = 1e-6
 """Largest difference of a final pose, in m and of a quaternion's components. On the machine of the recording it is 0; other
 processors may round differently, which moves a part by less than this, whereas a change of the task moves it by more."""
 HOW_TO_MEND = (
-    "the sample of {task} has another outcome than when it was recorded: raise the revision of {task} in its register_task(...) "
-    "and record the sample anew"
+    "the sample of {task} has another outcome than when it was recorded: "
+    "raise the revision of {task} in its register_task(...) and record the sample anew"
 )
 
 
