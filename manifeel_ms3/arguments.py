@@ -1,9 +1,12 @@
-"""Checks of what a caller gave: the error names the argument, what was given, and what would do."""
+"""Checks of arguments. The error names the argument, what was given, and what is allowed."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
 from typing import Any, TypeVar
+
+import numpy as np
+import torch
 
 from .errors import InvalidArgumentError
 
@@ -11,22 +14,63 @@ T = TypeVar("T")
 
 
 def one_of(name: str, given: T, allowed: Iterable[T]) -> T:
+    """Return `given` if it is one of the allowed values.
+
+    Raises:
+        InvalidArgumentError: It is not.
+    """
     if given not in list(allowed):
         raise InvalidArgumentError(f"{name}={given!r} is unknown; choose from {list(allowed)}")
     return given
 
 
 def several_of(name: str, given: Any, allowed: Iterable[str]) -> tuple[str, ...]:
-    """A single name counts as one of several."""
+    """Return the given names as a tuple if all of them are allowed; a single name counts as a tuple of one.
+
+    Raises:
+        InvalidArgumentError: One of them is not allowed.
+    """
     values = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     return tuple(one_of(name, value, allowed) for value in values)
 
 
 def by_name(name: str, given: Any, example: str) -> Mapping[str, Any]:
+    """Return `given` if it is a mapping with strings as keys.
+
+    Raises:
+        InvalidArgumentError: It is not; the message shows the example.
+    """
     if not isinstance(given, Mapping) or not all(isinstance(key, str) for key in given):
         raise InvalidArgumentError(f"{name}={given!r} must be a dict of values by name, like {example}")
     return given
 
 
 def is_number(value: Any) -> bool:
+    """Whether a value is a finite real number, and not a bool."""
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch.device | str = "cpu") -> torch.Tensor:
+    """Return an action as a float32 tensor.
+
+    Args:
+        action: Array, tensor or nested sequence of numbers.
+        shapes: Shapes that the task takes.
+        device: Device of the result.
+
+    Raises:
+        InvalidArgumentError: The action is not made of numbers, has another shape, or holds NaN or infinity.
+    """
+    try:
+        array = action.detach() if isinstance(action, torch.Tensor) else torch.from_numpy(np.array(action, np.float32))
+        tensor = array.to(device, torch.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InvalidArgumentError(f"the action is no array of numbers ({error}): {action!r}") from error
+    if tuple(tensor.shape) not in shapes:
+        expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
+        raise InvalidArgumentError(f"the action has shape {tuple(tensor.shape)}, the task takes {expected}")
+    if not torch.isfinite(tensor).all():
+        raise InvalidArgumentError(
+            f"the action holds NaN or infinity: {tensor.tolist()}; give finite numbers (they are clipped to [-1, 1])"
+        )
+    return tensor

@@ -1,9 +1,12 @@
-"""Controllers that survive contact: a target pose on a leash, and a gripper that holds what it holds.
+"""Controllers for contact: a pose target with a limited lead over the tool, and a gripper that keeps its grip.
 
-The arm follows pose targets that accumulate (precise in the air: a commanded millimetre is a millimetre), but before each
-command the target is pulled back to within a leash of where the tool really is. Contact force is then bounded by leash times
-joint stiffness, whatever the policy asks for, as with a task-space impedance.
+The arm follows pose targets that accumulate (precise in the air: a commanded millimetre is a millimetre). Before each command,
+the target is pulled back until it leads the tool's actual pose by at most `target_lead_limit`. Contact force is thereby bounded
+by that limit times the joint stiffness, whatever the policy asks for, as with a task-space impedance.
 """
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# (ManiSkill annotates actions and joint positions as unions of arrays, sequences and dicts; here they are tensors)
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +29,11 @@ from mani_skill.utils.geometry.rotation_conversions import (
 )
 from mani_skill.utils.structs import Pose
 
+IK_TOLERANCE = 1e-7
+"""Norm of the pose error, in m and rad, at which inverse kinematics has converged: the resolution of single precision."""
+IK_ITERATIONS = 30
+"""Largest number of Gauss-Newton iterations; a step of an episode takes a few."""
+
 
 def clamp_norm(vector: torch.Tensor, limit: float) -> torch.Tensor:
     """Shorten the rows of `vector` (N, D) that are longer than `limit`."""
@@ -36,17 +44,17 @@ def clamp_norm(vector: torch.Tensor, limit: float) -> torch.Tensor:
 def rotation_between(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
     """Rotation vector (N, 3), rad, that turns quaternion `start` into `end` about the axes both are expressed in."""
     turn = quaternion_multiply(end, quaternion_invert(start))
-    turn = torch.where(turn[:, :1] < 0, -turn, turn)  # the short way round
+    turn = torch.where(turn[:, :1] < 0, -turn, turn)  # of the two rotations, the shorter one
     return quaternion_to_axis_angle(turn)
 
 
-class LeashedEEPoseController(PDEEPoseController):
-    """Delta pose control of the tool about the base frame's axes, the target on a leash.
+class LimitedLeadEEPoseController(PDEEPoseController):
+    """Delta pose control of the tool about the base frame's axes; the target's lead over the tool is limited.
 
     Action +-1 maps to `pos_upper` metres along and `rot_upper` radians about each axis of the base frame, right-hand rule.
     """
 
-    config: "LeashedEEPoseControllerConfig"
+    config: "LimitedLeadEEPoseControllerConfig"
 
     def _initialize_action_space(self):
         rotations = len(self.config.rotation_axes)
@@ -61,21 +69,21 @@ class LeashedEEPoseController(PDEEPoseController):
         delta = self._preprocess_action(action)
         turn = delta.new_zeros(len(delta), 3)
         turn[:, list(self.config.rotation_axes)] = delta[:, 3:]
-        leashed = self.commanded_pose
+        base = self.commanded_pose
         self._target_pose = Pose.create_from_pq(
-            leashed.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), leashed.q)
+            base.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), base.q)
         )
         self.set_drive_targets(self.solve_ik(self._target_pose))
 
     @property
     def commanded_pose(self) -> Pose:
-        """Pose (base frame) that the next action counts from: the last target, pulled back to the tool by the leash."""
-        return self._pull_back(self._target_pose, self.ee_pose_at_base)
+        """Pose (base frame) that the next action is relative to: the last target, its lead over the tool limited."""
+        return self._limit_lead(self._target_pose, self.ee_pose_at_base)
 
-    def _pull_back(self, target: Pose, current: Pose) -> Pose:
-        turn = clamp_norm(rotation_between(current.q, target.q), self.config.leash_rot)
+    def _limit_lead(self, target: Pose, current: Pose) -> Pose:
+        turn = clamp_norm(rotation_between(current.q, target.q), self.config.target_lead_limit_rot)
         return Pose.create_from_pq(
-            current.p + clamp_norm(target.p - current.p, self.config.leash_pos),
+            current.p + clamp_norm(target.p - current.p, self.config.target_lead_limit_pos),
             quaternion_multiply(axis_angle_to_quaternion(turn), current.q),
         )
 
@@ -97,7 +105,7 @@ class LeashedEEPoseController(PDEEPoseController):
         start = q0[0, solver.pmodel_active_joint_indices].cpu().numpy()
         # dt = 1 makes the damped iteration Gauss-Newton; the stock 0.1 stops 0.1 mm short
         solution, _, _ = solver.pmodel.compute_inverse_kinematics(
-            solver.end_link_idx, pose.sp, start, solver.qmask, eps=1e-7, max_iterations=30, dt=1.0
+            solver.end_link_idx, pose.sp, start, solver.qmask, eps=IK_TOLERANCE, max_iterations=IK_ITERATIONS, dt=1.0
         )
         limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
         q = common.to_tensor(solution[solver.pmodel_controlled_joint_indices], device=self.device).float()
@@ -108,26 +116,30 @@ class LeashedEEPoseController(PDEEPoseController):
 
 
 @dataclass
-class LeashedEEPoseControllerConfig(PDEEPoseControllerConfig):
+class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
+    """Configuration of `LimitedLeadEEPoseController`."""
+
     pos_lower: float = -0.01
+    """Translation of an action of -1, in m."""
     pos_upper: float = 0.01
-    """Translation of an action of 1, metres (0.01 in the paper's public code)."""
+    """Translation of an action of 1, in m (public code of the paper)."""
     rot_lower: float = -0.05
+    """Rotation of an action of -1, in rad."""
     rot_upper: float = 0.05
-    """Rotation of an action of 1, radians (0.05 in the paper's public code)."""
+    """Rotation of an action of 1, in rad (public code of the paper)."""
     rotation_axes: Sequence[int] = (0, 1, 2)
-    """Base-frame axes that have a rotation action; (2,) is yaw alone."""
-    leash_pos: float = 0.006
-    """The target may lead the tool by this much before a command is added, metres: the arm's lag at full speed is 5.8 mm
-    (joint time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact it bounds the force near 16 N."""
-    leash_rot: float = 0.04
-    """The same for rotation, radians."""
+    """Axes of the base frame that have a rotation action; (2,) is yaw alone."""
+    target_lead_limit_pos: float = 0.006
+    """Largest lead of the target over the tool before a command is added, in m. The arm's lag at full speed is 5.8 mm (joint
+    time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds the force near 16 N."""
+    target_lead_limit_rot: float = 0.04
+    """The same for rotation, in rad."""
     use_target: bool = True
-    controller_cls = LeashedEEPoseController
+    controller_cls = LimitedLeadEEPoseController
 
 
 class HoldGripperController(PDJointPosController):
-    """A gripper with no action that keeps the grip that the robot was reset with.
+    """A gripper without an action, which keeps the grip that the robot was reset with.
 
     The fingers stay position controlled, so that a sideways push on the held object meets their stiffness.
     """
@@ -144,5 +156,7 @@ class HoldGripperController(PDJointPosController):
 
 @dataclass
 class HoldGripperControllerConfig(PDJointPosControllerConfig):
+    """Configuration of `HoldGripperController`."""
+
     normalize_action: bool = False
     controller_cls = HoldGripperController

@@ -1,5 +1,9 @@
 """The robot of every ManiFeel task: a Franka Panda with a GelSight R1.5 finger on each side and a wrist camera."""
 
+# pyright: reportArgumentType=false
+# (controllers' configurations are built from dicts of mixed types, as ManiSkill's own robots do it)
+from typing import Any, ClassVar
+
 import numpy as np
 import sapien
 import torch
@@ -16,20 +20,38 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
-from .controllers import HoldGripperControllerConfig, LeashedEEPoseControllerConfig
+from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseControllerConfig
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
-GEL_STIFFNESS = (
-    16000.0  # N/m per contact point; PhysX averages it with the other body's 0: 8 kN/m acts, 0.6 mm at 20 N on a face
-)
+GEL_STIFFNESS = 16000.0
+"""Stiffness of the gel, in N/m per contact point. PhysX averages it with the other body's 0: 8 kN/m acts, which is 0.6 mm at
+20 N on a face."""
 GEL_FRICTION = 1.0
-HOLD_STIFFNESS = 1.0e4  # N/m: a push of 10 N shifts a held object by 0.5 mm between the two fingers
+"""Coulomb's coefficient of the gel."""
+GEL_PATCH_RADIUS = 0.01
+"""Radius of the contact patch over which PhysX takes torsional friction, in m."""
+HOUSING_FRICTION = 0.3
+"""Coulomb's coefficient of the fingers' housings."""
+ARM_STIFFNESS, ARM_DAMPING, ARM_FORCE_LIMIT = 1e3, 1e2, 100.0
+"""Joint control of the arm, in N m/rad, N m s/rad and N m: those of ManiSkill's Panda."""
+HOLD_STIFFNESS = 1.0e4
+"""Stiffness of a finger that holds, in N/m: a push of 10 N shifts a held object by 0.5 mm between the two fingers."""
+HOLD_DAMPING, HOLD_FORCE_LIMIT = 2e2, 100.0
+"""Damping, in N s/m, and largest force, in N, of a finger that holds."""
+GRIPPER_FORCE_LIMIT = 40.0
+"""Largest force of a finger, in N, that a policy can command."""
+FINGER_RANGE = (-0.01, 0.04)
+"""Range of a finger's commanded distance from the middle, in m. A command short of a thin object is a force: 1 kN/m times the
+distance."""
+IK_STEPS = 20
+"""Number of Levenberg-Marquardt steps of the inverse kinematics at a reset on a GPU."""
 _TURNS = ("roll", "pitch", "yaw")
-ACTION_AXES = {  # of a controller's actions, in their order; about the base's axes
+ACTION_AXES = {
     "pd_ee_delta_pose": ("x", "y", "z", *_TURNS, "gripper"),
     "pd_ee_delta_pose_fixed_gripper": ("x", "y", "z", *_TURNS),
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
+"""Meaning of the components of an action by controller, in their order; rotations are about the base's axes."""
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
 WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
 
@@ -43,22 +65,22 @@ class PandaGelSight(BaseAgent):
     """
 
     uid = "panda_gelsight"
-    urdf_config = dict(
+    urdf_config: ClassVar[dict[str, Any]] = dict(
         _materials=dict(
             gel=dict(static_friction=GEL_FRICTION, dynamic_friction=GEL_FRICTION, restitution=-GEL_STIFFNESS),
-            housing=dict(static_friction=0.3, dynamic_friction=0.3, restitution=0.0),
+            housing=dict(static_friction=HOUSING_FRICTION, dynamic_friction=HOUSING_FRICTION, restitution=0.0),
         ),
         link=dict(
-            gel_left=dict(material="gel", patch_radius=0.01, min_patch_radius=0.01),
-            gel_right=dict(material="gel", patch_radius=0.01, min_patch_radius=0.01),
+            gel_left=dict(material="gel", patch_radius=GEL_PATCH_RADIUS, min_patch_radius=GEL_PATCH_RADIUS),
+            gel_right=dict(material="gel", patch_radius=GEL_PATCH_RADIUS, min_patch_radius=GEL_PATCH_RADIUS),
             panda_leftfinger=dict(material="housing"),
             panda_rightfinger=dict(material="housing"),
         ),
     )
-    arm_joint_names = [f"panda_joint{i}" for i in range(1, 8)]
-    gripper_joint_names = ["panda_finger_joint1", "panda_finger_joint2"]
+    arm_joint_names: ClassVar[list[str]] = [f"panda_joint{i}" for i in range(1, 8)]
+    gripper_joint_names: ClassVar[list[str]] = ["panda_finger_joint1", "panda_finger_joint2"]
     ee_link_name = "panda_hand_tcp"
-    keyframes = dict(
+    keyframes: ClassVar[dict[str, Keyframe]] = dict(
         # fingers straight down over (0.5, 0), their tips 150 mm above the table: the paper's start
         tool_down=Keyframe(qpos=np.array([0.0, -0.2086, 0.0, -2.2905, 0.0, 2.0819, np.pi / 4, 0.04, 0.04]), pose=sapien.Pose()),
         rest=Keyframe(
@@ -77,28 +99,39 @@ class PandaGelSight(BaseAgent):
     def _controller_configs(self):
         pose = dict(
             joint_names=self.arm_joint_names,
-            stiffness=1e3,
-            damping=1e2,
-            force_limit=100,
+            stiffness=ARM_STIFFNESS,
+            damping=ARM_DAMPING,
+            force_limit=ARM_FORCE_LIMIT,
             ee_link=self.ee_link_name,
             urdf_path=self.urdf_path,
         )
-        delta_pose = LeashedEEPoseControllerConfig(**pose)
-        delta_yaw = LeashedEEPoseControllerConfig(**pose, rotation_axes=(2,))
+        delta_pose = LimitedLeadEEPoseControllerConfig(**pose)
+        delta_yaw = LimitedLeadEEPoseControllerConfig(**pose, rotation_axes=(2,))
         gripper = PDJointPosMimicControllerConfig(
             self.gripper_joint_names,
-            lower=-0.01,  # commands a force on thin objects: 1 kN/m times the distance short of it
-            upper=0.04,
-            stiffness=1e3,
-            damping=1e2,
-            force_limit=40,  # N
+            lower=FINGER_RANGE[0],
+            upper=FINGER_RANGE[1],
+            stiffness=ARM_STIFFNESS,
+            damping=ARM_DAMPING,
+            force_limit=GRIPPER_FORCE_LIMIT,
             mimic={"panda_finger_joint2": {"joint": "panda_finger_joint1"}},
         )
         hold = HoldGripperControllerConfig(
-            self.gripper_joint_names, None, None, stiffness=HOLD_STIFFNESS, damping=2e2, force_limit=100
+            self.gripper_joint_names,
+            None,
+            None,
+            stiffness=HOLD_STIFFNESS,
+            damping=HOLD_DAMPING,
+            force_limit=HOLD_FORCE_LIMIT,
         )
         joints = PDJointPosControllerConfig(
-            self.arm_joint_names, None, None, stiffness=1e3, damping=1e2, force_limit=100, normalize_action=False
+            self.arm_joint_names,
+            None,
+            None,
+            stiffness=ARM_STIFFNESS,
+            damping=ARM_DAMPING,
+            force_limit=ARM_FORCE_LIMIT,
+            normalize_action=False,
         )
         return deepcopy_dict(
             dict(
@@ -143,7 +176,9 @@ class PandaGelSight(BaseAgent):
     def reset(self, init_qpos: torch.Tensor | None = None, grip_force: float = 0.0):
         """Put the joints (n, 9) of the environments being reset in place, to stay there.
 
-        `grip_force`, N, is what each finger presses with against what it holds at these joint positions.
+        Args:
+            init_qpos: Joint positions (n, 9), in rad and m; the present ones if not given.
+            grip_force: Force, in N, of each finger on the object that it holds at these joint positions.
         """
         super().reset(init_qpos)
         if init_qpos is not None:
@@ -151,10 +186,14 @@ class PandaGelSight(BaseAgent):
             targets[:, 7:] -= grip_force / self.controller.controllers["gripper"].config.stiffness
             self.robot.set_joint_drive_targets(targets, self.robot.active_joints, torch.arange(9, device=self.device))
 
-    def reset_tool(self, pose: Pose, opening: float = 0.04, grip_force: float = 0.0, wrist_turn: float = 0.0):
-        """`reset` with the tool at poses (n,), base frame, and each finger `opening`, m, from the middle.
+    def reset_tool(self, pose: Pose, opening: float = FINGER_RANGE[1], grip_force: float = 0.0, wrist_turn: float = 0.0):
+        """Reset the robot with the tool at given poses.
 
-        `wrist_turn`, rad: about which angle the last joint is to be turned, of those that differ by a whole turn.
+        Args:
+            pose: Poses (n,) of the tool in the base frame.
+            opening: Distance of each finger from the middle, in m.
+            grip_force: Force, in N, of each finger on the object that it holds there.
+            wrist_turn: Angle, in rad, near which the last joint is to be, of those that differ by a whole turn.
         """
         qpos = torch.tensor(self.keyframes["tool_down"].qpos, dtype=torch.float32, device=self.device).repeat(len(pose), 1)
         qpos[:, 6] += wrist_turn
@@ -167,33 +206,36 @@ class PandaGelSight(BaseAgent):
 
     @property
     def tcp_pose_at_base(self) -> Pose:
-        """Tool centre point in the robot's base frame."""
+        """Pose of the tool centre point in the robot's base frame."""
         return self.robot.pose.inv() * self.tcp.pose
 
     def solve_ik(self, pose: Pose, q0: torch.Tensor) -> torch.Tensor:
         """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
         controller = self.controller.controllers["arm"]
-        return controller.solve_ik(pose, q0, iterations=20)
+        return controller.solve_ik(pose, q0, iterations=IK_STEPS)
 
     def pad_wrench(self, side: str) -> torch.Tensor:
-        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame: the sums of its TacFF."""
+        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame: the sums over its TacFF."""
         return self._gauges[side].read()
 
     @property
     def pad_joint_forces(self) -> torch.Tensor:
-        """What the engine says of both pads' joints, (N, 2, 6), N and N m, in the joints' frames: cheap to collect."""
+        """Force and moment (N, 2, 6), N and N m, of both pads' joints, in the joints' frames: cheap to collect."""
         return self.robot.get_link_incoming_joint_forces()[:, self._gel_indices]
 
     def held_object_force(self, pad_joint_forces: torch.Tensor) -> torch.Tensor:
-        """Size (...), N, of the force that both pads together exert on what they hold; the world pushes back as much.
+        """Norm (...), in N, of the force of both pads together on the held object, which equals that of the world on it.
 
-        `pad_joint_forces` (..., 2, 6) was collected from the property of that name.
+        Args:
+            pad_joint_forces: Values (..., 2, 6) of the property of that name.
         """
         return torch.linalg.norm(torch.einsum("...kj,kij->...i", pad_joint_forces[..., :3], self._joint_to_hand), dim=-1)
 
     def torque_on_held(self, point: torch.Tensor) -> torch.Tensor:
-        """Torque (N,), N m, of both pads on what they hold, about the vertical through `point` (N, 3), counter-clockwise seen
-        from above."""
+        """Torque (N,), in N m, of both pads on the held object about the vertical through `point` (N, 3).
+
+        It is positive counter-clockwise, seen from above.
+        """
         total = torch.zeros(len(point), device=point.device)
         for side, gel in self.gels.items():
             wrench = self.pad_wrench(side).to(point.dtype)

@@ -21,12 +21,15 @@ from mani_skill import PACKAGE_ASSET_DIR
 
 from manifeel_ms3.paths import cache_dir
 
-FINGER_SIZE = (0.030, 0.023, 0.100)  # across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
-GEL_SIZE = (0.024, 0.032, 0.003)  # across, along the finger, thick
-GEL_CENTRE = 0.082  # along the finger: the gel ends 2 mm short of the tip
-HAND_TO_FINGER = 0.0584  # hand frame to finger frame, from the Panda's URDF
+FINGER_SIZE = (0.030, 0.023, 0.100)  # m: across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
+GEL_SIZE = (0.024, 0.032, 0.003)  # m: across, along the finger, thick
+GEL_CENTRE = 0.082  # m along the finger: the gel ends 2 mm short of the tip
+HAND_TO_FINGER = 0.0584  # m: hand frame to finger frame, from the Panda's URDF
 HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
-TRIANGLES_PER_MESH = 1200  # a link's silhouette moves by less than a pixel at 256 x 256
+TRIANGLES_PER_MESH = 1200  # with so many, a link's silhouette moves by less than a pixel at 256 x 256
+FEWEST_TRIANGLES = 24  # of a small part of a mesh, which would vanish with its share of the triangles
+SMOOTH_ANGLE = np.deg2rad(35)  # edges that are sharper stay sharp; chosen by eye
+FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
@@ -35,7 +38,9 @@ _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1
 def panda_gelsight_urdf(visuals: bool = True) -> str:
     """Path of the derived URDF; it and the low-poly meshes are made on the first call and cached.
 
-    Without `visuals` it can be loaded where there is no renderer at all: SAPIEN makes a render material for every visual.
+    Args:
+        visuals: Whether links have visual meshes. Without them the file can be loaded where there is no renderer at all: SAPIEN
+            makes a render material for every visual.
     """
     # the key covers everything the files are made from: this module, the package's URDF, and where the package lies
     recipe = Path(__file__).read_bytes() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
@@ -46,7 +51,7 @@ def panda_gelsight_urdf(visuals: bool = True) -> str:
 
 
 def _build_into(folder: Path) -> None:
-    """Build in a temporary folder and move it in place, so that processes that start together do no harm."""
+    """Build in a temporary folder and move it in place, so that processes that start together do not disturb each other."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
         work = Path(scratch) / "new"
@@ -94,7 +99,7 @@ def _decimate(source: Path, work: Path) -> str:
     total = sum(len(part.faces) for part in parts)
     out = trimesh.Scene()
     for part in parts:
-        budget = max(24, TRIANGLES_PER_MESH * len(part.faces) // total)
+        budget = max(FEWEST_TRIANGLES, TRIANGLES_PER_MESH * len(part.faces) // total)
         vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
         if len(faces) > budget:
             merged = trimesh.Trimesh(vertices, faces)  # seams of the texture are cracks to the decimator
@@ -108,7 +113,7 @@ def _decimate(source: Path, work: Path) -> str:
         # unmerged vertices give flat facets with true normals; smooth shading over big facets looks dented
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         mesh.visual = trimesh.visual.TextureVisuals(material=material)
-        out.add_geometry(trimesh.graph.smooth_shade(mesh, angle=np.deg2rad(35)))
+        out.add_geometry(trimesh.graph.smooth_shade(mesh, angle=SMOOTH_ANGLE))
     name = f"{source.stem}.glb"
     (work / name).write_bytes(out.export(file_type="glb"))
     return name
@@ -119,10 +124,10 @@ def _replace_finger(link: ET.Element, side: str) -> None:
         for element in link.findall(tag):
             link.remove(element)
     _, outward = _FINGERS[side]
-    across, deep, long = FINGER_SIZE
+    _, deep, long = FINGER_SIZE
     centre = (0.0, outward * (GEL_SIZE[2] + deep / 2), long / 2)
     _add_box(link, FINGER_SIZE, centre, colour="0.16 0.16 0.18 1")
-    _add_inertia(link, mass=0.08, size=FINGER_SIZE, centre=centre)
+    _add_inertia(link, mass=FINGER_MASS, size=FINGER_SIZE, centre=centre)
 
 
 def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element]:
@@ -130,7 +135,7 @@ def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element
     link = ET.Element("link", name=name)
     centre = (0.0, 0.0, -GEL_SIZE[2] / 2)
     _add_box(link, GEL_SIZE, centre, colour="0.75 0.77 0.8 1")
-    _add_inertia(link, mass=0.01, size=GEL_SIZE, centre=centre)
+    _add_inertia(link, mass=GEL_MASS, size=GEL_SIZE, centre=centre)
     joint = ET.Element("joint", name=f"{name}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=finger)
     ET.SubElement(joint, "child", link=name)

@@ -11,6 +11,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from manifeel_ms3.arguments import checked_action
+from manifeel_ms3.errors import InvalidArgumentError
+
 from .policy import Policy
 
 HANGS_FOR_GOOD = 10.0
@@ -100,15 +103,15 @@ def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
 
 
 def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the policy's action as an array.
+
+    Raises:
+        PolicyFault: The task does not take it.
+    """
     try:
-        array = np.asarray(action, np.float32)
-    except (TypeError, ValueError) as error:
-        raise PolicyFault(f"the action is no array of numbers ({error})") from error
-    if array.shape != shape:
-        raise PolicyFault(f"the action has shape {array.shape}, the task takes {shape}")
-    if not np.isfinite(array).all():
-        raise PolicyFault(f"the action holds NaN or infinity: {array.tolist()}")
-    return array
+        return checked_action(action, (shape,)).numpy()
+    except InvalidArgumentError as error:
+        raise PolicyFault(str(error)) from error
 
 
 @contextmanager

@@ -13,14 +13,13 @@ import torch
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.sensors.visualisation import observation_images
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
 
 TILE_HEIGHT = 240
 """Height of each image in a video, in pixels: that of a TacRGB image."""
-CONTROL_RATE = 10
-"""Frames per second of a video: the tasks' control rate, in Hz, so that a video runs in real time."""
 BLOCK = 8
 """Widths and heights of a video are made multiples of this number of pixels; H.264 needs an even number."""
 QUALITY = 7
@@ -58,7 +57,7 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     return outcome, frames
 
 
-def encode_video(frames: list[Frame], fps: int = CONTROL_RATE) -> bytes:
+def encode_video(frames: list[Frame], fps: int = CONTROL_FREQ) -> bytes:
     """An MP4 file with the images of each step side by side.
 
     Args:

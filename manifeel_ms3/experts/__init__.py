@@ -13,6 +13,7 @@ from .ball_sorting import BallSortingExpert as BallSortingExpert
 from .insertion import GearExpert as GearExpert
 from .insertion import InsertionExpert as InsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
+from .screwing import BulbExpert as BulbExpert
 from .screwing import ScrewingExpert as ScrewingExpert
 
 
@@ -20,12 +21,17 @@ class Expert(Protocol):
     """A demonstrator for one episode, made after `env.reset(seed=seed)`."""
 
     def actions(self) -> Iterator[np.ndarray]:
-        """Actions in [-1, 1], one for every step; the iterator is advanced after the step before has been taken."""
+        """Actions in [-1, 1], one for every step; take each one in the environment before asking for the next."""
         ...
 
 
 def make_expert(env_id: str, env: VisuotactileEnv, seed: int) -> Expert:
-    """The demonstrator of a task, for the episode that the environment has just been reset to.
+    """Make the demonstrator of a task for the episode that the environment has just been reset to.
+
+    Args:
+        env_id: Id of the task.
+        env: The environment, without its wrappers.
+        seed: Seed of the episode; the demonstrator draws its errors of perception and its guesses from it.
 
     Raises:
         UnknownNameError: The task is not registered, or has no demonstrator.
@@ -34,7 +40,7 @@ def make_expert(env_id: str, env: VisuotactileEnv, seed: int) -> Expert:
 
 
 def require_demonstrator(env_id: str) -> Callable[[Any, int], Expert]:
-    """What makes the demonstrator of a task from an environment and a seed.
+    """The callable that makes a task's demonstrator from an environment and a seed.
 
     Raises:
         UnknownNameError: The task is not registered, or has no demonstrator.

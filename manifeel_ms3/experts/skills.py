@@ -1,28 +1,54 @@
-"""Skills that scripted demonstrators share: moving, pressing, feeling.
+"""Skills that the scripted demonstrators share: moving, pressing and sensing load.
 
-A skill is a generator that yields actions and sees the world anew after each. It commands the same controller as a policy
-does, within the same limits, and feels through the pads: the load it acts on is the sum of both force fields.
+A skill is a generator of actions. It reads the state of the world again after each action that it yields. It commands the
+same controller as a policy does, within the same limits. The load that it acts on is the sum of the force fields of both pads.
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 from mani_skill.utils.structs import Actor
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks import VisuotactileEnv
 
 Actions = Iterator[np.ndarray]
-MOVE_GAIN = 0.4  # share of the remaining way that a step covers: a reach that slows down towards its end, as a hand's does
-TOP_SPEED = 0.008  # m a step; actions reach 0.01
-TOP_TURN = 0.04  # rad a step; actions reach 0.05
-SPEED_UP = 0.002  # m a step more than the step before, at most
-SIGHT_ERROR = 0.0015  # m: how far off the eye places a thing, about two pixels of the wrist camera
-DOWNWARD = Rotation.from_euler("x", np.pi)  # of the tool, and of a plug in it: frames with their z down
+DOWNWARD = Rotation.from_euler("x", np.pi)
+"""Orientation of a tool that points straight down, and of a plug in it: their frames have z down."""
+SMALLEST_NORM = 1e-9
+"""Norm, m or rad, below which a displacement has no direction; it keeps divisions finite."""
+
+
+@dataclass(frozen=True)
+class SkillConfig:
+    """Constants of the shared skills.
+
+    Values without another origin were tuned by hand; docs/tasks.md has the success of every demonstrator over seeds 0 to 99.
+    """
+
+    move_gain: float = 0.4
+    """Share of the remaining distance that one step of a reach covers, so that it slows down towards its end. Tuned."""
+    top_speed: float = 0.008
+    """Largest step of a reach, in m; the controller allows 0.01 (public code of the paper)."""
+    top_turn: float = 0.04
+    """Largest rotation of a reach in one step, in rad; the controller allows 0.05 (public code of the paper)."""
+    speed_up: float = 0.002
+    """Largest increase of a step's length over that of the step before, in m. Tuned."""
+    angle_tolerance: float = 0.006
+    """Orientation error, in rad, below which a reach has arrived. Tuned."""
+    sight_error: float = 0.0015
+    """Largest error of a position that a demonstrator sees, in m: about two pixels of the wrist camera."""
+    settle_steps: int = 2
+    """Number of steps that the fingers get to come to rest after a motion at a steady pace. Tuned."""
+
+
+CONFIG = SkillConfig()
 
 
 class Skills:
-    """Motion and feeling of one robot in one environment (`num_envs=1`), in its base frame, m, rad and N."""
+    """Motion and sensed load of one robot in one environment (`num_envs=1`); base frame, in m, rad and N."""
 
     def __init__(self, env: VisuotactileEnv):
         self.env = env
@@ -32,27 +58,27 @@ class Skills:
         self._speed = 0.0
         self._no_load = np.zeros(3)
         self.gripper: float | None = None
-        """What actions command the gripper to do, 1 open to -1 closed; None where the controller holds it fixed."""
+        """Gripper command of every action, from 1 (open) to -1 (closed); None where the controller holds the gripper fixed."""
 
-    # ---------------------------------------------------------------- what is seen and felt
+    # ---------------------------------------------------------------- sensing
 
     @property
     def tool(self) -> tuple[np.ndarray, Rotation]:
-        """Where the tool is."""
+        """Measured position and orientation of the tool centre point."""
         return position_rotation(self.agent.tcp_pose_at_base.raw_pose)
 
     @property
     def commanded(self) -> tuple[np.ndarray, Rotation]:
-        """Where the next action counts from."""
+        """Position and orientation that the next action is relative to."""
         return position_rotation(self.arm.commanded_pose.raw_pose)
 
     @property
     def load(self) -> np.ndarray:
-        """Force (3,) of the world on what the fingers hold, felt by both pads, since `tare`."""
+        """Force (3,), N, of the world on the held object, sensed by both pads, relative to the last `tare`."""
         return self._raw_load() - self._no_load
 
     def tare(self) -> None:
-        """Take the present load, the held object's weight, as zero."""
+        """Take the present load, which is the weight of the held object, as zero."""
         self._no_load = self._raw_load()
 
     def _raw_load(self) -> np.ndarray:
@@ -61,19 +87,19 @@ class Skills:
             force = self.agent.pad_wrench(side)[0, :3].cpu().numpy()
             _, pad = position_rotation(gel.pose.raw_pose)
             total += pad.apply(force)
-        return total  # the object passes on to the pads what the world does to it
+        return total  # the held object transmits the world's force to the pads
 
     @property
     def squeeze(self) -> np.ndarray:
-        """Normal force (2,), N, that the left and the right pad feel."""
+        """Normal force (2,), N, on the left and the right pad."""
         return np.array([-float(self.agent.pad_wrench(side)[0, 2]) for side in ("left", "right")])
 
     # ---------------------------------------------------------------- moving
 
     def command(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        """Action (6,), or (7,) with a gripper, that puts the controller's target at a pose, or as near as the limits allow.
+        """Action (6,), or (7,) with a gripper, that sets the controller's target to a pose, or as near as the limits allow.
 
-        It is shorter where the controller turns about fewer axes.
+        The action is shorter where the controller turns about fewer axes.
         """
         here, facing = self.commanded
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
@@ -81,76 +107,89 @@ class Skills:
         return action if self.gripper is None else np.r_[action, self.gripper]
 
     def towards(self, rotation: Rotation, rate: float) -> Rotation:
-        """Orientation of the command, turned towards another by `rate` rad at most."""
+        """Orientation of the command, turned towards another one by at most `rate`, in rad."""
         _, facing = self.commanded
         way = (rotation * facing.inv()).as_rotvec()
-        return Rotation.from_rotvec(way * min(1.0, rate / max(np.linalg.norm(way), 1e-9))) * facing
+        return Rotation.from_rotvec(way * min(1.0, rate / max(np.linalg.norm(way), SMALLEST_NORM))) * facing
 
-    def stride(self, position: np.ndarray, rotation: Rotation, top_speed: float = TOP_SPEED) -> np.ndarray:
-        """Action (6,) of a reach towards a pose: gathers speed, slows down at the end."""
+    def stride(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
+        """Action of one step of a reach towards a pose, which accelerates at first and slows down at the end."""
         here, facing = self.commanded
         way, turn = position - here, (rotation * facing.inv()).as_rotvec()
         distance, angle = np.linalg.norm(way), np.linalg.norm(turn)
-        self._speed = min(MOVE_GAIN * distance, top_speed, self._speed + SPEED_UP)
-        pace = self._speed / distance if distance > 1e-9 else 1.0
-        sweep = min(MOVE_GAIN, TOP_TURN / angle) if angle > 1e-9 else 1.0
+        self._speed = min(CONFIG.move_gain * distance, CONFIG.top_speed, self._speed + CONFIG.speed_up)
+        pace = self._speed / distance if distance > SMALLEST_NORM else 1.0
+        sweep = min(CONFIG.move_gain, CONFIG.top_turn / angle) if angle > SMALLEST_NORM else 1.0
         return self.command(here + pace * way, Rotation.from_rotvec(sweep * turn) * facing)
 
     def reach(self, position: np.ndarray, rotation: Rotation, tolerance: float = 5e-4, steps: int = 80) -> Actions:
-        """Move to a pose through free space."""
+        """Move to a pose through free space, until within `tolerance`, in m, or for so many steps."""
         self._speed = 0.0
         for _ in range(steps):
             here, facing = self.tool
-            if np.linalg.norm(position - here) < tolerance and (rotation * facing.inv()).magnitude() < 0.006:
+            arrived = np.linalg.norm(position - here) < tolerance
+            if arrived and (rotation * facing.inv()).magnitude() < CONFIG.angle_tolerance:
                 return
             yield self.stride(position, rotation)
 
+    def hold_still(self) -> Actions:
+        """Repeat the present command without end."""
+        while True:
+            yield self.command(*self.commanded)
+
     def set_gripper(self, opening: float, steps: int = 6) -> Actions:
-        """Stay, and move the gripper: 1 open to -1 closed."""
+        """Stay in place and command the gripper, from 1 (open) to -1 (closed)."""
         self.gripper = opening
         for _ in range(steps):
             yield self.command(*self.commanded)
 
     def move_fingers(self, opening: float, steps: int) -> Actions:
-        """Stay, and move the gripper at a steady pace; then give it two steps to come to rest."""
+        """Stay in place and move the gripper at a steady pace; then give it two steps to come to rest."""
         start = self.gripper or 0.0
-        for step in range(steps + 2):
+        for step in range(steps + CONFIG.settle_steps):
             yield from self.set_gripper(start + (opening - start) * min((step + 1) / steps, 1.0), steps=1)
 
     def finger_action(self, position: float) -> float:
-        """What commands each finger to a place, m from the middle."""
+        """Gripper command that moves each finger to a distance from the middle, in m."""
         limits = self.agent.controller.controllers["gripper"].config
         return float(np.clip((position - limits.lower) / (limits.upper - limits.lower) * 2 - 1, -1, 1))
 
     def grip_action(self, width: float, force: float) -> float:
-        """What presses each finger with a force, N, on something this wide, m."""
+        """Gripper command that presses each finger with `force`, in N, on an object `width` wide, in m."""
         return self.finger_action(width / 2 - force / self.agent.controller.controllers["gripper"].config.stiffness)
 
-    def lift_and_hold(self, height: float, rotation: Rotation) -> Actions:
-        """Raise what is held by `height`, m; then stay, without end."""
+    def lift_and_hold(self, height: float, rotation: Rotation, tolerance: float = 2e-3) -> Actions:
+        """Raise the held object by `height`, in m; then hold it there without end."""
         here, _ = self.tool
-        yield from self.reach(here + [0.0, 0.0, height], rotation, tolerance=2e-3)
-        while True:
-            yield self.command(*self.commanded)
+        yield from self.reach(above(here, height), rotation, tolerance)
+        yield from self.hold_still()
 
     def lower_until_contact(self, rotation: Rotation, lowest: float, threshold: float = 2.0, speed: float = 0.002) -> Actions:
-        """Go straight down until something pushes back, or the tool is at height `lowest`."""
+        """Go straight down by `speed`, in m per step, until the load exceeds `threshold`, in N, or the tool is at `lowest`."""
         while True:
             here, _ = self.commanded
             tool, _ = self.tool
             if self.load[2] > threshold or tool[2] < lowest:
                 return
-            yield self.command(here - [0.0, 0.0, speed], rotation)
+            yield self.command(above(here, -speed), rotation)
 
 
-def seen(actor: Actor, rng: np.random.Generator) -> np.ndarray:
-    """Where a thing seems to be, (3,), m, base frame: up to SIGHT_ERROR off, to any side."""
-    angle, radius = rng.uniform(0, 2 * np.pi), SIGHT_ERROR * np.sqrt(rng.uniform())
+def above(position: np.ndarray, height: float) -> np.ndarray:
+    """The point `height`, in m, above a position (3,)."""
+    return position + np.array([0.0, 0.0, height])
+
+
+def perceived_position(actor: Actor, rng: np.random.Generator) -> np.ndarray:
+    """Position (3,), m, base frame, of an actor as a demonstrator sees it: up to `sight_error` off in a random direction.
+
+    The true position is read from the simulator, and the error added to it.
+    """
+    angle, radius = rng.uniform(0, 2 * np.pi), CONFIG.sight_error * np.sqrt(rng.uniform())
     position, _ = position_rotation(actor.pose.raw_pose)
     return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
-def position_rotation(raw_pose) -> tuple[np.ndarray, Rotation]:
-    """Of the only environment, from a pose (1, 7)."""
+def position_rotation(raw_pose: torch.Tensor) -> tuple[np.ndarray, Rotation]:
+    """Position and rotation of the only environment, from a pose (1, 7)."""
     pose = raw_pose[0].cpu().numpy().astype(np.float64)
     return pose[:3], Rotation.from_quat(pose[[4, 5, 6, 3]])  # SAPIEN has w first

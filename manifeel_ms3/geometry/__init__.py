@@ -1,3 +1,5 @@
+"""Shapes of the tasks' parts: one description for drawing, collision and touch."""
+
 from .fits import Fit as Fit
 from .gears import gear_fit as gear_fit
 from .part import Box as Box

@@ -7,22 +7,28 @@ import trimesh
 
 from .part import Ball, Box, Part, block_with_holes
 
-BALL_RADIUS = 0.02075  # m, of both: between a table-tennis ball's 20.0 and a golf ball's 21.35
-GOLF_MASS, TENNIS_MASS = 0.0459, 0.0027  # kg
-DIMPLES, DIMPLE_DEPTH, DIMPLE_RADIUS = 336, 2.5e-4, 1.75e-3  # m
-SEAT_SPACING, SEAT_HOLE, STAND_HEIGHT = 0.130, 0.020, 0.015  # m; so far apart that open fingers go between
-SEAT_SIZE = (0.05, 0.05)
+BALL_RADIUS = 0.02075
+"""Radius of both balls, in m: between a table-tennis ball's 20.0 mm (ITTF) and a golf ball's 21.35 mm (R&A, USGA)."""
+GOLF_MASS, TENNIS_MASS = 0.0459, 0.0027
+"""Masses in kg (R&A, USGA; ITTF)."""
+DIMPLES, DIMPLE_DEPTH, DIMPLE_RADIUS = 336, 2.5e-4, 1.75e-3  # number; m, typical of golf balls
+SEAT_SPACING, SEAT_HOLE, STAND_HEIGHT = 0.130, 0.020, 0.015  # m; open fingers fit between the seats
+SEAT_SIZE = (0.05, 0.05)  # m
+SUBDIVISIONS = 6
+"""Subdivisions of the golf ball's icosahedron: 82,000 triangles, of about 0.4 mm, resolve the dimples."""
 SEAT_HEIGHT = STAND_HEIGHT + float(np.sqrt(BALL_RADIUS**2 - (SEAT_HOLE / 2) ** 2))
-"""Of a seated ball's centre: it rests on the four edges of a square hole."""
+"""Height of a seated ball's centre, in m: the ball rests on the four edges of a square hole."""
 WHITE = (0.93, 0.93, 0.90)
 
 
 @functools.cache
 def golf_ball() -> Part:
+    """Ball whose dimples can be touched; cameras and contacts meet a smooth sphere."""
     return _ball("golf_ball", GOLF_MASS, golf_ball_mesh())
 
 
 def tennis_ball() -> Part:
+    """Smooth ball of the same size and colour."""
     return _ball("tennis_ball", TENNIS_MASS, None)
 
 
@@ -33,7 +39,7 @@ def _ball(name: str, mass: float, relief: trimesh.Trimesh | None) -> Part:
 
 def golf_ball_mesh() -> trimesh.Trimesh:
     """Sphere with 336 spherical dimples, evenly spread (Fibonacci lattice), 82,000 triangles."""
-    mesh = trimesh.creation.icosphere(subdivisions=6, radius=1.0)
+    mesh = trimesh.creation.icosphere(subdivisions=SUBDIVISIONS, radius=1.0)
     k = np.arange(DIMPLES) + 0.5
     polar, turn = np.arccos(1 - 2 * k / DIMPLES), np.pi * (1 + np.sqrt(5)) * k
     centres = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
@@ -45,7 +51,7 @@ def golf_ball_mesh() -> trimesh.Trimesh:
 
 
 def ball_stand() -> Part:
-    """Two seats with a square hole each, along y, and a bar between; its frame in the middle of its underside."""
+    """Two seats with a square hole each, side by side along y, joined by a bar; frame in the middle of the underside."""
     seat = block_with_holes(SEAT_SIZE, STAND_HEIGHT, [((SEAT_HOLE, SEAT_HOLE), (0.0, 0.0))])
     seats = [
         Box(box.size, (box.centre[0], box.centre[1] + side * SEAT_SPACING / 2, box.centre[2]))

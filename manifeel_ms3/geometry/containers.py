@@ -1,22 +1,30 @@
-"""Things to look for, and what they are hidden in."""
+"""The containers of the exploration tasks, and the battery that is hidden in one."""
 
 import numpy as np
 
 from .part import Box, Cylinder, Hulls, Part, ring_of_wedges
 
 CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004  # m
-CONTAINER_FLOOR = 0.004
-BATTERY_SIZE = 0.025
+CONTAINER_FLOOR = 0.004  # m, thickness
+BATTERY_SIZE = 0.025  # m
+TERMINAL_HEIGHT = 0.001  # m
 BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010  # m, inside; the floor's thickness
+BOWL_WALL, BOWL_WEDGES = 0.005, 16  # m; number of convex pieces of the round wall
 
 
 def container(front_drawn: bool) -> Part:
-    """Where the battery lies."""
+    """Opaque container in which the battery lies."""
     return open_box(CONTAINER_OUTER, CONTAINER_HEIGHT, front_drawn)
 
 
 def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Part:
-    """Opaque box, open above; its frame in the middle of its underside. Its front, at +x, may be left undrawn."""
+    """Opaque box, open above; its frame in the middle of its underside.
+
+    Args:
+        outer: Outer size along x and y, in m.
+        height: Height, in m.
+        front_drawn: Whether the front, at +x, is drawn; it collides in any case.
+    """
     (x, y), wall = outer, CONTAINER_WALL
     pieces = (
         Box((wall, y, height), ((x - wall) / 2, 0.0, height / 2)),
@@ -30,7 +38,7 @@ def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Pa
 def battery() -> Part:
     """Cube-shaped battery block with its contact in the middle of one face."""
     size = BATTERY_SIZE
-    terminal = Box((size / 3, size / 3, 0.001), (0.0, 0.0, size / 2 + 0.0005))
+    terminal = Box((size / 3, size / 3, TERMINAL_HEIGHT), (0.0, 0.0, size / 2 + TERMINAL_HEIGHT / 2))
     return Part(
         "battery", (Box((size, size, size)), terminal), (0.12, 0.35, 0.20), density=2000.0, other_colours={1: (0.8, 0.7, 0.3)}
     )
@@ -40,8 +48,8 @@ def bowl(name: str, colour: tuple[float, float, float]) -> Part:
     """Round bowl with an upright wall; its frame in the middle of its underside."""
 
     def rim(angles: np.ndarray) -> np.ndarray:
-        return np.full_like(angles, BOWL_RADIUS + 0.005)
+        return np.full_like(angles, BOWL_RADIUS + BOWL_WALL)
 
-    wall = ring_of_wedges(16, BOWL_RADIUS, rim, 0.0, BOWL_HEIGHT)
+    wall = ring_of_wedges(BOWL_WEDGES, BOWL_RADIUS, rim, 0.0, BOWL_HEIGHT)
     floor = Cylinder(BOWL_RADIUS, BOWL_FLOOR, (0.0, 0.0, BOWL_FLOOR / 2))
     return Part(name, (Hulls(tuple(wall)), floor), colour)

@@ -1,4 +1,4 @@
-"""What goes into what: a held part with a leading end, and the receptacle that takes it."""
+"""Fits: a held plug with a leading end, and the socket that takes it."""
 
 from dataclasses import dataclass
 
@@ -6,9 +6,13 @@ import numpy as np
 
 from .part import Part
 
-CORNER_AIM = 0.75  # of a hole's half size, inside its (+x, +y) corner: near its middle, for what the eye may be off
-LEAD = 0.0007  # m that a leaning plug's corner can go down before its other side meets the hole's
+CORNER_AIM = 0.75
+"""Distance of the first landing place from a hole's (+x, +y) corner, as a share of its half size: near the hole's middle, which
+allows for the error of sight. Tuned."""
+LEAD = 0.0007
+"""Depth, in m, that a leaning plug's corner can reach before its other side meets the hole's. Tuned."""
 LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
+"""Smallest and largest lean, in rad. Tuned."""
 
 
 @dataclass(frozen=True)
@@ -22,30 +26,36 @@ class Fit:
     plug: Part
     socket: Part
     reach: float
-    """From the plug's origin to its foremost face, along its z."""
+    """Distance from the plug's origin to its foremost face, along its z."""
     grip: float
-    """From the plug's origin to between the pads, along its z."""
+    """Position between the pads relative to the plug's origin, along its z."""
     grip_width: float
-    """Of what the pads close on, along the plug's y."""
+    """Width that the pads close on, along the plug's y."""
     rim: float
     """Height of the socket's rim over its underside."""
     floor: float
     """Height of the plug's foremost face over the socket's underside when it is all the way in."""
     corner: tuple[float, float]
-    """Where the first of the foremost face finds its way in when the plug leans towards it: (x, y) from the socket's axis when
-    the plug is in."""
+    """Point of the foremost face that enters first when the plug leans towards it: (x, y) from the socket's axis when the
+    plug is in."""
     aim: tuple[float, float]
-    """Where to set that point down, (x, y) from the socket's axis: well within what takes it."""
+    """Place where that point is set down, (x, y) from the socket's axis: well within the hole."""
     lean: tuple[float, float]
-    """How far the plug leans so that this point goes ahead: rad, along x and along y."""
+    """Lean of the plug along x and along y, in rad, with which this point goes ahead."""
     clearance: float = 1e-3
-    """How far off its axis a plug that is in can be."""
+    """Largest distance from the socket's axis of a plug that is in."""
 
     @staticmethod
     def into_hole(
         prong: tuple[float, float], hole: tuple[float, float], at: tuple[float, float] = (0.0, 0.0)
     ) -> dict[str, tuple[float, float]]:
-        """`corner`, `aim` and `lean` of a prong of half sizes `prong` that finds the (+x, +y) corner of a hole at `at`."""
+        """`corner`, `aim` and `lean` of a prong that finds the (+x, +y) corner of a hole.
+
+        Args:
+            prong: Half sizes of the prong.
+            hole: Half sizes of the hole.
+            at: Centre of the hole, from the socket's axis.
+        """
         corner = (at[0] + prong[0], at[1] + prong[1])
         aim = (at[0] + (1 - CORNER_AIM) * hole[0], at[1] + (1 - CORNER_AIM) * hole[1])
         lean = tuple(float(np.clip(np.arctan(LEAD / ((2 - CORNER_AIM) * half)), *LEANS)) for half in hole)
@@ -53,4 +63,5 @@ class Fit:
 
     @property
     def depth(self) -> float:
+        """Depth of the socket."""
         return self.rim - self.floor

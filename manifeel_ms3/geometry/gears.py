@@ -9,14 +9,18 @@ from .part import Box, Cylinder, Hulls, Part, extruded, ring_of_wedges
 
 MODULE = 0.002  # m: pitch diameter per tooth
 PRESSURE_ANGLE = np.deg2rad(20.0)
-BACKLASH = 4e-4  # m along the pitch circle, that each gear's teeth are thinner than half the pitch
+BACKLASH = 4e-4  # m along the pitch circle, by which each gear's teeth are thinner than half the pitch
 TEETH = {"small": 9, "medium": 19, "large": 29}  # 22, 42 and 62 mm across
 THICKNESS = {"small": 0.014, "medium": 0.020, "large": 0.014}  # m
 SHAFT_RADIUS, SHAFT_HEIGHT, BORE_GAP = 0.005, 0.018, 1.5e-4  # m; the gap is the bore's, on each side
 RING_HEIGHT = 0.005  # m, between the medium gear and its handle
 BASE_SIZE = (0.15, 0.075, 0.025)  # m
 HANDLE_SIZE = (0.020, 0.030, 0.040)  # m; narrower than a pad, so that touch sees its edges
-WEDGES = 16
+WEDGES = 16  # number of convex pieces of the ring around the bore
+DEDENDUM = 1.25  # modules, from the pitch circle to the root (ISO 53)
+RING_OVERLAP = 2e-4  # m, of the ring and the teeth, so that no gap is between them
+NECK_RADIUS = 0.010  # m, of the ring between the gear and its handle
+LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))  # along x and y, with which the bore's rim goes ahead; tuned
 GEAR_FRICTION = 0.15  # greased
 ALUMINIUM = 2700.0  # kg/m^3
 BESIDE = 0.0022  # m from the shaft's side to where the bore's rim is set down
@@ -34,7 +38,7 @@ COLOURS = {"small": (0.75, 0.35, 0.25), "medium": (0.80, 0.62, 0.20), "large": (
 def tooth_polygon(teeth: int) -> np.ndarray:
     """Outline (n, 2), m, of the tooth about the x axis, from root to tip: involutes of the base circle (ISO 53 proportions)."""
     pitch = MODULE * teeth / 2
-    base, tip, root = pitch * np.cos(PRESSURE_ANGLE), pitch + MODULE, pitch - 1.25 * MODULE
+    base, tip, root = pitch * np.cos(PRESSURE_ANGLE), pitch + MODULE, pitch - DEDENDUM * MODULE
     radius = np.linspace(root, tip, FLANK_POINTS + 1)
 
     def involute(r: np.ndarray) -> np.ndarray:
@@ -47,20 +51,20 @@ def tooth_polygon(teeth: int) -> np.ndarray:
 
 def gear_hulls(teeth: int, bottom: float, top: float) -> Hulls:
     """Gear about z between two heights, in the phase that has a tooth at +x."""
-    root = MODULE * teeth / 2 - 1.25 * MODULE
+    root = MODULE * teeth / 2 - DEDENDUM * MODULE
     bore = SHAFT_RADIUS + BORE_GAP
     pieces = []
     for k in range(teeth):
         turn = 2 * np.pi * k / teeth
         rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
         pieces.append(extruded(tooth_polygon(teeth) @ rotation.T, bottom, top))
-    pieces += ring_of_wedges(WEDGES, bore, lambda angles: np.full_like(angles, root + 2e-4), bottom, top)
+    pieces += ring_of_wedges(WEDGES, bore, lambda angles: np.full_like(angles, root + RING_OVERLAP), bottom, top)
     return Hulls(tuple(pieces))
 
 
 @functools.cache
 def neighbour_gear(name: str) -> Part:
-    """The "small" or the "large" gear, to turn on its shaft. Its frame on the axis, in the underside."""
+    """The "small" or the "large" gear, which turns on its shaft; its frame on the axis, in the underside."""
     return Part(
         f"{name}_gear",
         (gear_hulls(TEETH[name], 0.0, THICKNESS[name]),),
@@ -71,11 +75,11 @@ def neighbour_gear(name: str) -> Part:
 
 
 def gear_fit() -> Fit:
-    """The medium gear on its handle, and the base. Held, it hangs from the handle's middle; the bore's rim finds the shaft."""
+    """The medium gear on its handle, and the base; the gear is held by its handle, and the bore's rim finds the shaft."""
     top = HANDLE_SIZE[2] / 2 + RING_HEIGHT
     reach = top + THICKNESS["medium"]
     body = gear_hulls(TEETH["medium"], top, reach)
-    ring = Cylinder(0.010, RING_HEIGHT, (0.0, 0.0, top - RING_HEIGHT / 2))
+    ring = Cylinder(NECK_RADIUS, RING_HEIGHT, (0.0, 0.0, top - RING_HEIGHT / 2))
     diagonal = np.sqrt(0.5)
     return Fit(
         plug=Part(
@@ -93,13 +97,13 @@ def gear_fit() -> Fit:
         floor=BASE_SIZE[2],
         corner=(-diagonal * (SHAFT_RADIUS + BORE_GAP),) * 2,
         aim=(-diagonal * (SHAFT_RADIUS + BESIDE),) * 2,
-        lean=(np.deg2rad(7.0), np.deg2rad(5.0)),
+        lean=LEAN,
         clearance=5e-4,
     )
 
 
 def gear_base() -> Part:
-    """Plate with three shafts; its frame below the medium shaft, in the plate's underside."""
+    """Plate with three shafts; its frame below the middle shaft, in the plate's underside."""
     plate = Box(BASE_SIZE, (-BASE_SHIFT, 0.0, BASE_SIZE[2] / 2))
     shafts = [Cylinder(SHAFT_RADIUS, SHAFT_HEIGHT, (x, 0.0, BASE_SIZE[2] + SHAFT_HEIGHT / 2)) for x in SHAFT_X.values()]
     return Part(

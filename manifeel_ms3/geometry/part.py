@@ -20,6 +20,7 @@ from manifeel_ms3.sensors.depth.surfaces import give_relief
 
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
 """Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""
+ROUGHNESS, SPECULAR = 0.6, 0.3  # of every part's surface, chosen by eye
 UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
 
 
@@ -80,13 +81,13 @@ class Hulls:
 
     @cached_property
     def file(self) -> Path:
-        """The hulls as meshes of one file, which is how the engine takes them."""
+        """File with the hulls as meshes, which is the form that the engine takes."""
         return _cached_obj([trimesh.convex.convex_hull(points / MILLIMETRES[0]) for points in self.points])
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A triangle mesh, m, as it is: for parts that are fixed, and touch convex ones."""
+    """A triangle mesh, in m, of a fixed part, which collides with convex ones."""
 
     mesh: trimesh.Trimesh
 
@@ -98,7 +99,7 @@ class Solid:
 
     @cached_property
     def file(self) -> Path:
-        """The mesh as a file, which is how the engine takes it."""
+        """File with the mesh, which is the form that the engine takes."""
         return _cached_obj([self.mesh])
 
 
@@ -106,7 +107,7 @@ Piece = Box | Cylinder | Ball | Hulls | Solid
 
 
 def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
-    """A file with these meshes as its objects, made once."""
+    """File in the cache with these meshes as its objects; written once."""
     lines, first = [], 1
     for k, mesh in enumerate(meshes):
         lines.append(f"o piece{k}")
@@ -125,23 +126,26 @@ def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
 
 @dataclass(frozen=True)
 class Part:
-    """A rigid body made of pieces. `density` in kg/m^3, `friction` Coulomb's coefficient, `colour` RGB in [0, 1].
-
-    `other_colours`: of single pieces, by their place in `pieces`.
-    """
+    """A rigid body made of pieces."""
 
     name: str
+    """Name of the actor in the scene."""
     pieces: tuple[Piece, ...]
+    """Shapes that are drawn, collide and are touched."""
     colour: tuple[float, float, float]
+    """RGB in [0, 1]."""
     density: float = 1000.0
+    """Density in kg/m^3."""
     friction: float = 0.5
+    """Coulomb's coefficient."""
     other_colours: dict[int, tuple[float, float, float]] = field(default_factory=dict)
+    """Colours of single pieces, by index in `pieces`."""
     undrawn: frozenset[int] = frozenset()
-    """Places in `pieces` of those that collide and are not seen, nor felt."""
+    """Indices in `pieces` of those that collide, but are neither drawn nor touched."""
     springs: dict[int, float] = field(default_factory=dict)
-    """Places in `pieces` of those that give way, and how stiff they are: N/m at each contact point."""
+    """Stiffness of compliant pieces, in N/m at each contact point, by index in `pieces`."""
     relief: trimesh.Trimesh | None = None
-    """Surface to touch, where it has what is too fine for cameras and contacts."""
+    """Surface that the pads touch, where it has details too fine for cameras and contacts."""
 
     def build(self, scene: ManiSkillScene, body_type: str, initial_pose: sapien.Pose) -> Actor:
         """Add the part to a scene as a "dynamic", "kinematic" or "static" actor."""
@@ -150,7 +154,7 @@ class Part:
             look = None
             if scene.can_render() and k not in self.undrawn:  # a render material cannot even be made without a renderer
                 colour = self.other_colours.get(k, self.colour)
-                look = RenderMaterial(base_color=[*colour, 1.0], roughness=0.6, specular=0.3)
+                look = RenderMaterial(base_color=[*colour, 1.0], roughness=ROUGHNESS, specular=SPECULAR)
             # the engine takes negative restitution as a spring, and averages it with the other body's
             material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
             piece.add_to(builder, material, self.density, look)
@@ -170,7 +174,15 @@ def extruded(outline: np.ndarray, bottom: float, top: float) -> np.ndarray:
 def ring_of_wedges(
     count: int, bore: float, rim: Callable[[np.ndarray], np.ndarray], bottom: float, top: float
 ) -> list[np.ndarray]:
-    """Points (8, 3) of each convex wedge of a ring about z, whose flats touch the bore's circle; `rim`: radius at an angle."""
+    """Points (8, 3) of each convex wedge of a ring about z, whose flats touch the bore's circle.
+
+    Args:
+        count: Number of wedges.
+        bore: Radius of the bore, in m.
+        rim: Outer radii, in m, at angles (n,), in rad.
+        bottom: Height of the underside, in m.
+        top: Height of the top, in m.
+    """
     wedges = []
     for k in range(count):
         angles = 2 * np.pi * (k + np.array([0.0, 1.0])) / count
@@ -183,12 +195,16 @@ def ring_of_wedges(
 def block_with_holes(
     outer: tuple[float, float], depth: float, holes: list[tuple[tuple[float, float], tuple[float, float]]], bottom: float = 0.0
 ) -> tuple[Box, ...]:
-    """Boxes of a slab `outer` (x, y) by `depth`, its underside at z = `bottom`, with rectangular through holes.
+    """Boxes of a slab with rectangular through holes.
 
-    `holes`: ((size x, size y), (centre x, centre y)) each; they must not overlap along x.
+    Args:
+        outer: Size of the slab along x and y, in m.
+        depth: Size along z, in m.
+        holes: ((size x, size y), (centre x, centre y)) of each hole, in m; they must not overlap along x.
+        bottom: Height of the underside, in m.
 
     Raises:
-        ValueError: holes that overlap or reach beyond the slab.
+        ValueError: Holes overlap or reach beyond the slab.
     """
     holes = sorted(holes, key=lambda hole: hole[1][0])
     z, boxes, left = bottom + depth / 2, [], -outer[0] / 2

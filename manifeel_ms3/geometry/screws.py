@@ -21,29 +21,37 @@ class Screw:
     held: Part
     fixed: Part
     grip_width: float
-    """Of what the pads close on."""
+    """Width that the pads close on."""
     engaged: float
     """Height of the held part's origin over the underside of the fixed one where the threads first meet."""
     pitch: float
+    """Height of one turn of the thread."""
     seated: float
-    """The same height where it is far enough in."""
+    """The same height where the held part is far enough in."""
     tightening: float
-    """rad to turn it further there."""
+    """Angle, in rad, by which the held part is turned further there."""
     reach: float
-    """How far below the held part's origin its thread begins."""
+    """Distance below the held part's origin at which its thread begins."""
     symmetry: float
-    """rad between grips that are alike."""
+    """Angle, in rad, between two equivalent grips."""
     grip_force: float
-    """N, of each pad."""
+    """Force of each pad, in N."""
 
 
-STEEL, GREASED, GREY = 7800.0, 0.15, (0.70, 0.72, 0.75)
-M16 = iso_metric(0.008, 0.002)
+STEEL_DENSITY = 7800.0  # kg/m^3
+GREASED_FRICTION = 0.15  # Coulomb's coefficient of greased steel
+GREY, BLUE = (0.70, 0.72, 0.75), (0.25, 0.35, 0.55)  # RGB
+M16 = iso_metric(0.008, 0.002)  # ISO 261, coarse pitch
 M16_POINT = 0.006  # m: radius of the flat point (ISO 4753)
 BOLT_FOOT, BOLT_LENGTH = 0.030, 0.024  # m: plate and head; thread
 NUT_ACROSS_FLATS, NUT_HEIGHT, NUT_WALL = 0.024, 0.013, 0.0083  # m; the wall is the ridge's root
+PLATE_SIZE, PLATE_HEIGHT, HEAD_BORE = 0.06, 0.02, 0.001  # m; the head is a ring of wedges around a pinhole
+PIECES_PER_TURN = 24  # convex pieces of one turn of a ridge
+HEX_WEDGES = 12  # two convex pieces for each side of a hexagon
 BOLT_TURN = np.deg2rad(-15)  # so that the threads meet soon after the hand begins to turn
 NUT_GAP, NUT_CREST_GAP, NUT_TURNS, NUT_MOUTH = 1e-4, 2e-4, 2.0, 0.0015  # m; the mouth is below the ridge
+NUT_DESCENT = 1.5  # pitches from the first contact of the threads to the goal
+NUT_TIGHTENING, NUT_SYMMETRY, NUT_GRIP_FORCE = np.deg2rad(40), np.deg2rad(60), 20.0  # rad; rad, of a hexagon; N
 NUT_ENGAGED = 0.0018  # m: its middle over the bolt's end, where the ridge's lower end just passes under the end of the crest
 
 
@@ -54,42 +62,41 @@ def hexagon(across_flats: float) -> Callable[[np.ndarray], np.ndarray]:
 
 def m16_bolt() -> Part:
     """M16 bolt, standing on its head in a plate."""
-    head = ring_of_wedges(12, 0.001, hexagon(NUT_ACROSS_FLATS), 0.020, BOLT_FOOT)
+    head = ring_of_wedges(HEX_WEDGES, HEAD_BORE, hexagon(NUT_ACROSS_FLATS), PLATE_HEIGHT, BOLT_FOOT)
     shank = external_mesh(M16, BOLT_LENGTH, M16_POINT)
     shank.apply_transform(trimesh.transformations.rotation_matrix(BOLT_TURN, [0, 0, 1]))
     shank.apply_translation([0, 0, BOLT_FOOT])
-    plate = Box((0.06, 0.06, 0.02), (0.0, 0.0, 0.01))
-    return Part(
-        "bolt", (plate, Hulls(tuple(head)), Solid(shank)), GREY, friction=GREASED, other_colours={0: (0.25, 0.35, 0.55)}
-    )
+    plate = Box((PLATE_SIZE, PLATE_SIZE, PLATE_HEIGHT), (0.0, 0.0, PLATE_HEIGHT / 2))
+    return Part("bolt", (plate, Hulls(tuple(head)), Solid(shank)), GREY, friction=GREASED_FRICTION, other_colours={0: BLUE})
 
 
 def m16_nut() -> Part:
     """Hexagon nut, 24 mm across flats, two turns of ridge in its lower half."""
-    inner, root = M16.minor_radius + NUT_CREST_GAP, NUT_WALL / np.cos(np.pi / 24)
+    inner, root = M16.minor_radius + NUT_CREST_GAP, NUT_WALL / np.cos(np.pi / (2 * HEX_WEDGES))
 
     def half_width(radius: float) -> float:
         return M16.pitch / 8 + (radius - M16.minor_radius) * FLANK - NUT_GAP
 
     section = np.array([[r, side * half_width(r)] for r in (inner, root) for side in (-1, 1)])
     section[:, 1] += NUT_MOUTH + M16.pitch / 2 - NUT_HEIGHT / 2
-    wedges = ring_of_wedges(12, NUT_WALL, hexagon(NUT_ACROSS_FLATS), -NUT_HEIGHT / 2, NUT_HEIGHT / 2)
-    pieces = (*wedges, *ridge(section, M16.pitch, NUT_TURNS, per_turn=24))
-    return Part("nut", (Hulls(pieces),), GREY, density=STEEL, friction=GREASED)
+    wedges = ring_of_wedges(HEX_WEDGES, NUT_WALL, hexagon(NUT_ACROSS_FLATS), -NUT_HEIGHT / 2, NUT_HEIGHT / 2)
+    pieces = (*wedges, *ridge(section, M16.pitch, NUT_TURNS, PIECES_PER_TURN))
+    return Part("nut", (Hulls(pieces),), GREY, density=STEEL_DENSITY, friction=GREASED_FRICTION)
 
 
 def nut_and_bolt() -> Screw:
+    """The M16 nut and its bolt."""
     return Screw(
         held=m16_nut(),
         fixed=m16_bolt(),
         grip_width=NUT_ACROSS_FLATS,
         engaged=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED,
         pitch=M16.pitch,
-        seated=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED - 1.5 * M16.pitch,
-        tightening=np.deg2rad(40),
+        seated=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED - NUT_DESCENT * M16.pitch,
+        tightening=NUT_TIGHTENING,
         reach=NUT_HEIGHT / 2,
-        symmetry=np.deg2rad(60),
-        grip_force=20.0,
+        symmetry=NUT_SYMMETRY,
+        grip_force=NUT_GRIP_FORCE,
     )
 
 
@@ -104,8 +111,11 @@ CONTACT_HEIGHT = 0.012  # m, over the underside
 BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's chamfer
 BORE_TURN = np.deg2rad(-10)  # the hand turns by 80 degrees before the threads meet, while the cap finds its place in the mouth
 CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.3 N m of the thread
-DRY = 0.35  # friction of brass on brass, neither greased nor polished
+DRY_FRICTION = 0.35  # Coulomb's coefficient of brass on brass, neither greased nor polished
 BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)
+LEAD_IN = 0.25  # turns over which the cap's ridge rises
+BULB_TIGHTENING, BULB_SYMMETRY, BULB_GRIP_FORCE = np.deg2rad(120), np.deg2rad(15), 12.0  # rad, tuned; rad; N
+BULB_DENSITY = 400.0  # kg/m^3: a bulb is hollow
 BULB_SEATED = CONTACT_HEIGHT - CAP_TIP
 BULB_TRAVEL = 0.0034  # m down from where the ridge's lower end just passes under the bore's crest
 
@@ -118,7 +128,11 @@ def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int
 
 
 def bulb_yaw(height: float | np.ndarray) -> float | np.ndarray:
-    """rad, of a bulb whose ridge lies in the middle of the holder's groove; `height`, m: of its glass over the underside."""
+    """Yaw, in rad, of a bulb whose ridge lies in the middle of the holder's groove.
+
+    Args:
+        height: Height of the glass's centre over the holder's underside, in m.
+    """
     return BORE_TURN + 2 * np.pi * (height + CAP_RIDGE - BORE[0]) / E27.pitch
 
 
@@ -129,15 +143,15 @@ def e27_bulb() -> Part:
     section = np.r_[crest, [[core - 5e-4, side * E27.pitch / 4] for side in (-1, 1)]]
     section[:, 1] += CAP_RIDGE
     neck = _cone((0.018, core), (-0.024, CAP_TOP))
-    cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, per_turn=24, lead_in=0.25))
+    cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, PIECES_PER_TURN, lead_in=LEAD_IN))
     foot = _cone((core, 0.005), (CAP_FOOT, CAP_TIP + 0.001))
     tip = Cylinder(0.004, 0.003, (0.0, 0.0, CAP_TIP + 0.0015))
     return Part(
         "bulb",
         (Ball(GLASS_RADIUS), Hulls((neck,)), Hulls(cap), Hulls((foot,)), tip),
         GLASS,
-        density=400.0,
-        friction=DRY,
+        density=BULB_DENSITY,
+        friction=DRY_FRICTION,
         other_colours={2: GREY, 3: (0.1, 0.1, 0.1), 4: BRASS},
     )
 
@@ -157,13 +171,14 @@ def e27_holder() -> Part:
         "holder",
         (Solid(shell), Solid(thread), contact),
         (0.16, 0.16, 0.18),
-        friction=DRY,
+        friction=DRY_FRICTION,
         other_colours={1: GREY, 2: BRASS},
         springs={2: CONTACT_SPRING},
     )
 
 
 def bulb_and_holder() -> Screw:
+    """The E27 bulb and its holder."""
     return Screw(
         held=e27_bulb(),
         fixed=e27_holder(),
@@ -171,8 +186,8 @@ def bulb_and_holder() -> Screw:
         engaged=BULB_SEATED + BULB_TRAVEL,
         pitch=E27.pitch,
         seated=BULB_SEATED,
-        tightening=np.deg2rad(120),
+        tightening=BULB_TIGHTENING,
         reach=-CAP_FOOT,
-        symmetry=np.deg2rad(15),
-        grip_force=12.0,
+        symmetry=BULB_SYMMETRY,
+        grip_force=BULB_GRIP_FORCE,
     )

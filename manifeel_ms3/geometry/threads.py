@@ -1,4 +1,4 @@
-"""Threads that really turn. Of a mating pair the fixed side is one triangle mesh, the held one a row of convex ridge pieces.
+"""Threads that turn by contact. The fixed side of a pair is a triangle mesh, the held side a row of convex ridge pieces.
 
 Triangle meshes collide with convex shapes alone, and only fixed bodies can have them. All threads are right-handed.
 """
@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 
 FLANK = np.tan(np.deg2rad(30.0))
+"""Slope of a flank: half of the thread angle of 60 degrees (ISO 68-1)."""
 
 
 @dataclass(frozen=True)
@@ -16,15 +17,18 @@ class Thread:
     """Outer surface of a thread about z: its radius along one pitch, periodic, turned into a helix. Lengths in m."""
 
     pitch: float
+    """Height of one turn."""
     profile: tuple[tuple[float, float], ...]
-    """(height, radius) along one pitch, the crest's middle at height 0; straight lines between."""
+    """Points (height, radius) along one pitch, joined by straight lines; the crest's middle is at height 0."""
 
     @property
     def major_radius(self) -> float:
+        """Radius of the crest."""
         return max(radius for _, radius in self.profile)
 
     @property
     def minor_radius(self) -> float:
+        """Radius of the root."""
         return min(radius for _, radius in self.profile)
 
     def wider(self, gap: float) -> "Thread":
@@ -78,7 +82,7 @@ def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: 
 
 
 def _helix(thread: Thread, length: float, per_turn: int) -> np.ndarray:
-    """(radius, height) of the surface's columns, (per_turn, n, 2); what lies beyond the ends is cut off there."""
+    """Columns (per_turn, n, 2) of (radius, height) of the surface, clipped at both ends."""
     heights, radii = np.array(thread.profile).T
     turns = np.arange(-2, int(np.ceil(length / thread.pitch)) + 1)
     u = (turns[:, None] * thread.pitch + heights).ravel()
@@ -87,7 +91,7 @@ def _helix(thread: Thread, length: float, per_turn: int) -> np.ndarray:
 
 
 def _skin(rim: np.ndarray, per_pitch: int) -> tuple[np.ndarray, list[list[int]]]:
-    """Vertices and faces between columns; once round, a column meets the one a pitch further up."""
+    """Vertices and faces between columns; after one turn, a column meets the first one a pitch further up."""
     per_turn, count, _ = rim.shape
     angle = 2 * np.pi * np.arange(per_turn)[:, None] / per_turn
     vertices = np.stack([rim[..., 0] * np.cos(angle), rim[..., 0] * np.sin(angle), rim[..., 1]], axis=-1).reshape(-1, 3)
@@ -109,9 +113,14 @@ def _clean(vertices: np.ndarray, faces) -> trimesh.Trimesh:
 
 
 def ridge(section: np.ndarray, pitch: float, turns: float, per_turn: int, lead_in: float = 0.0) -> list[np.ndarray]:
-    """Convex pieces (2 m, 3) of a ridge that winds up from z = 0; `section` (m, 2): its corners, (radius, height).
+    """Convex pieces (2 m, 3) of a ridge that winds up from z = 0.
 
-    `lead_in`: turns over which it rises from its foot, the smallest radius.
+    Args:
+        section: Corners (m, 2) of its cross-section, (radius, height), in m.
+        pitch: Height of one turn, in m.
+        turns: Number of turns.
+        per_turn: Number of pieces of one turn.
+        lead_in: Number of turns over which the ridge rises from its foot, the smallest radius.
     """
     foot = section[:, 0].min()
 

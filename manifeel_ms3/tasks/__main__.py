@@ -1,4 +1,4 @@
-"""The tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
+"""Show the tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
 
 import inspect
 import sys
@@ -17,21 +17,23 @@ from .registry import PREFIX, SUFFIX, all_tasks, task_spec
 
 @dataclass
 class Args:
+    """Show what a task is, what is random in it and what counts as success; or all tasks in a table."""
+
     task: Annotated[str | None, tyro.conf.Positional] = None
-    """id or short name, such as PegInsertion: what it is, what is random, what counts as success; default: all, in a table"""
+    """Id or short name of a task, such as PegInsertion; all tasks in a table if not given."""
 
 
 def main(args: Args) -> None:
-    """Print them.
+    """Print the description of a task, or the table of all tasks.
 
     Raises:
-        UnknownNameError: there is no such task.
+        UnknownNameError: There is no such task.
     """
     if args.task is None:
-        table = Table("task", "category", "steps", "camera", "what is to be done", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
+        table = Table("task", "category", "steps", "camera", "description", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
         for spec in all_tasks().values():
             steps = str(spec.max_episode_steps)
-            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _description(spec.env_class))
+            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _summary(spec.env_class))
         Console().print(table)
         return
     by_name = {spec.name: env_id for env_id, spec in all_tasks().items()}
@@ -39,10 +41,9 @@ def main(args: Args) -> None:
     Console().print(Markdown(f"# {spec.env_id}\n\n{inspect.getdoc(spec.env_class)}"))
 
 
-def _description(cls: type) -> str:
-    """The first paragraph."""
-    text = (inspect.getdoc(cls) or "").removeprefix("**Task Description:**")
-    return " ".join(text.partition("\n\n")[0].split())
+def _summary(env_class: type) -> str:
+    """The first line of a task's documentation."""
+    return (inspect.getdoc(env_class) or "").partition("\n")[0]
 
 
 if __name__ == "__main__":

@@ -1,33 +1,33 @@
-"""Observation modes: ManiSkill's strings, and the two tokens for touch."""
+"""Observation modes: ManiSkill's strings, and two tokens for touch."""
 
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
+from manifeel_ms3.errors import InvalidArgumentError
+
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 STATE_TOKENS = ("state", "state_dict")
-WHOLE_MODES = (
-    "none",
-    "sensor_data",
-    "pointcloud",
-    "rgbd",
-)  # ManiSkill's names for whole modes; rgbd may be joined with touch
+WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")
+"""ManiSkill's names of whole modes; only "rgbd" may be joined with touch."""
 
 
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
-    """Split `obs_mode` into ManiSkill's own part ("none" where nothing is left) and the tactile outputs asked for.
+    """Split `obs_mode` into ManiSkill's own part ("none" if nothing is left) and the tactile outputs asked for.
 
     Raises:
-        ValueError: a token that is not known.
+        InvalidArgumentError: A token is unknown, repeated, or cannot be joined with others.
     """
     tokens = str(obs_mode).split("+")
     known = (*TACTILE_TOKENS, *ALL_VISUAL_TEXTURES, *STATE_TOKENS, *WHOLE_MODES)
     for token in tokens:
         if token not in known:
-            raise ValueError(f"obs_mode={obs_mode!r}: token {token!r} is unknown; join any of {list(known)} by '+'")
+            raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {token!r} is unknown; join any of {list(known)} by '+'")
     if repeated := {token for token in tokens if tokens.count(token) > 1}:
-        raise ValueError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} stands more than once")
+        raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} stands more than once")
     own = ["rgb+depth" if token == "rgbd" and len(tokens) > 1 else token for token in tokens if token not in TACTILE_TOKENS]
     alone = [token for token in own if token in WHOLE_MODES]
     if alone and len(tokens) > 1:
-        raise ValueError(f"obs_mode={obs_mode!r}: {alone[0]!r} stands alone; join 'rgb', 'depth', ... with touch instead")
+        raise InvalidArgumentError(
+            f"obs_mode={obs_mode!r}: {alone[0]!r} stands alone; join 'rgb', 'depth', ... with touch instead"
+        )
     touch = tuple(output for token, output in TACTILE_TOKENS.items() if token in tokens)
     return "+".join(own) or "none", touch

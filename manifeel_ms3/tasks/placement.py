@@ -1,27 +1,51 @@
-"""Random starts of the tool."""
+"""Random poses at the start of an episode."""
 
 import torch
 from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_multiply
 from mani_skill.utils.structs import Pose
 
 # a tool that points down reaches 0.30 to 0.72 m from the base's axis, up to 0.35 m high (by inverse kinematics, to 0.1 mm)
-REACH_XY = 0.19  # m, each axis, around (0.5, 0)
-HIGHEST = 0.35  # m
+REACH_XY = 0.19
+"""Half range, in m, on each axis around (0.5, 0) that is within the robot's reach."""
+HIGHEST = 0.35
+"""Largest height of the tool, in m, that is within the robot's reach."""
 OUT_OF_REACH = "further out it is out of the robot's reach"
 
 
+def uniform_in(half_range: float | torch.Tensor, *shape: int) -> torch.Tensor:
+    """Uniform random numbers of a shape in [-half_range, half_range].
+
+    ManiSkill's `randomization.uniform` rounds differently: with it, episodes would not be those of their seeds any more.
+    """
+    return (2 * torch.rand(shape) - 1) * half_range
+
+
+def turned_about(axis: int, angle: torch.Tensor) -> torch.Tensor:
+    """Quaternions (n, 4) of rotations by angles (n,), in rad, about the axis x (0), y (1) or z (2)."""
+    turn = torch.zeros(len(angle), 3)
+    turn[:, axis] = angle
+    return axis_angle_to_quaternion(turn)
+
+
 def start_pose(n: int, position: tuple[float, float, float], ranges: tuple[float, float, float], rotation: float) -> Pose:
-    """Random tool poses (n,) that point down: `position` +- `ranges`, m, turned by +- `rotation`, rad, about each base axis."""
-    offset = (2 * torch.rand(n, 3) - 1) * torch.tensor(ranges)
+    """Random poses (n,) of a tool that points down.
+
+    Args:
+        n: Number of poses.
+        position: Nominal position, in m.
+        ranges: Half range of each coordinate, in m.
+        rotation: Half range of the rotation about each axis of the robot's base, in rad.
+    """
+    offset = uniform_in(torch.tensor(ranges), n, 3)
     return Pose.create_from_pq(torch.tensor(position) + offset, random_downward(n, rotation))
 
 
 def random_downward(n: int, rotation: float) -> torch.Tensor:
     """Quaternions (n, 4) of a tool that points down with its x along the base's, turned by +- `rotation` about each axis."""
-    turn = axis_angle_to_quaternion((2 * torch.rand(n, 3) - 1) * rotation)
+    turn = axis_angle_to_quaternion(uniform_in(rotation, n, 3))
     return quaternion_multiply(turn, torch.tensor([0.0, 1.0, 0.0, 0.0]).expand(n, 4))
 
 
 def height_range(start: float, lowest: float) -> float:
-    """Largest half range, m, of a start height that stays above `lowest` and within reach."""
+    """Largest half range, in m, of a start height that stays above `lowest` and within reach."""
     return min(start - lowest, HIGHEST - start)

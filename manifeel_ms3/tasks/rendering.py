@@ -1,4 +1,4 @@
-"""Which renderer this process can use, and what to do where it has none."""
+"""The renderer that this process can use, and what to do where it has none."""
 
 import functools
 import os
@@ -10,22 +10,25 @@ NO_RENDERER = (
     "no Vulkan renderer was found, and {wanted} needs one. Without a GPU, install Mesa 24.3 or newer (Debian 12: "
     "`apt install -t bookworm-backports mesa-vulkan-drivers` and `apt install libvulkan1 libegl1 libgl1`; Ubuntu 24.04: "
     "`apt install mesa-vulkan-drivers libvulkan1 libegl1 libgl1`); `scripts/setup.sh` does it. With an NVIDIA GPU, install its "
-    "driver and libvulkan1. What needs no picture works without: obs_mode='state' or 'tacff', render_backend='none'."
+    "driver and libvulkan1. What needs no image works without: obs_mode='state' or 'tacff', render_backend='none'."
 )
 
 
 FORKED = (
-    "{wanted} needs a renderer, and this process was forked from one that has its own, which does not work on. Start it anew: "
-    "multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no picture works here: "
+    "{wanted} needs a renderer, and this process was forked from one that has its own, which does not survive a fork. Start "
+    "it anew: multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no image works here: "
     "obs_mode='state' or 'tacff'."
 )
 _IMPORTED_IN = os.getpid()
 _renders_in: int | None = None
-"""the process whose renderer this is; a fork copies the answer, not the renderer"""
+"""Id of the process whose renderer this is; a fork copies this answer, but not the renderer."""
 
 
 def available_render_backend(asked: str = "auto") -> str:
-    """The `render_backend` to use: "gpu", "cpu" or "none", which is all that a process has whose parent had the renderer."""
+    """The `render_backend` to use: "gpu", "cpu" or "none".
+
+    A process that was forked from one with a renderer has none.
+    """
     global _renders_in
     if asked == "none" or renderer_lost():
         return "none"
@@ -40,8 +43,8 @@ def renderer_lost() -> bool:
     return _renders_in not in (None, os.getpid())
 
 
-def mend_threads() -> None:
-    """In a forked process torch would wait for ever for OpenMP's threads, which the fork has not copied: work without."""
+def use_one_thread_after_fork() -> None:
+    """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's threads, which a fork loses."""
     if os.getpid() != _IMPORTED_IN:
         torch.set_num_threads(1)
 

@@ -1,84 +1,104 @@
-"""The base of every ManiFeel task: table, robot, cameras, light, touch, and what an observation holds."""
+"""The base class of every ManiFeel task: table, robot, cameras, light, touch, and the contents of an observation."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import Camera, CameraConfig
-from mani_skill.utils import common
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
-from mani_skill.utils.visualization.misc import tile_images
 
 from manifeel_ms3.agents import PandaGelSight
-from manifeel_ms3.arguments import by_name, is_number, one_of, several_of
+from manifeel_ms3.arguments import by_name, checked_action, one_of, several_of
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.geometry import Box, Part
-from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
+from manifeel_ms3.sensors import gelsight_r15, with_options
 
+from .checks import check_num_envs, check_seed, checked_randomization
 from .obs_modes import split_obs_mode
-from .pictures import same_height, same_size
-from .rendering import FORKED, NO_RENDERER, available_render_backend, mend_threads, renderer_lost
+from .rendering import FORKED, NO_RENDERER, available_render_backend, renderer_lost, use_one_thread_after_fork
+from .sensing import SensingEnv
 from .viewpoints import looking_at, looking_down
 
+CONTROL_FREQ = 10
+"""Control steps per second, in Hz (public code of the paper)."""
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
-LIGHTING = {"normal": 1.0, "dim": 0.05}  # dim: the paper's 5 % of normal
-HOLD_SECONDS = 0.5  # a goal counts once it has held this long
-SETTLE_SECONDS = 0.2  # the grip settles before the first observation
+LIGHTING = {"normal": 1.0, "dim": 0.05}
+"""Share of the normal light; 5 % is the paper's."""
+HOLD_SECONDS = 0.5
+"""Time for which a goal must hold until the episode is a success, in s."""
+SETTLE_SECONDS = 0.2
+"""Time in which the grip settles before the first observation, in s."""
+IMAGE_SIZE = 256
+"""Width and height of the cameras' images, in pixels (public code of the paper)."""
 FIELD_OF_VIEW = np.deg2rad(75)
+"""Field of view of the cameras, in rad (public code of the paper)."""
+SIDE_CAMERA_AT = (0.5, -0.17, 0.17)  # m
+AMBIENT_LIGHT, KEY_LIGHT, FILL_LIGHT = 0.3, 0.8, 0.35  # intensities, chosen by eye
+KEY_DIRECTION, FILL_DIRECTION = [0.4, 0.6, -1], [-0.5, -0.3, -1]
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
     solver_position_iterations=25,
     sleep_threshold=0.0,  # a sleeping body's contacts freeze
 )
+"""Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
 TABLE = Part("table", (Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02)),), colour=(0.55, 0.52, 0.48), friction=0.5)
 FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), colour=(0.30, 0.31, 0.33))
 
 
-class VisuotactileEnv(BaseEnv):
+class VisuotactileEnv(SensingEnv):
     """Base class of the ManiFeel tasks: a Panda with two GelSight fingers at the origin of a table, x ahead, z up.
 
-    Observations (ManiSkill's modes joined by "+" with `tacrgb` and `tacff`) hold, where asked for:
+    The observation mode joins ManiSkill's modes with `tacrgb` and `tacff` by "+". An observation holds what the mode asks for:
 
     - `sensor_data[camera]`: `rgb` uint8 (N, 256, 256, 3) and ManiSkill's other textures;
     - `sensor_data["tactile_left" | "tactile_right"]`: `rgb` uint8 (N, 240, 320, 3); `force_field` float32 (N, 10, 14, 3), N per
       taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`);
-    - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Nothing privileged but in the state modes.
+    - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Privileged state is in the state modes alone.
 
-    `info` holds `success` (the goal has held for 0.5 s), `fail`, `contact_force` (N, between what the fingers hold and the
-    rest of the world, the largest of any physics step of the last control step) and the task's own measures.
-
-    Args:
-        cameras: those rendered, of "front", "side", "wrist"; default: the task's policy camera.
-        tactile_sensors: pads observed, of "left", "right"; default: right, as in the paper.
-        tactile: fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
-        lighting: "normal" or "dim" (5 %).
-        occlusion: whether the task's occluder hides its interior, as it does by default where there is one.
-        randomization: fields of the task's `Randomization` to override, by name.
+    `info` holds `success` (the goal has held for 0.5 s), `fail`, `contact_force` (N; the largest force, in any physics step of
+    the last control step, between the held object and the rest of the world) and the task's own measures.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
 
+    Args:
+        args: Positional arguments of ManiSkill's `BaseEnv`.
+        obs_mode: Observation mode, such as "rgb+tacff"; "state" if not given.
+        control_mode: Controller, one of the robot's; the task's own if not given.
+        robot_uids: Robot; only "panda_gelsight" is supported.
+        render_backend: "auto", "gpu", "cpu" or "none".
+        cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
+        tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
+        tactile: Fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+        lighting: "normal" or "dim" (5 %).
+        occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
+        randomization: Fields of the task's `Randomization` to override, by name.
+        kwargs: Other arguments of ManiSkill's `BaseEnv`.
+
     Raises:
-        ValueError: an argument with a value that is not known; the message lists what is.
-        RuntimeError: pictures are asked for on a machine without a renderer.
+        InvalidArgumentError: An argument has a value that is not allowed; the message lists those that are.
+        MachineError: Images are asked for on a machine without a renderer, or many environments on one without a GPU.
     """
 
-    SUPPORTED_ROBOTS = ["panda_gelsight"]
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = ["panda_gelsight"]
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     Randomization: type
+    """Frozen dataclass of the half ranges of the task's random quantities."""
     policy_cameras: tuple[str, ...] = ("wrist",)
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
+    """Whether the task has a part that hides its interior from the policy's camera."""
     physics_rate = 240
-    """Hz."""
-    contacts = CONTACTS
-    """How the engine solves contacts: fields of ManiSkill's `SceneConfig`."""
+    """Physics steps per second, in Hz."""
+    contacts: dict[str, Any] = CONTACTS
+    """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
     max_reward = 4.0
-    """Of the dense reward."""
-    front_camera_at = (0.68, 0.0, 0.15)  # m
+    """Largest value of the dense reward."""
+    front_camera_at = (0.68, 0.0, 0.15)
+    """Position of the front camera, in m."""
     agent: PandaGelSight
 
     def __init__(
@@ -107,15 +127,17 @@ class VisuotactileEnv(BaseEnv):
         self._lighting = one_of("lighting", lighting, LIGHTING)
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
-            raise ValueError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
+            raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
         self.occlusion = self.has_occluder if occlusion is None else occlusion
-        self.randomization = self._make_randomization(randomization or {})
+        self.randomization = checked_randomization(
+            type(self).__name__, self.Randomization, randomization or {}, self._largest_ranges()
+        )
         one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
-        self._check_number(kwargs.get("num_envs", 1))
-        mend_threads()
+        check_num_envs(kwargs.get("num_envs", 1))
+        use_one_thread_after_fork()
         backend = available_render_backend(render_backend)
-        if backend == "none" and (wanted := self._wanted_pictures(own_mode, kwargs.get("render_mode"))):
-            raise RuntimeError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+        if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
+            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -125,30 +147,8 @@ class VisuotactileEnv(BaseEnv):
             **kwargs,
         )
 
-    def _make_randomization(self, overrides: dict[str, float]):
-        known = self.Randomization.__dataclass_fields__
-        for name, value in by_name("randomization", overrides, "dict(socket_xy=0.01)").items():
-            if name not in known:
-                raise ValueError(f"randomization[{name!r}] is unknown for {type(self).__name__}; known: {list(known)}")
-            if not (is_number(value) and value >= 0):
-                raise ValueError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
-            limit, reason = self._largest_ranges().get(name, (np.inf, ""))
-            if value > limit:
-                raise ValueError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
-        return self.Randomization(**overrides)
-
     @staticmethod
-    def _check_number(num_envs: Any) -> None:
-        if type(num_envs) is not int or num_envs < 1:
-            raise ValueError(f"num_envs={num_envs!r} must be a whole number of at least 1")
-        if num_envs > 1 and not torch.cuda.is_available():
-            raise RuntimeError(
-                f"num_envs={num_envs}: many environments in one process need a CUDA GPU, and torch sees none; use several "
-                "processes (gymnasium's AsyncVectorEnv, --workers of the commands)"
-            )
-
-    @staticmethod
-    def _wanted_pictures(own_mode: str, render_mode: str | None) -> str:
+    def _wanted_images(own_mode: str, render_mode: str | None) -> str:
         if own_mode not in ("none", "state", "state_dict"):
             return f"obs_mode={own_mode!r}"
         return f"render_mode={render_mode!r}" if render_mode else ""
@@ -160,7 +160,7 @@ class VisuotactileEnv(BaseEnv):
     # ---------------------------------------------------------------- for tasks to define
 
     def _largest_ranges(self) -> dict[str, tuple[float, str]]:
-        """For fields of `Randomization`: the largest half range that can be played, and what happens beyond."""
+        """The largest half range that can be played, by the name of a field of `Randomization`, and what happens beyond it."""
         return {}
 
     def _load_task(self) -> None:
@@ -176,15 +176,15 @@ class VisuotactileEnv(BaseEnv):
         raise NotImplementedError
 
     def goal_reached(self, measures: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(N,) bool: the goal is met at this moment."""
+        """Whether the goal is met at this moment, (N,) bool."""
         raise NotImplementedError
 
     def failed(self, measures: dict[str, torch.Tensor]) -> torch.Tensor:
-        """(N,) bool: the episode cannot be won any more."""
+        """Whether the episode cannot be won any more, (N,) bool."""
         raise NotImplementedError
 
     def _privileged_state(self) -> dict[str, torch.Tensor]:
-        """What the state modes hold of the task's parts."""
+        """State of the task's parts that only the state modes observe."""
         raise NotImplementedError
 
     def compute_normalized_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
@@ -196,16 +196,16 @@ class VisuotactileEnv(BaseEnv):
     def _default_sim_config(self):
         return SimConfig(
             sim_freq=self.physics_rate,
-            control_freq=10,
+            control_freq=CONTROL_FREQ,
             gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=2**21, max_rigid_patch_count=2**19),
             scene_config=SceneConfig(**self.contacts),
         )
 
     @property
     def _default_sensor_configs(self):
-        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=((0.5, -0.17, 0.17), (0.0, 1.0)))
+        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(SIDE_CAMERA_AT, (0.0, 1.0)))
         return [
-            CameraConfig(name, looking_down(*views[name]), 256, 256, FIELD_OF_VIEW, near=0.01, far=10)
+            CameraConfig(name, looking_down(*views[name]), IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, near=0.01, far=10)
             for name in self._camera_names
             if name in views
         ]
@@ -226,18 +226,13 @@ class VisuotactileEnv(BaseEnv):
 
     def _load_lighting(self, options: dict):
         level = LIGHTING[self._lighting]
-        self.scene.set_ambient_light([0.3 * level] * 3)
-        self.scene.add_directional_light([0.4, 0.6, -1], [0.8 * level] * 3, shadow=self.enable_shadow, shadow_scale=1.0)
-        self.scene.add_directional_light([-0.5, -0.3, -1], [0.35 * level] * 3)
+        key, fill = KEY_LIGHT * level, FILL_LIGHT * level
+        self.scene.set_ambient_light([AMBIENT_LIGHT * level] * 3)
+        self.scene.add_directional_light(KEY_DIRECTION, [key] * 3, shadow=self.enable_shadow, shadow_scale=1.0)
+        self.scene.add_directional_light(FILL_DIRECTION, [fill] * 3)
 
     def _after_reconfigure(self, options: dict):
-        # not in _setup_sensors, which runs only with a renderer: touch works without
-        self._tactile_sensors = {
-            uid: TactileSensor(config, self.scene, self.agent.robot, self._tactile_outputs)
-            for uid, config in self._tactile_configs.items()
-            if self._tactile_outputs
-        }
-        self._touch_is_fresh = False
+        self._make_tactile_sensors()
         self._measured: dict[str, torch.Tensor] | None = None
         self._steps_at_goal = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         self._contact_force = torch.zeros(self.num_envs, device=self.device)
@@ -245,10 +240,13 @@ class VisuotactileEnv(BaseEnv):
     # ---------------------------------------------------------------- episode
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None):
-        """As ManiSkill's. With a seed, on the CPU, the scene is built anew (0.1 s): the engine's solver remembers earlier
-        episodes, and only so is an episode a function of its seed alone, bit for bit."""
+        """Reset as ManiSkill does; with a seed, on the CPU, also build the scene anew (0.1 s).
+
+        The engine's solver remembers earlier episodes. Only in a new scene is an episode a function of its seed alone, bit for
+        bit.
+        """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
-        self._check_seed(seed)
+        check_seed(seed)
         if seed is not None and self.num_envs == 1:
             options["reconfigure"] = True
         obs, info = super().reset(seed=seed, options=options)
@@ -260,13 +258,8 @@ class VisuotactileEnv(BaseEnv):
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
 
-    def _check_seed(self, seed: Any) -> None:
-        seeds = seed if isinstance(seed, list | tuple | np.ndarray) else [seed]
-        if seed is not None and not all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds):
-            raise ValueError(f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one for each environment")
-
     def _settle(self, env_idx: torch.Tensor) -> None:
-        """Let the grip take its load before the first observation; environments in mid-episode are put back as they were."""
+        """Let the grip take its load before the first observation; the other environments' states are restored afterwards."""
         others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         others[env_idx] = False
         state = self.get_state_dict() if others.any() else None
@@ -291,7 +284,9 @@ class VisuotactileEnv(BaseEnv):
             sensor.reset(env_idx, self._episode_seed[env_idx.cpu().numpy()])
 
     def _step_action(self, action):
-        action = self._checked(action)
+        if action is not None:
+            shape = self.single_action_space.shape
+            action = checked_action(action, (shape, (self.num_envs, *shape)), self.device)
         self._pad_forces = []
         action = super()._step_action(action)
         self._contact_force = self.agent.held_object_force(torch.stack(self._pad_forces)).amax(dim=0)
@@ -300,26 +295,6 @@ class VisuotactileEnv(BaseEnv):
         reached = self.goal_reached(self._measured)
         self._steps_at_goal = torch.where(reached, self._steps_at_goal + 1, 0)
         return action
-
-    def _checked(self, action):
-        """The action as a tensor; a wrong shape or a NaN is an error before anything moves."""
-        if action is None:
-            return None
-        try:
-            tensor = torch.as_tensor(action, dtype=torch.float32, device=self.device)
-        except (TypeError, RuntimeError, ValueError) as error:
-            raise ValueError(f"action {action!r} is no array of numbers: {error}") from None
-        shape = self.single_action_space.shape
-        if tuple(tensor.shape) not in (shape, (self.num_envs, *shape)):
-            raise ValueError(
-                f"action has shape {tuple(tensor.shape)}; control_mode={self.agent.control_mode!r} takes {shape} "
-                f"or {(self.num_envs, *shape)}"
-            )
-        if not torch.isfinite(tensor).all():
-            raise ValueError(
-                f"action {tensor.tolist()} holds NaN or infinity; give finite numbers (they are clipped to [-1, 1])"
-            )
-        return tensor
 
     def _after_simulation_step(self):
         self._pad_forces.append(self.agent.pad_joint_forces)
@@ -340,58 +315,3 @@ class VisuotactileEnv(BaseEnv):
     def _get_obs_extra(self, info: dict) -> dict:
         extra = dict(tcp_pose=self.agent.tcp_pose_at_base.raw_pose)
         return extra | self._privileged_state() if self.obs_mode_struct.use_state else extra
-
-    def get_obs(self, info: dict | None = None, unflattened: bool = False):
-        if not self._tactile_outputs:
-            return super().get_obs(info, unflattened)
-        obs = self._get_obs_with_sensor_data(self.get_info() if info is None else info)
-        return obs if unflattened else self._flatten_raw_obs(obs)
-
-    def _flatten_raw_obs(self, obs: Any):
-        if self._tactile_outputs and self.obs_mode_struct.state:  # plain "state" would flatten touch, too
-            tree = dict(agent=obs["agent"], extra=obs["extra"])
-            state = common.flatten_state_dict(tree, use_torch=True, device=self.device)
-            return {name: data for name, data in obs.items() if name not in tree} | dict(state=state)
-        return super()._flatten_raw_obs(obs)
-
-    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
-        wanted = {name: getattr(self.obs_mode_struct.visual, name) for name in self.obs_mode_struct.visual.__dict__}
-        return self._sense(wanted, apply_texture_transforms)
-
-    def _sense(self, textures: dict[str, bool], apply_texture_transforms: bool = True) -> dict:
-        """What cameras (these textures) and pads see now; nothing else is rendered."""
-        cameras = {name: s for name, s in self._sensors.items() if isinstance(s, Camera)} if any(textures.values()) else {}
-        if cameras or any(sensor.needs_render for sensor in self._tactile_sensors.values()):
-            self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        for camera in cameras.values():
-            camera.capture()
-        seen = {
-            name: camera.get_obs(**textures, apply_texture_transforms=apply_texture_transforms)
-            for name, camera in cameras.items()
-        }
-        if not self._touch_is_fresh:  # once per state: shear has a history
-            for sensor in self._tactile_sensors.values():
-                sensor.capture()
-            self._touch_is_fresh = True
-        return seen | {name: sensor.get_obs() for name, sensor in self._tactile_sensors.items()}
-
-    def get_sensor_images(self) -> dict[str, dict[str, torch.Tensor]]:
-        """Pictures of what every camera and pad sees now, uint8 (N, H, W, 3) each."""
-        seen = self._sense(dict(rgb=True, depth=False, position=False, segmentation=False))
-        sensors = self._sensors | self._tactile_sensors
-        return {name: sensors[name].get_images(data) for name, data in seen.items()}
-
-    def get_sensor_params(self) -> dict[str, dict[str, torch.Tensor]]:
-        visual = any(vars(self.obs_mode_struct.visual).values())
-        cameras = super().get_sensor_params() if visual else {}
-        return cameras | {name: sensor.get_params() for name, sensor in self._tactile_sensors.items()}
-
-    def render_sensors(self):
-        return tile_images(self._sensor_pictures(), nrows=2)
-
-    def render_all(self):
-        sensors = self.render_sensors()
-        return torch.cat(same_height([self.render_rgb_array(), sensors]), dim=2)
-
-    def _sensor_pictures(self) -> list[torch.Tensor]:
-        return same_size([image for sensor in self.get_sensor_images().values() for image in sensor.values()])

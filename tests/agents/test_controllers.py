@@ -57,7 +57,7 @@ def test_target_is_precise_in_the_air(env):
     assert np.linalg.norm(after - before) < 1e-5  # it neither sags nor creeps
 
 
-def test_leash_bounds_the_force_however_long_one_pushes(env):
+def test_target_lead_limit_bounds_the_force_however_long_one_pushes(env):
     env.reset(seed=2)
     down = -np.eye(6)[2]
     forces = [float(env.step(0.3 * down)[-1]["contact_force"]) for _ in range(100)]
@@ -75,12 +75,12 @@ def test_action_dimensions(make_env, mode, dim):
 def test_yaw_mode_turns_about_the_vertical_alone(make_env):
     env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_delta_yaw")
     env.reset(seed=0)
-    before, facing = tool(env)
+    _, facing = tool(env)
     for _ in range(4):
         env.step(np.array([0, 0, 0, 1.0, -1.0]))
     for _ in range(8):
         env.step(np.array([0, 0, 0, 0, -1.0]))
-    after, turned = tool(env)
+    _, turned = tool(env)
     assert (turned * facing.inv()).as_rotvec() == pytest.approx([0, 0, 0.2], abs=4e-3)
 
 

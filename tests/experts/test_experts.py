@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations.episode import demonstrate
-from manifeel_ms3.experts import make_expert
-from manifeel_ms3.experts.ball_sorting import ROUGH
+from manifeel_ms3.experts import BallSortingExpert, make_expert
 from manifeel_ms3.sensors.depth.surfaces import RELIEF
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.conftest import PEG
@@ -117,7 +116,7 @@ def test_sorting_decides_by_the_dimples_it_feels(make_env):
     for _, action in zip(range(250), expert.actions(), strict=False):
         env.step(action)
     assert len(felt) == 3
-    assert max(felt) < ROUGH
+    assert max(felt) < BallSortingExpert.config.rough
 
 
 def test_unknown_task_names_those_that_have_an_expert(make_env):

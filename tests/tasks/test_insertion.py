@@ -32,7 +32,7 @@ def measures_with_plug_at(env, offset, tilt_degrees=0.0) -> tuple[dict, bool]:
     """Measures with the plug's foremost face at `offset` from the floor's middle, tilted about y."""
     base = env.unwrapped
     turn = Rotation.from_euler("y", tilt_degrees, degrees=True) * Rotation.from_euler("x", np.pi)
-    socket = base.socket.pose.raw_pose[0, :3].double().numpy() + [0, 0, base.fit.floor]
+    socket = base.socket.pose.raw_pose[0, :3].double().numpy() + np.array([0, 0, base.fit.floor])
     centre = socket + np.array(offset) - turn.apply([0, 0, base.fit.reach])
     quaternion = turn.as_quat()[[3, 0, 1, 2]]
     base.plug.set_pose(Pose.create_from_pq(torch.tensor(centre[None]).float(), torch.tensor(quaternion[None]).float()))

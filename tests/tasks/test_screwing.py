@@ -14,7 +14,7 @@ def goal_with_held_at(env, height: float, offset: float = 0.0, tilt_degrees: flo
     base = env.unwrapped
     fixed = base.fixed.pose.raw_pose[0, :3].double().numpy()
     quaternion = Rotation.from_euler("x", tilt_degrees, degrees=True).as_quat()[[3, 0, 1, 2]]
-    place = torch.tensor((fixed + [offset, 0, height])[None]).float()
+    place = torch.tensor((fixed + np.array([offset, 0, height]))[None]).float()
     base.held.set_pose(Pose.create_from_pq(place, torch.tensor(quaternion[None]).float()))
     measures = base.measure()
     if torque is not None:

@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 import torch
+from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
@@ -57,19 +58,20 @@ def test_visual_modes_hold_nothing_privileged(make_env, mode):
 
 
 @needs_renderer
-def test_visual_observation_does_not_depend_on_what_is_hidden(make_env):
-    """Same robot, other socket: out of the camera's sight, the observation is the same to the bit."""
-    env = make_env(obs_mode="tacff", render_backend="none")
+@pytest.mark.parametrize("occlusion", [True, False])
+def test_visual_observation_depends_on_a_hidden_part_only_without_the_occluder(make_env, occlusion):
+    """Same robot, another place of the rim in the box: behind the occluder the observation is the same to the bit."""
+    env = make_env("ManiFeel-PegReorientation-v1", obs_mode="rgb", occlusion=occlusion)
     obs, _ = env.reset(seed=0)
     pose = env.unwrapped.socket.pose.raw_pose.clone()
     pose[:, :2] += 0.03
-    from mani_skill.utils.structs import Pose
-
     env.unwrapped.socket.set_pose(Pose.create(pose))
     moved = env.unwrapped.get_obs()
-    for key in ("agent", "extra"):
-        for name, value in obs[key].items():
-            assert torch.equal(value, moved[key][name])
+    for group in ("agent", "extra"):
+        for name, value in obs[group].items():
+            assert torch.equal(value, moved[group][name])
+    same = torch.equal(obs["sensor_data"]["front"]["rgb"], moved["sensor_data"]["front"]["rgb"])
+    assert same is occlusion
 
 
 def test_state_modes(make_env):
@@ -112,7 +114,7 @@ def test_bad_arguments_name_what_is_allowed(make_env, kwargs, word):
         make_env(render_backend="none", **kwargs)
 
 
-def test_pictures_without_a_renderer_say_what_to_install(make_env):
+def test_images_without_a_renderer_say_what_to_install(make_env):
     assert "mesa-vulkan-drivers" in NO_RENDERER
     with pytest.raises(RuntimeError, match="mesa-vulkan-drivers"):
         make_env(obs_mode="rgb", render_backend="none")

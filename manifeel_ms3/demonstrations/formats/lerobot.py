@@ -23,6 +23,7 @@ import numpy as np
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json, write_json
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import DemonstrationFormat, Progress
 from .lerobot_statistics import episode_statistics, joined_statistics
@@ -30,8 +31,6 @@ from .maniskill_h5 import DemonstrationError, each_demonstration, observation_ke
 
 INFO = "meta/info.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-FPS = 10
-"""Frames per second: the control rate of every task, in Hz."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """Features that number frames, episodes and tasks; every LeRobot dataset has them."""
 FILES_PER_CHUNK = 1000
@@ -226,7 +225,7 @@ def _features_of(episode: dict[str, np.ndarray], keys: list[str], number: int, s
     length = len(episode["actions"])
     frame = np.arange(length)
     values = {feature_name(key): episode[key][:length] for key in keys} | dict(action=episode["actions"])
-    values["timestamp"] = (frame / FPS).astype(np.float32)
+    values["timestamp"] = (frame / CONTROL_FREQ).astype(np.float32)
     return values | dict(zip(COUNTERS, (frame, np.full(length, number), start + frame, np.zeros(length, int)), strict=True))
 
 
@@ -253,7 +252,7 @@ def _info(features: dict[str, Any], num_episodes: int, num_frames: int) -> dict[
         chunks_size=FILES_PER_CHUNK,
         data_files_size_in_mb=DATA_FILE_MB,
         video_files_size_in_mb=VIDEO_FILE_MB,
-        fps=FPS,
+        fps=CONTROL_FREQ,
         splits=dict(train=f"0:{num_episodes}"),
         data_path=DATA,
         video_path=None,

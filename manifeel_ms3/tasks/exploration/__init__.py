@@ -1,0 +1,1 @@
+"""The exploration tasks: what the camera cannot tell, touch must find out."""

@@ -1,4 +1,4 @@
-"""ManiFeel-BallSorting-v1 and ManiFeel-BallSortingDim-v1"""
+"""The tasks ManiFeel-BallSorting-v1 and ManiFeel-BallSortingDim-v1."""
 
 from dataclasses import dataclass
 
@@ -10,39 +10,57 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
-from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose
+from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 STAND_XY = (0.5, 0.0)  # m, nominal
 START_XYZ = (0.5, 0.0, 0.17)  # m
-LIFTED = 0.10  # m above its seat
-IN_PLACE = 0.010  # m from its seat
-PAD_END = 0.021  # m under the tool, and some air
+LIFTED = 0.10
+"""Height of the golf ball over its seat, in m, at success."""
+IN_PLACE = 0.010
+"""Distance of the table-tennis ball from its seat, in m, within which it has stayed in place."""
+ON_TABLE = 0.005
+"""Height of a ball's lowest point over the table, in m, below which it has fallen off the stand."""
+PAD_END = 0.021
+"""Distance from the tool centre point to below the fingertips, in m, with some clearance."""
 BOWLS = {"golf": ((0.40, 0.19), (0.90, 0.45, 0.10)), "tennis": ((0.40, -0.19), (0.15, 0.35, 0.75))}  # xy, m; orange, blue
 GOALS = ("lift", "bowls")
 
 
-@dataclass
-class Randomization:
+@dataclass(frozen=True)
+class BallSortingRandomization:
     """Half ranges of the uniform distributions; the default of the stand is the paper's."""
 
     stand_xy: float = 0.05
-    """m, each axis"""
+    """Position of the stand on each axis, in m."""
     start_xy: float = 0.05
-    """m, each axis"""
+    """Position of the tool at the start on each horizontal axis, in m."""
     start_z: float = 0.02
-    """m"""
+    """Height of the tool at the start, in m."""
+
+
+@dataclass(frozen=True)
+class BallSortingRewardConfig:
+    """Constants of the task's dense reward, chosen by hand."""
+
+    reach_gain: float = 8.0
+    """Gain, in 1/m, on the distance between tool and golf ball: 125 mm away the term is 1 - tanh(1)."""
+    bowl_gain: float = 4.0
+    """Gain, in 1/m, on the distance between a ball and its bowl: 250 mm away the term is 1 - tanh(1)."""
+    bowl_weight: float = 1.5
+    """Reward for one ball in its bowl: success adds 1 to that of both balls, which makes 4."""
 
 
 @register_task(
     "ManiFeel-BallSorting-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("II", "III")
 )
 class BallSortingEnv(VisuotactileEnv):
-    """
+    """Tell a golf ball from a table-tennis ball by touch, and lift it.
+
     **Task Description:**
     A table-tennis ball and a golf ball of the same size and colour sit on a stand. The gripper lifts the golf ball and leaves
-    the other: which is which, only touch can tell. The golf ball's 336 dimples are there for the pads, and not for the cameras.
+    the other. Only touch can tell which is which: the golf ball's 336 dimples are there for the pads, and not for the cameras.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - stand: xy +-50 mm around (0.5, 0) m; the balls swap seats with even chances; the golf ball is turned at random
@@ -50,14 +68,15 @@ class BallSortingEnv(VisuotactileEnv):
 
     **Success Conditions:** held for 0.5 s
     - the golf ball is 100 mm or more above its seat
-    - the table-tennis ball is in its own (10 mm)
+    - the table-tennis ball is in its own seat (10 mm)
 
     **Fail Conditions:** a ball lies on the table.
 
     `goal="bowls"` is the paper's task on the real robot: the golf ball goes into an orange bowl and the other into a blue one.
     """
 
-    Randomization = Randomization
+    Randomization = BallSortingRandomization
+    reward_config = BallSortingRewardConfig()
     policy_cameras = ("front",)
     default_control_mode = "pd_ee_delta_pose"
     front_camera_at = (0.80, 0.0, 0.15)
@@ -86,7 +105,7 @@ class BallSortingEnv(VisuotactileEnv):
     def _initialize_task(self, env_idx: torch.Tensor):
         n, ranges = len(env_idx), self.randomization
         stand = torch.tensor([*STAND_XY, 0.0]).repeat(n, 1)
-        stand[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.stand_xy
+        stand[:, :2] += uniform_in(ranges.stand_xy, n, 2)
         self.stand.set_pose(Pose.create_from_pq(stand))
         swapped = torch.rand(n) < 0.5
         self.swapped[env_idx] = swapped
@@ -98,7 +117,7 @@ class BallSortingEnv(VisuotactileEnv):
         self.agent.reset_tool(start)
 
     def _seats(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where the golf ball's and the other's centres belong, (N, 3), m."""
+        """Positions (N, 3), in m, of the centres of the golf ball and of the other ball in their seats."""
         middle = self.stand.pose.p + torch.tensor([0.0, 0.0, SEAT_HEIGHT], device=self.device)
         side = torch.where(self.swapped, 1.0, -1.0)[:, None] * torch.tensor([0.0, SEAT_SPACING / 2, 0.0], device=self.device)
         return middle + side, middle - side
@@ -111,7 +130,7 @@ class BallSortingEnv(VisuotactileEnv):
         ) | {f"{name}_to_bowl": self._to_bowl(name) for name in BOWLS if self.goal == "bowls"}
 
     def _to_bowl(self, ball: str) -> torch.Tensor:
-        """Distance (N,), m, of a ball from where it would lie in the middle of its bowl."""
+        """Distance (N,), in m, of a ball from its position in the middle of its bowl."""
         middle = torch.tensor([*BOWLS[ball][0], BOWL_FLOOR + BALL_RADIUS], device=self.device)
         return torch.linalg.norm(getattr(self, ball).pose.p - middle, dim=1)
 
@@ -122,20 +141,21 @@ class BallSortingEnv(VisuotactileEnv):
 
     def failed(self, measures):
         lowest = torch.minimum(self.golf.pose.p[:, 2], self.tennis.pose.p[:, 2])
-        return lowest < BALL_RADIUS + 0.005  # on the table
+        return lowest < BALL_RADIUS + ON_TABLE
 
     def _privileged_state(self):
         return dict(golf_pose=self.golf.pose.raw_pose, tennis_pose=self.tennis.pose.raw_pose)
 
     def compute_dense_reward(self, obs, action, info):
-        """In [0, 4]: 1 for reaching the golf ball, 1 for lifting it, 1 for leaving the other, 1 for success.
+        """Reward in [0, 4]: 1 for reaching the golf ball, 1 for lifting it, 1 for leaving the other, 1 for success.
 
-        With bowls: 1.5 for each ball's way to its own, 1 for success.
+        With bowls: 1.5 for each ball that comes close to its bowl, 1 for success.
         """
+        config = self.reward_config
         if self.goal == "bowls":
-            near = [1 - torch.tanh(4 * info[f"{name}_to_bowl"]) for name in BOWLS]
-            return 1.5 * (near[0] + near[1]) + info["success"].float()
-        reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.golf.pose.p, dim=1))
+            near = [1 - torch.tanh(config.bowl_gain * info[f"{name}_to_bowl"]) for name in BOWLS]
+            return config.bowl_weight * (near[0] + near[1]) + info["success"].float()
+        reach = 1 - torch.tanh(config.reach_gain * torch.linalg.norm(self.agent.tcp.pose.p - self.golf.pose.p, dim=1))
         lifted = (info["golf_height"] / LIFTED).clamp(0.0, 1.0)
         return reach + lifted + (info["tennis_away"] < IN_PLACE).float() + info["success"].float()
 

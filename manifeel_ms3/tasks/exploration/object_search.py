@@ -1,4 +1,4 @@
-"""ManiFeel-ObjectSearch-v1"""
+"""The task ManiFeel-ObjectSearch-v1."""
 
 from dataclasses import dataclass
 
@@ -7,34 +7,51 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR, CONTAINER_OUTER, CONTAINER_WALL, battery, container
-from manifeel_ms3.tasks.placement import height_range, start_pose
+from manifeel_ms3.tasks.placement import height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 CONTAINER_XY = (0.5, 0.0)  # m
 PLACES_X = (-0.075, 0.075)  # m from the container's middle
 START_XYZ = (0.5, 0.0, 0.23)  # m
-HAND, LOWEST = 0.08, 0.07  # m: half of the hand's width; of the tool over the table, clear of the battery
-LIFTED = 0.10  # m above where it lies
+HAND = 0.08
+"""Half of the hand's width, in m."""
+LOWEST = 0.07
+"""Smallest height of the tool over the table at the start, in m: clear of the battery."""
+LIFTED = 0.10
+"""Height of the battery over the container's floor, in m, at success."""
+OUTSIDE = 0.17
+"""Distance of the battery from the container's middle on either axis, in m, beyond which it is outside (half size: 0.161 m)."""
+NOT_LIFTED = 0.02
+"""Height of the battery over the container's floor, in m, below which it has not been lifted."""
 
 
-@dataclass
-class Randomization:
+@dataclass(frozen=True)
+class ObjectSearchRandomization:
     """Half ranges of the uniform distributions."""
 
     place_xy: float = 0.005
-    """m, each axis, around the place drawn"""
+    """Position of the battery on each axis around the place drawn, in m."""
     start_xy: float = 0.03
-    """m, each axis"""
+    """Position of the tool at the start on each horizontal axis, in m."""
     start_z: float = 0.02
-    """m"""
+    """Height of the tool at the start, in m."""
+
+
+@dataclass(frozen=True)
+class ObjectSearchRewardConfig:
+    """Constants of the task's dense reward, chosen by hand."""
+
+    reach_gain: float = 8.0
+    """Gain, in 1/m, on the distance between tool and battery: 125 mm away the term is 1 - tanh(1)."""
 
 
 @register_task(
     "ManiFeel-ObjectSearch-v1", max_episode_steps=400, category="exploration", paper_demos=50, paper_tables=("I", "II", "III")
 )
 class ObjectSearchEnv(VisuotactileEnv):
-    """
+    """Find a battery in a container that the camera cannot see into, and lift it.
+
     **Task Description:**
     A battery block, a cube of 25 mm, lies in one of two places on the floor of an opaque container, 322 x 281 x 161 mm, that
     the policy's camera, in front of it, cannot look into. The gripper finds it by touch and lifts it.
@@ -51,7 +68,8 @@ class ObjectSearchEnv(VisuotactileEnv):
     `occlusion=False` leaves the container's front undrawn.
     """
 
-    Randomization = Randomization
+    Randomization = ObjectSearchRandomization
+    reward_config = ObjectSearchRewardConfig()
     policy_cameras = ("front",)
     default_control_mode = "pd_ee_delta_pose"
     has_occluder = True
@@ -77,7 +95,7 @@ class ObjectSearchEnv(VisuotactileEnv):
         self.place[env_idx] = torch.randint(2, (n,))
         position = torch.zeros(n, 3)
         position[:, 0] = CONTAINER_XY[0] + torch.tensor(PLACES_X)[self.place[env_idx]]
-        position[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.place_xy
+        position[:, :2] += uniform_in(ranges.place_xy, n, 2)
         position[:, 2] = CONTAINER_FLOOR + BATTERY_SIZE / 2
         self.battery.set_pose(Pose.create_from_pq(position))
         start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
@@ -94,12 +112,13 @@ class ObjectSearchEnv(VisuotactileEnv):
         return measures["height"] > LIFTED
 
     def failed(self, measures):
-        return (measures["away"] > 0.17) & (measures["height"] < 0.02)
+        return (measures["away"] > OUTSIDE) & (measures["height"] < NOT_LIFTED)
 
     def _privileged_state(self):
         return dict(battery_pose=self.battery.pose.raw_pose)
 
     def compute_dense_reward(self, obs, action, info):
-        """In [0, 3]: 1 for reaching the battery, 1 for lifting it, 1 for success."""
-        reach = 1 - torch.tanh(8 * torch.linalg.norm(self.agent.tcp.pose.p - self.battery.pose.p, dim=1))
+        """Reward in [0, 3]: 1 for reaching the battery, 1 for lifting it, 1 for success."""
+        distance = torch.linalg.norm(self.agent.tcp.pose.p - self.battery.pose.p, dim=1)
+        reach = 1 - torch.tanh(self.reward_config.reach_gain * distance)
         return reach + (info["height"] / LIFTED).clamp(0.0, 1.0) + info["success"].float()

@@ -1,4 +1,4 @@
-"""ManiFeel-PegReorientation-v1"""
+"""The task ManiFeel-PegReorientation-v1."""
 
 from dataclasses import dataclass
 
@@ -7,16 +7,17 @@ import sapien
 
 from manifeel_ms3.geometry import reorientation_fit
 from manifeel_ms3.geometry.containers import open_box
-from manifeel_ms3.tasks.insertion.base import SOCKET_XY, InsertionEnv
-from manifeel_ms3.tasks.insertion.base import Randomization as InsertionRandomization
+from manifeel_ms3.tasks.insertion.base import SOCKET_XY, InsertionEnv, InsertionRandomization
 from manifeel_ms3.tasks.registry import register_task
 
 BOX_OUTER, BOX_HEIGHT = (0.24, 0.26), 0.09  # m
+NOT_INSERTED = 0.1
+"""Share of the rim's depth that the peg may leave at success."""
 
 
-@dataclass
-class Randomization(InsertionRandomization):
-    """Half ranges of the uniform distributions; the defaults are the paper's: the place is fixed, the peg's angle is not."""
+@dataclass(frozen=True)
+class PegReorientationRandomization(InsertionRandomization):
+    """Half ranges of the uniform distributions; the defaults are the paper's, which fixes the place of the rim."""
 
     socket_xy: float = 0.0
     start_xy: float = 0.03
@@ -29,7 +30,8 @@ class Randomization(InsertionRandomization):
     "ManiFeel-PegReorientation-v1", max_episode_steps=300, category="exploration", paper_demos=50, paper_tables=("I",)
 )
 class PegReorientationEnv(InsertionEnv):
-    """
+    """Stand a tilted peg up in a rim that the camera cannot see.
+
     **Task Description:**
     The gripper holds a peg, 16 x 10 x 50 mm, at an angle, over a rim in an opaque box that the policy's camera cannot see into.
     It finds the rim, stands the peg up in it and presses it in.
@@ -47,12 +49,12 @@ class PegReorientationEnv(InsertionEnv):
     `occlusion=False` leaves the box's front undrawn.
     """
 
-    Randomization = Randomization
+    Randomization = PegReorientationRandomization
     policy_cameras = ("front",)
     has_occluder = True
     front_camera_at = (0.80, 0.0, 0.15)
     fit = reorientation_fit()
-    max_gap = 0.1 * fit.depth
+    max_gap = NOT_INSERTED * fit.depth
     lift = 0.05
 
     def _load_task(self):

@@ -1,55 +1,80 @@
-"""What the insertion tasks share: a held plug, a socket on the table, and the plug's foremost face on the way to its floor."""
+"""The base class of the insertion tasks: a held plug, a socket on the table, and the plug's foremost face over its floor."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import sapien
 import torch
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_apply
+from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Fit
-from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose
+from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, turned_about, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 SOCKET_XY = (0.5, 0.0)  # m, nominal
-START_XYZ = (0.5, 0.0, 0.15)  # m, between the pads
-GRIP_FORCE = 20.0  # N
-GRIP_INDENTATION = 6e-4  # m: each gel under the grip of 20 N (four contact points of 8 kN/m)
+START_XYZ = (0.5, 0.0, 0.15)
+"""Nominal position of the tool, in m, at the start (paper)."""
+GRIP_FORCE = 20.0
+"""Force of each pad on the plug, in N."""
+GRIP_INDENTATION = 6e-4
+"""Indentation of each gel under the grip of 20 N, in m: four contact points of 8 kN/m."""
 MAX_TILT = np.deg2rad(3.0)
-LOST = 0.03  # m between plug and where it was held
-CLEAR = 0.010  # m over the socket, of a plug at the start
-MAX_ROTATION, MAX_PITCH = 0.4, 0.8  # rad
-BESIDE = 0.005  # m off the axis: lower is not better there
+"""Angle, in rad, from the socket's axis below which the plug counts as upright."""
+LOST = 0.03
+"""Displacement of the plug in the grip, in m, beyond which it is lost."""
+CLEAR = 0.010
+"""Smallest height of the plug over the socket at the start, in m."""
+MAX_ROTATION = 0.4
+"""Largest half range of the tool's rotation, in rad, that keeps the hand off the table and its joints off their limits."""
+MAX_PITCH = 0.8
+"""Largest half range of the plug's pitch in the hand, in rad."""
 
 
-@dataclass
-class Randomization:
+@dataclass(frozen=True)
+class InsertionRandomization:
     """Half ranges of the uniform distributions; the defaults are the paper's."""
 
     socket_xy: float = 0.05
-    """m, each axis"""
+    """Position of the socket on each axis, in m."""
     start_xy: float = 0.10
-    """m, each axis"""
+    """Position of the tool at the start on each horizontal axis, in m."""
     start_z: float = 0.05
-    """m"""
+    """Height of the tool at the start, in m."""
     start_rotation: float = 0.1
-    """rad, about each axis of the robot's base"""
+    """Rotation of the tool at the start about each axis of the robot's base, in rad."""
     in_hand_pitch: float = float(np.deg2rad(10))
-    """rad, of the plug about the closing axis"""
+    """Pitch of the plug in the hand about the closing axis, in rad."""
+
+
+@dataclass(frozen=True)
+class InsertionRewardConfig:
+    """Constants of the insertion tasks' dense reward, chosen by hand."""
+
+    offset_gain: float = 20.0
+    """Gain, in 1/m, on the distance from the socket's axis: 50 mm away the term is 1 - tanh(1)."""
+    height_gain: float = 5.0
+    """Gain, in 1/m, on the height over the rim."""
+    tilt_gain: float = 10.0
+    """Gain, in 1/rad, on the plug's tilt."""
+    beside: float = 0.005
+    """Distance from the socket's axis, in m, beyond which depth is not rewarded: the plug is beside the hole there."""
 
 
 class InsertionEnv(VisuotactileEnv):
     """A held plug is put into a socket.
 
-    Subclasses set `fit` before they call this constructor, `max_gap`, the distance from the floor that counts as in, and
-    `lift`, how much higher than 150 mm the tool starts.
+    Subclasses set `fit` before they call this constructor, and `max_gap`.
     """
 
-    Randomization = Randomization
+    Randomization = InsertionRandomization
+    reward_config = InsertionRewardConfig()
     fit: Fit
+    """Shapes of plug and socket."""
     max_gap: float
+    """Distance of the plug's foremost face from the socket's floor, in m, below which the plug is in."""
     lift: float = 0.0
+    """Height by which the tool starts above 150 mm, in m."""
 
     def _largest_ranges(self):
         lowest = self.fit.rim + CLEAR + self.fit.reach - self.fit.grip
@@ -68,21 +93,20 @@ class InsertionEnv(VisuotactileEnv):
     def _initialize_task(self, env_idx: torch.Tensor):
         n, ranges = len(env_idx), self.randomization
         socket = torch.tensor([*SOCKET_XY, 0.0]).repeat(n, 1)
-        socket[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.socket_xy
+        socket[:, :2] += uniform_in(ranges.socket_xy, n, 2)
         self.socket.set_pose(Pose.create_from_pq(socket))
 
         position = (*START_XYZ[:2], START_XYZ[2] + self.lift)
         start = start_pose(n, position, (ranges.start_xy, ranges.start_xy, ranges.start_z), ranges.start_rotation)
         self.agent.reset_tool(start, self.fit.grip_width / 2 - GRIP_INDENTATION, GRIP_FORCE)
 
-        pitch = torch.zeros(n, 3)
-        pitch[:, 1] = (2 * torch.rand(n) - 1) * ranges.in_hand_pitch
-        in_hand = Pose.create_from_pq(q=axis_angle_to_quaternion(pitch)) * self._grip
+        pitch = turned_about(1, uniform_in(ranges.in_hand_pitch, n))
+        in_hand = Pose.create_from_pq(q=pitch) * self._grip
         self.plug.set_pose(start * in_hand)
 
     @property
     def _grip(self) -> Pose:
-        """Plug in the tool's frame at zero pitch."""
+        """Pose of the plug in the tool's frame at zero pitch."""
         return Pose.create_from_pq(torch.tensor([[0.0, 0.0, -self.fit.grip]], device=self.device))
 
     def measure(self) -> dict[str, torch.Tensor]:
@@ -107,9 +131,9 @@ class InsertionEnv(VisuotactileEnv):
         return dict(plug_pose=self.plug.pose.raw_pose, socket_pose=self.socket.pose.raw_pose)
 
     def compute_dense_reward(self, obs, action, info):
-        """In [0, 4]: 1 for coming over the hole, 1 for being upright there, 1 for depth, 1 for success."""
-        depth = self.fit.depth
-        near = 1 - torch.tanh(20 * info["offset"] + 5 * (info["gap"] - depth).clamp(min=0.0))
-        upright = near * (1 - torch.tanh(10 * info["tilt"]))
+        """Reward in [0, 4]: 1 for the position over the hole, 1 for being upright there, 1 for depth, 1 for success."""
+        depth, gains = self.fit.depth, self.reward_config
+        near = 1 - torch.tanh(gains.offset_gain * info["offset"] + gains.height_gain * (info["gap"] - depth).clamp(min=0.0))
+        upright = near * (1 - torch.tanh(gains.tilt_gain * info["tilt"]))
         inserted = ((depth - info["gap"]) / (depth - self.max_gap)).clamp(0.0, 1.0)
-        return near + upright + inserted * (info["offset"] < BESIDE).float() + info["success"].float()
+        return near + upright + inserted * (info["offset"] < gains.beside).float() + info["success"].float()

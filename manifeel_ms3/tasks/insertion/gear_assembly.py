@@ -1,37 +1,39 @@
-"""ManiFeel-GearAssembly-v1"""
+"""The task ManiFeel-GearAssembly-v1."""
 
 from dataclasses import dataclass
 
 import sapien
 import torch
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion, quaternion_apply
+from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import gear_fit
 from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X, neighbour_gear
+from manifeel_ms3.tasks.placement import turned_about, uniform_in
 from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS
 
-from .base import SOCKET_XY, InsertionEnv
-from .base import Randomization as InsertionRandomization
+from .base import SOCKET_XY, InsertionEnv, InsertionRandomization
 
 NEIGHBOURS = ("small", "large")
-ON_SHAFT = 1.0e-3  # m that a neighbour may be off its place
+ON_SHAFT = 1.0e-3
+"""Largest displacement of a neighbouring gear from its place, in m, at success."""
 
 
-@dataclass
-class Randomization(InsertionRandomization):
-    """Half ranges of the uniform distributions; the defaults are the paper's, of its simulation."""
+@dataclass(frozen=True)
+class GearRandomization(InsertionRandomization):
+    """Half ranges of the uniform distributions; the defaults are those of the paper's simulation."""
 
     base_yaw: float = 0.0
-    """rad, of the base about the vertical"""
+    """Rotation of the base about the vertical, in rad."""
 
 
 @register_task(
     "ManiFeel-GearAssembly-v1", max_episode_steps=300, category="insertion", paper_demos=100, paper_tables=("I", "II", "III")
 )
 class GearAssemblyEnv(InsertionEnv):
-    """
+    """Put a gear onto its shaft between two others, with which its teeth mesh.
+
     **Task Description:**
     The gripper holds the medium one of three gears (19 teeth, 42 mm across) by a handle and puts it on the middle shaft of a
     base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.
@@ -49,7 +51,7 @@ class GearAssemblyEnv(InsertionEnv):
     **Fail Conditions:** the gear has left the grip (30 mm).
     """
 
-    Randomization = Randomization
+    Randomization = GearRandomization
     contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
     fit = gear_fit()
     max_gap = 1.0e-3
@@ -71,13 +73,13 @@ class GearAssemblyEnv(InsertionEnv):
         super()._initialize_task(env_idx)
         n = len(env_idx)
         if self.randomization.base_yaw > 0:
-            turned = _random_yaw(n, self.randomization.base_yaw)
+            turned = turned_about(2, uniform_in(self.randomization.base_yaw, n))
             self.socket.set_pose(Pose.create_from_pq(self.socket.pose.p[env_idx], turned))
         for name, actor in self.neighbours.items():
-            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], _random_yaw(n, torch.pi)))
+            actor.set_pose(Pose.create_from_pq(self._place_of(name)[env_idx], turned_about(2, uniform_in(torch.pi, n))))
 
     def _place_of(self, neighbour: str) -> torch.Tensor:
-        """Where a neighbour belongs, (N, 3), m."""
+        """Position (N, 3), in m, where a neighbouring gear belongs."""
         place = torch.tensor([SHAFT_X[neighbour], 0.0, BASE_SIZE[2]], device=self.device).expand(self.num_envs, 3)
         return self.socket.pose.p + quaternion_apply(self.socket.pose.q, place)
 
@@ -90,10 +92,3 @@ class GearAssemblyEnv(InsertionEnv):
 
     def _privileged_state(self):
         return super()._privileged_state() | {f"{name}_gear_pose": a.pose.raw_pose for name, a in self.neighbours.items()}
-
-
-def _random_yaw(n: int, half_range: float) -> torch.Tensor:
-    """Quaternions (n, 4), turned about the vertical."""
-    turn = torch.zeros(n, 3)
-    turn[:, 2] = (2 * torch.rand(n) - 1) * half_range
-    return axis_angle_to_quaternion(turn)

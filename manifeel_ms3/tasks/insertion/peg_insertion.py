@@ -1,4 +1,4 @@
-"""ManiFeel-PegInsertion-v1"""
+"""The task ManiFeel-PegInsertion-v1."""
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import peg_fit
@@ -10,7 +10,8 @@ from .base import InsertionEnv
 
 @register_task("ManiFeel-PegInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
 class PegInsertionEnv(InsertionEnv):
-    """
+    """Insert a rectangular peg into a socket with little clearance.
+
     **Task Description:**
     The gripper holds a rectangular peg (11.96 x 7.91 x 50 mm) by its upper end and inserts it into a socket 9 mm deep.
     `fit="tight"` leaves 0.04 and 0.09 mm around the peg (the paper's part), `fit="loose"` 0.5 mm.

@@ -1,16 +1,21 @@
-"""ManiFeel-PowerPlugInsertion-v1"""
+"""The task ManiFeel-PowerPlugInsertion-v1."""
 
 from manifeel_ms3.geometry import power_fit
+from manifeel_ms3.geometry.plugs import BLADE
 from manifeel_ms3.tasks.registry import register_task
 
 from .base import InsertionEnv
+
+NOT_INSERTED = 0.1
+"""Share of the blades' length that may be outside the socket at success."""
 
 
 @register_task(
     "ManiFeel-PowerPlugInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",)
 )
 class PowerPlugInsertionEnv(InsertionEnv):
-    """
+    """Insert a NEMA 5-15 plug into a socket that looks up.
+
     **Task Description:**
     The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that looks up. The holes leave
     0.2 mm on each side; the ground pin, 3 mm longer than the blades, finds its hole first.
@@ -28,5 +33,5 @@ class PowerPlugInsertionEnv(InsertionEnv):
     """
 
     fit = power_fit()
-    max_gap = 0.1 * 0.0175  # of the blades' length
+    max_gap = NOT_INSERTED * BLADE[2]
     lift = 0.03

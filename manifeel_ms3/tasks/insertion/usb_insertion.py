@@ -1,17 +1,21 @@
-"""ManiFeel-USBInsertion-v1"""
+"""The task ManiFeel-USBInsertion-v1."""
 
 from manifeel_ms3.geometry import usb_fit
 from manifeel_ms3.tasks.registry import register_task
 
 from .base import InsertionEnv
 
+NOT_INSERTED = 0.1
+"""Share of the shell that may be outside the port at success."""
+
 
 @register_task("ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
 class USBInsertionEnv(InsertionEnv):
-    """
+    """Insert a USB-A plug into a port that looks up.
+
     **Task Description:**
     The gripper holds a USB-A plug by its handle and puts it into a port that looks up. Shell and tongue have 0.1 mm around them
-    on each side; the plug goes in one way round alone, which is the way it is held.
+    on each side; the plug fits only one way round, which is the way it is held.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - port: xy +-50 mm around (0.5, 0) m
@@ -26,5 +30,5 @@ class USBInsertionEnv(InsertionEnv):
     """
 
     fit = usb_fit()
-    max_gap = 0.1 * fit.depth
+    max_gap = NOT_INSERTED * fit.depth
     lift = 0.03

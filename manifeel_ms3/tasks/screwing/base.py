@@ -1,4 +1,4 @@
-"""What the screwing tasks share: a held part with a thread, and the fixed one that it is turned onto or into."""
+"""The base class of the screwing tasks: a held part with a thread, and the fixed part that it is screwed onto or into."""
 
 from dataclasses import dataclass
 
@@ -9,44 +9,63 @@ from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quatern
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Screw
-from manifeel_ms3.tasks.placement import height_range, start_pose
+from manifeel_ms3.tasks.placement import height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS, VisuotactileEnv
 
 FIXED_XY = (0.5, 0.0)  # m, nominal
 START_Z = 0.15  # m
-WOUND_UP = np.deg2rad(200)  # about the vertical, that the hand starts turned by: near the end of its joint
-MAX_XY, CLEAR = 0.07, 0.02  # m; m over where the threads first meet
+WOUND_UP = np.deg2rad(200)
+"""Rotation of the hand about the vertical at the start, in rad: near the end of its last joint."""
+MAX_XY = 0.07
+"""Largest half range of horizontal positions, in m, within which the wrist can be turned all the way."""
+CLEAR = 0.02
+"""Smallest height at the start over the first contact of the threads, in m."""
 WRIST_END = "further out the wrist comes to its end"
-LOST = 0.05  # m from the hand, and
-OFF_AXIS = 0.004  # m from the axis
+LOST = 0.05
+"""Distance of the held part from the tool, in m, beyond which it is out of the hand."""
+OFF_AXIS = 0.004
+"""Distance of the held part from the fixed part's axis, in m, beyond which it is off it."""
 
 
-@dataclass
-class Randomization:
+@dataclass(frozen=True)
+class ScrewingRandomization:
     """Half ranges of the uniform distributions; the defaults are the paper's."""
 
     fixed_xy: float = 0.05
-    """m, each axis, of the bolt or the holder"""
+    """Position of the bolt or the holder on each axis, in m."""
     start_xy: float = 0.0
-    """m, each axis"""
+    """Position of the tool at the start on each horizontal axis, in m."""
     start_z: float = 0.0
-    """m"""
+    """Height of the tool at the start, in m."""
+
+
+@dataclass(frozen=True)
+class ScrewingRewardConfig:
+    """Constants of the screwing tasks' dense reward, chosen by hand."""
+
+    offset_gain: float = 20.0
+    """Gain, in 1/m, on the distance from the fixed part's axis: 50 mm away the term is 1 - tanh(1)."""
+    height_gain: float = 5.0
+    """Gain, in 1/m, on the height over the first contact of the threads."""
+    tilt_gain: float = 10.0
+    """Gain, in 1/rad, on the held part's tilt."""
 
 
 class ScrewingEnv(VisuotactileEnv):
-    """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, takes it again.
+    """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, and grasps it again.
 
-    Subclasses define `screw` and `grip_indentation`, m, of each gel under its grip.
+    Subclasses define `screw` and `grip_indentation`.
     """
 
-    Randomization = Randomization
+    Randomization = ScrewingRandomization
+    reward_config = ScrewingRewardConfig()
     default_control_mode = "pd_ee_delta_pose"
     physics_rate = 720  # at 240 a thread tilts and jams
     contacts = CONTACTS | dict(contact_offset=5e-5)  # m: threads have a tenth of a millimetre of play
     screw: Screw
+    """Shapes of the held and the fixed part."""
     grip_indentation: float
-    start = "hand"
-    """where the held part is at the start: in the hand, or already in the "holder"."""
+    """Indentation of each gel under the grip, in m."""
 
     def _largest_ranges(self):
         lowest = self.screw.engaged + CLEAR
@@ -63,18 +82,18 @@ class ScrewingEnv(VisuotactileEnv):
     def _initialize_task(self, env_idx: torch.Tensor):
         n, ranges = len(env_idx), self.randomization
         fixed = torch.tensor([*FIXED_XY, 0.0]).repeat(n, 1)
-        fixed[:, :2] += (2 * torch.rand(n, 2) - 1) * ranges.fixed_xy
+        fixed[:, :2] += uniform_in(ranges.fixed_xy, n, 2)
         self.fixed.set_pose(Pose.create_from_pq(fixed))
         self._initialize_held(env_idx)
 
     def _initialize_held(self, env_idx: torch.Tensor) -> None:
-        """Put the tool at its start, the held part in it."""
+        """Put the tool at its start, with the held part in it."""
         opening = self.screw.grip_width / 2 - self.grip_indentation
         start = self._start_tool(env_idx, START_Z, opening, self.screw.grip_force)
         self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([[0.0, 1.0, 0.0, 0.0]])))
 
     def _start_tool(self, env_idx: torch.Tensor, height: float, opening: float, grip_force: float) -> Pose:
-        """Put the wound-up tool at a random start around a height, and return where."""
+        """Put the wound-up tool at a random pose around a height, in m, and return the poses."""
         n, ranges = len(env_idx), self.randomization
         start = start_pose(n, (*FIXED_XY, height), (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
         wound = axis_angle_to_quaternion(torch.tensor([[0.0, 0.0, WOUND_UP]])).expand(n, 4)
@@ -100,8 +119,9 @@ class ScrewingEnv(VisuotactileEnv):
         return dict(held_pose=self.held.pose.raw_pose, fixed_pose=self.fixed.pose.raw_pose)
 
     def compute_dense_reward(self, obs, action, info):
-        """In [0, 4]: 1 for coming over the axis, 1 for being upright there, 1 for depth, 1 for success."""
-        near = 1 - torch.tanh(20 * info["offset"] + 5 * (-info["descent"]).clamp(min=0.0))
-        upright = near * (1 - torch.tanh(10 * info["tilt"]))
+        """Reward in [0, 4]: 1 for the position over the axis, 1 for being upright there, 1 for depth, 1 for success."""
+        gains = self.reward_config
+        near = 1 - torch.tanh(gains.offset_gain * info["offset"] + gains.height_gain * (-info["descent"]).clamp(min=0.0))
+        upright = near * (1 - torch.tanh(gains.tilt_gain * info["tilt"]))
         deep = (info["descent"] / (self.screw.engaged - self.screw.seated)).clamp(0.0, 1.0)
         return near + upright + deep * (info["offset"] < OFF_AXIS).float() + info["success"].float()

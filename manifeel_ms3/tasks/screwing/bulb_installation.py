@@ -1,34 +1,42 @@
-"""ManiFeel-BulbInstallation-v1"""
+"""The task ManiFeel-BulbInstallation-v1."""
 
 from dataclasses import dataclass
 
 import torch
-from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quaternion
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import bulb_and_holder
 from manifeel_ms3.geometry.screws import BULB_TRAVEL, bulb_yaw
+from manifeel_ms3.tasks.placement import turned_about, uniform_in
 from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS
 
-from .base import Randomization as ScrewingRandomization
-from .base import ScrewingEnv
+from .base import ScrewingEnv, ScrewingRandomization
 
-MAX_GAP = 0.5e-3  # m
-TIGHT = 0.1  # N m
+MAX_GAP = 0.5e-3
+"""Distance of the cap's foot from the holder's contact, in m, at success."""
+ON_AXIS = 2e-3
+"""Distance of the bulb from the holder's axis, in m, at success."""
+TIGHT = 0.1
+"""Torque of the hand on the bulb, in N m, at success."""
 STARTS = ("hand", "holder")
-SCREWED_IN = 0.0015  # m down from where the threads first meet, on average
-SUNK = 2.2e-4  # m that it sits lower than the middle of the groove, on the thread
-OVER_BULB = 0.17  # m, of the open fingers over the table
+SCREWED_IN = 0.0015
+"""Mean depth of a bulb that starts in the holder below the first contact of the threads, in m."""
+SUNK = 2.2e-4
+"""Distance, in m, by which a bulb that rests on the thread sits lower than the middle of the groove."""
+OVER_BULB = 0.17
+"""Height of the tool over the table, in m, at the start over a bulb in the holder."""
+OPEN = 0.04
+"""Distance of each open finger from the middle, in m: the Panda's limit."""
 
 
-@dataclass
-class Randomization(ScrewingRandomization):
+@dataclass(frozen=True)
+class BulbRandomization(ScrewingRandomization):
     """Half ranges of the uniform distributions; the defaults of the first three are the paper's."""
 
     screw_depth: float = 0.0012
-    """m, with `start="holder"`"""
+    """Depth of the bulb in the holder with `start="holder"`, in m."""
 
 
 @register_task(
@@ -40,7 +48,8 @@ class Randomization(ScrewingRandomization):
     demo_megabytes=70.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
-    """
+    """Screw a light bulb into its holder.
+
     **Task Description:**
     The gripper holds a light bulb by its glass and screws its E27 cap (pitch 3.63 mm) into a holder that hides the thread,
     until it is tight. The hand turns 310 degrees at most; then it lets go, turns back, and takes the bulb again.
@@ -60,8 +69,7 @@ class BulbInstallationEnv(ScrewingEnv):
     the open gripper, over it, moves and turns about the vertical alone (5-D actions).
     """
 
-    Randomization = Randomization
-
+    Randomization = BulbRandomization
     screw = bulb_and_holder()
     grip_indentation = 1.5e-3  # m: one contact point of 8 kN/m
     contacts = CONTACTS | dict(
@@ -87,15 +95,13 @@ class BulbInstallationEnv(ScrewingEnv):
     def _initialize_in_holder(self, env_idx: torch.Tensor) -> None:
         n = len(env_idx)
         place = self.fixed.pose.p[env_idx]
-        place[:, 2] += self.screw.engaged - SCREWED_IN + (2 * torch.rand(n) - 1) * self.randomization.screw_depth
-        turn = torch.zeros(n, 3)
-        turn[:, 2] = bulb_yaw(place[:, 2] + SUNK)
-        self.held.set_pose(Pose.create_from_pq(place, axis_angle_to_quaternion(turn)))
-        self._start_tool(env_idx, OVER_BULB, opening=0.04, grip_force=0.0)
+        place[:, 2] += self.screw.engaged - SCREWED_IN + uniform_in(self.randomization.screw_depth, n)
+        self.held.set_pose(Pose.create_from_pq(place, turned_about(2, bulb_yaw(place[:, 2] + SUNK))))
+        self._start_tool(env_idx, OVER_BULB, opening=OPEN, grip_force=0.0)
 
     def measure(self):
         measures = super().measure()
         return measures | dict(gap=BULB_TRAVEL - measures["descent"])  # m, from the cap's foot to the holder's contact
 
     def goal_reached(self, measures):
-        return (measures["gap"] < MAX_GAP) & (measures["offset"] < 2e-3) & (measures["torque"] > TIGHT)
+        return (measures["gap"] < MAX_GAP) & (measures["offset"] < ON_AXIS) & (measures["torque"] > TIGHT)

@@ -1,4 +1,4 @@
-"""ManiFeel-NutBoltAssembly-v1"""
+"""The task ManiFeel-NutBoltAssembly-v1."""
 
 import numpy as np
 
@@ -7,8 +7,10 @@ from manifeel_ms3.tasks.registry import register_task
 
 from .base import ScrewingEnv
 
-ON_AXIS = 1.0e-3  # m
+ON_AXIS = 1.0e-3
+"""Distance of the nut from the bolt's axis, in m, at success."""
 MAX_TILT = np.deg2rad(2.0)
+"""Angle, in rad, between the axes of nut and bolt at success."""
 
 
 @register_task(
@@ -20,7 +22,8 @@ MAX_TILT = np.deg2rad(2.0)
     demo_megabytes=70.0,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):
-    """
+    """Screw an M16 nut onto a bolt.
+
     **Task Description:**
     The gripper holds an M16 nut and screws it onto a bolt that stands up. Both have real threads, 2 mm of pitch. The hand turns
     310 degrees at most; then it lets go, turns back, and takes the nut again.

@@ -1,0 +1,66 @@
+"""Checks of the arguments that a task's environment is made and reset with."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from manifeel_ms3.arguments import by_name, is_number
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
+
+Limits = Mapping[str, tuple[float, str]]
+"""The largest half range that can be played, by the name of a randomization's field, and what happens beyond it."""
+
+
+def checked_randomization(env_name: str, kind: Any, overrides: Any, limits: Limits) -> Any:
+    """Make a task's randomization from the fields that a caller overrides.
+
+    Args:
+        env_name: Name of the task's class, for messages.
+        kind: Dataclass of the randomization.
+        overrides: Half ranges by field name.
+        limits: Largest half ranges by field name.
+
+    Raises:
+        InvalidArgumentError: A field is unknown, or its value is no number, negative or too large.
+    """
+    known = kind.__dataclass_fields__
+    for name, value in by_name("randomization", overrides, "dict(socket_xy=0.01)").items():
+        if name not in known:
+            raise InvalidArgumentError(f"randomization[{name!r}] is unknown for {env_name}; known: {list(known)}")
+        if not (is_number(value) and value >= 0):
+            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
+        limit, reason = limits.get(name, (np.inf, ""))
+        if value > limit:
+            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
+    return kind(**overrides)
+
+
+def check_num_envs(num_envs: Any) -> None:
+    """Check the number of environments that are simulated at once.
+
+    Raises:
+        InvalidArgumentError: It is not a whole number of at least 1.
+        MachineError: It is more than 1, and this machine has no CUDA GPU.
+    """
+    if type(num_envs) is not int or num_envs < 1:
+        raise InvalidArgumentError(f"num_envs={num_envs!r} must be a whole number of at least 1")
+    if num_envs > 1 and not torch.cuda.is_available():
+        raise MachineError(
+            f"num_envs={num_envs}: many environments in one process need a CUDA GPU, and torch finds none; use several "
+            "processes (gymnasium's AsyncVectorEnv, --workers of the commands)"
+        )
+
+
+def check_seed(seed: Any) -> None:
+    """Check a seed, or one seed for each environment.
+
+    Raises:
+        InvalidArgumentError: One of them is not a whole number from 0 to 2**32 - 1.
+    """
+    seeds = seed if isinstance(seed, list | tuple | np.ndarray) else [seed]
+    if seed is not None and not all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds):
+        raise InvalidArgumentError(
+            f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one such number for each environment"
+        )

@@ -1,0 +1,90 @@
+"""Observation with cameras and tactile pads."""
+
+from typing import Any
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import Camera
+from mani_skill.utils import common
+from mani_skill.utils.visualization.misc import tile_images
+
+from manifeel_ms3.sensors import TactileSensor, TactileSensorConfig
+
+from .images import same_height, same_size
+
+
+class SensingEnv(BaseEnv):
+    """A ManiSkill environment whose observations and images hold those of tactile pads, too.
+
+    Subclasses set `_tactile_outputs` and `_tactile_configs` before they call the constructor, and clear `_touch_is_fresh`
+    whenever the simulation's state changes.
+    """
+
+    _tactile_outputs: tuple[str, ...]
+    """Outputs of the pads that observations hold: "rgb", "force_field"."""
+    _tactile_configs: dict[str, TactileSensorConfig]
+    """Configurations of the observed pads by sensor name."""
+    _touch_is_fresh: bool
+    """Whether the pads have been read in the present state. They are read once per state, since shear has a history."""
+
+    def _make_tactile_sensors(self) -> None:
+        # not in _setup_sensors, which runs only with a renderer: touch works without one
+        self._tactile_sensors = {
+            uid: TactileSensor(config, self.scene, self.agent.robot, self._tactile_outputs)
+            for uid, config in self._tactile_configs.items()
+            if self._tactile_outputs
+        }
+        self._touch_is_fresh = False
+
+    def get_obs(self, info: dict | None = None, unflattened: bool = False):
+        if not self._tactile_outputs:
+            return super().get_obs(info, unflattened)
+        obs = self._get_obs_with_sensor_data(self.get_info() if info is None else info)
+        return obs if unflattened else self._flatten_raw_obs(obs)
+
+    def _flatten_raw_obs(self, obs: Any):
+        if self._tactile_outputs and self.obs_mode_struct.state:  # plain "state" would flatten touch, too
+            tree = dict(agent=obs["agent"], extra=obs["extra"])
+            state = common.flatten_state_dict(tree, use_torch=True, device=self.device)
+            return {name: data for name, data in obs.items() if name not in tree} | dict(state=state)
+        return super()._flatten_raw_obs(obs)
+
+    def _get_obs_sensor_data(self, apply_texture_transforms: bool = True) -> dict:
+        visual = self.obs_mode_struct.visual
+        return self._sense({name: getattr(visual, name) for name in visual.__dict__}, apply_texture_transforms)
+
+    def _sense(self, textures: dict[str, bool], apply_texture_transforms: bool = True) -> dict:
+        """Observations of the cameras (these textures) and the pads in the present state; nothing else is rendered."""
+        cameras = {name: s for name, s in self._sensors.items() if isinstance(s, Camera)} if any(textures.values()) else {}
+        if cameras or any(sensor.needs_render for sensor in self._tactile_sensors.values()):
+            self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        for camera in cameras.values():
+            camera.capture()
+        observed = {
+            name: camera.get_obs(**textures, apply_texture_transforms=apply_texture_transforms)
+            for name, camera in cameras.items()
+        }
+        if not self._touch_is_fresh:
+            for sensor in self._tactile_sensors.values():
+                sensor.capture()
+            self._touch_is_fresh = True
+        return observed | {name: sensor.get_obs() for name, sensor in self._tactile_sensors.items()}
+
+    def get_sensor_images(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Images of every camera and pad in the present state, uint8 (N, H, W, 3) each."""
+        observed = self._sense(dict(rgb=True, depth=False, position=False, segmentation=False))
+        sensors = self._sensors | self._tactile_sensors
+        return {name: sensors[name].get_images(data) for name, data in observed.items()}
+
+    def get_sensor_params(self) -> dict[str, dict[str, torch.Tensor]]:
+        visual = any(vars(self.obs_mode_struct.visual).values())
+        cameras = super().get_sensor_params() if visual else {}
+        return cameras | {name: sensor.get_params() for name, sensor in self._tactile_sensors.items()}
+
+    def render_sensors(self):
+        images = [image for sensor in self.get_sensor_images().values() for image in sensor.values()]
+        return tile_images(same_size(images), nrows=2)
+
+    def render_all(self):
+        sensors = self.render_sensors()
+        return torch.cat(same_height([self.render_rgb_array(), sensors]), dim=2)

@@ -1,0 +1,64 @@
+"""Many environments in one process, which need a CUDA GPU."""
+
+import numpy as np
+import pytest
+import torch
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU on this machine"),
+]
+NUM_ENVS = 4
+
+
+@pytest.fixture(scope="module")
+def env(make_env):
+    return make_env(
+        obs_mode="state_dict+tacff",
+        num_envs=NUM_ENVS,
+        sim_backend="physx_cuda",
+        render_backend="none",
+        reward_mode="normalized_dense",
+    )
+
+
+def test_actions_are_batched(env):
+    obs, _ = env.reset(seed=0)
+    before = obs["extra"]["tcp_pose"][:, :3].clone()
+    action = torch.zeros(NUM_ENVS, 6)
+    action[1, 2] = 1.0
+    for _ in range(5):
+        obs, reward, _, _, info = env.step(action)
+    assert reward.shape == info["success"].shape == (NUM_ENVS,)
+    assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (NUM_ENVS, 10, 14, 3)
+    risen = (obs["extra"]["tcp_pose"][:, :3] - before)[:, 2].cpu()
+    assert risen[1] > 0.03
+    assert risen[[0, 2, 3]].abs().max() < 0.002
+
+
+def test_one_action_is_refused_unless_its_shape_is_known(env):
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="the task takes"):
+        env.step(np.zeros((NUM_ENVS + 1, 6)))
+
+
+def test_environments_start_differently_and_repeat_with_their_seed(env):
+    first = env.reset(seed=0)[0]["extra"]["socket_pose"].clone()
+    other = env.reset(seed=1)[0]["extra"]["socket_pose"].clone()
+    again = env.reset(seed=0)[0]["extra"]["socket_pose"]
+    assert len(torch.unique(first[:, 0])) == NUM_ENVS
+    assert not torch.equal(first, other)
+    assert torch.equal(first, again)
+
+
+def test_partial_reset_leaves_the_other_environments_unchanged(env):
+    env.reset(seed=0)
+    action = torch.full((NUM_ENVS, 6), 0.3)
+    for _ in range(5):
+        obs, *_ = env.step(action)
+    before = {name: obs["extra"][name].clone() for name in ("tcp_pose", "plug_pose", "socket_pose")}
+    after, _ = env.reset(options=dict(env_idx=torch.tensor([2])))
+    others = [0, 1, 3]
+    for name, poses in before.items():
+        assert torch.allclose(after["extra"][name][others], poses[others], atol=1e-5), name
+        assert not torch.allclose(after["extra"][name][2], poses[2], atol=1e-3), name
