@@ -24,6 +24,7 @@ from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
+from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from .episode import demonstrate
@@ -120,7 +121,7 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     return dict(
         # "module:id" is gymnasium's way to import what registers an id: ManiSkill's tools then know it, too. What renders is
         # this machine's affair, and not kept
-        env_info=dict(env_id=f"manifeel_ms3:{env_id}", env_kwargs=_without_renderer(env_kwargs), max_episode_steps=limit),
+        env_info=dict(env_id=task_spec(env_id).gym_id, env_kwargs=_without_renderer(env_kwargs), max_episode_steps=limit),
         source_type="scripted",
         source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
         versions=packages,
@@ -175,7 +176,7 @@ def _start_worker(env_id: str, env_kwargs: dict[str, Any], path: Path) -> None:
 @cache
 def worker_env() -> gym.Env:
     """In a worker process: its environment, made when first asked for, so that the one who asks hears what is wrong with it."""
-    return gym.make(worker["env_id"], **worker["env_kwargs"])
+    return make_env(worker["env_id"], **worker["env_kwargs"])
 
 
 def _record_seed(seed: int) -> dict[str, Any] | None:

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import tyro
 from mani_skill.utils import common
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.registry import make_env
 
 from .formats.maniskill_h5 import open_trajectories, read_header
 
@@ -41,7 +40,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     """Replay episodes from their seeds and actions, without pictures."""
     header = read_header(path)
     kwargs = header["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = gym.make(header["env_info"]["env_id"], **kwargs)
+    env = make_env(header["env_info"]["env_id"], **kwargs)
     results = []
     with progress_bar() as bar:
         for info in bar.track(header["episodes"][:num], description="replaying"):

@@ -17,14 +17,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import torch
 import tyro
 from pebble import ProcessExpired, ProcessPool
 
 from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.registry import evaluation_seeds
+from manifeel_ms3.tasks.registry import evaluation_seeds, make_env
 
 from .checkpoint_config import checkpoint_config
 from .policy import PolicySource
@@ -152,7 +151,7 @@ def _run_seed(seed: int, step_timeout: float) -> EpisodeOutcome:
         import manifeel_ms3  # noqa: F401
 
         evaluation = _worker["evaluation"]
-        _worker.update(env=gym.make(evaluation.env_id, **evaluation.env_kwargs), policy=evaluation.source.make())
+        _worker.update(env=make_env(evaluation.env_id, **evaluation.env_kwargs), policy=evaluation.source.make())
     return evaluate_episode(_worker["env"], _worker["policy"], seed, step_timeout=step_timeout)
 
 

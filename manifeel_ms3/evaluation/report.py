@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import gymnasium as gym
 import jinja2
 import numpy as np
 import plotly.graph_objects as go
 import tyro
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import run
+from manifeel_ms3.tasks.registry import make_env
 
 from .policy import load_policy
 from .result import read_result
@@ -70,7 +69,7 @@ def training_curve(log_file: Path) -> str:
 
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     """The task's randomisation in this evaluation: {name: (value, the task's default)}."""
-    env = gym.make(result["env_id"], **result["env_kwargs"] | dict(obs_mode="none", render_backend="none"))
+    env = make_env(result["env_id"], **result["env_kwargs"] | dict(obs_mode="none", render_backend="none"))
     used, default = env.unwrapped.randomization, env.unwrapped.Randomization()
     env.close()
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}

@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import torch
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.sensors.visualisation import pictures_of
+from manifeel_ms3.tasks.registry import make_env
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
@@ -31,7 +30,7 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     """Roll an evaluated episode out again, with every picture."""
     torch.set_num_threads(1)  # as in the evaluation: sums, and with them a rollout, depend on it
     cameras = tuple(dict.fromkeys([*env_kwargs.get("cameras", ()), "wrist", "front"]))
-    env = gym.make(env_id, **env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras))
+    env = make_env(env_id, **env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras))
     frames: list[Frame] = []
 
     def keep(obs: dict[str, Any]) -> None:

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import gymnasium as gym
 import tyro
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.command_line import json_object, run
+from manifeel_ms3.tasks.registry import make_env
 
 from .devices import DEVICES, follow
 from .operator import Operator
@@ -59,7 +58,7 @@ def main(args: Args) -> Path:
     if args.cameras is not None:
         kwargs["cameras"] = list(args.cameras)
     kwargs |= json_object("--env-kwargs", args.env_kwargs)
-    env = gym.make(args.env_id, **kwargs)
+    env = make_env(args.env_id, **kwargs)
     operator = Operator(ACTION_AXES[env.unwrapped.control_mode])
     if args.device:
         follow(DEVICES[args.device](), operator)
