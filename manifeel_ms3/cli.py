@@ -23,7 +23,6 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import PluginError
 from manifeel_ms3.plugins import Command
 
-
 COMMANDS = {
     "tasks": Command("manifeel_ms3.tasks.__main__", "List the tasks, or describe one of them."),
     "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and how to repair what it cannot."),
@@ -89,13 +88,14 @@ def _run(arguments: list[str]) -> Any:
         module = command_module(name)
         return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
     completion = any("-completion" in argument for argument in arguments)
-    forms = [
+    forms: list[Any] = [
         Annotated[
             command_module(name).Args if completion else _NotImported, tyro.conf.subcommand(name, description=command.about)
         ]
         for name, command in commands.items()
     ]
-    tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)  # prints the list, a completion, or an error
+    choice: Any = reduce(or_, forms)
+    tyro.cli(choice, prog="manifeel", args=arguments)  # prints the list, a completion, or an error
     return None
 
 

@@ -1,7 +1,7 @@
 """How a command runs from a shell: its log, its errors and its exit code.
 
-A `ManifeelError` is printed as one line, followed by the path of a page about common problems. Any other exception is a fault of
-the program and keeps its traceback.
+A `ManifeelError` is printed as one line, followed by the path of a page about common problems. Any other exception is a fault
+of the program and keeps its traceback.
 """
 
 import json
