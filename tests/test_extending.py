@@ -1,4 +1,4 @@
-"""The package that docs/extending.md shows is installed as a third party's, and works in real processes with nothing stubbed."""
+"""The package that docs/extending.md shows, installed as a third party's, works in real processes with nothing stubbed."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.conftest import needs_renderer
+from tests.conftest import PEG, needs_renderer
 
 REPOSITORY = Path(__file__).parents[1]
 PAGE = (REPOSITORY / "docs/extending.md").read_text()
@@ -212,7 +212,9 @@ def test_a_command_with_a_name_that_is_taken_or_of_another_kind_is_refused(tmp_p
     assert said in refusal(tmp_path, "tasks")
 
 
-def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(checkpoint, tmp_path):
-    said = refusal(tmp_path, "eval", "--checkpoint", checkpoint, "--env-id", TASK)  # without the page's package
-    assert "its policy is unknown: 'regression' is not registered in manifeel.policies; registered are" in said
+def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
+    config = dict(policy_name="knitting", env_id=PEG, obs_mode="tacff", cameras=[], tactile_sensors=["right"])
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER)
+    assert "its policy is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
     assert "['diffusion_policy', 'equivariant_diffusion_policy', 'flow_matching']" in said
