@@ -1,6 +1,7 @@
 """The commands that do a study's jobs; a job runs with exactly the arguments that are printed here."""
 
 import shlex
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,12 @@ def evaluate_arguments(job: Job, workers: int, checkpoint: str, out: str) -> lis
 
 def training_args(job: Job, root: Path = Path()) -> Any:
     """The `TrainArgs` of a training job, of its policy's own class."""
-    return preset_cli(policy_spec(job.settings["policy"]), train_arguments(job, root))
+    return _parsed(job.settings["policy"], *train_arguments(job, root))
+
+
+@cache
+def _parsed(policy: str, *arguments: str) -> Any:
+    return preset_cli(policy_spec(policy), list(arguments))
 
 
 def shell_command(job: Job, root: Path, workers: int) -> str:
