@@ -2,12 +2,12 @@
 #   docker build -t manifeel . && docker run --rm --gpus all manifeel manifeel doctor
 FROM python:3.11-slim-bookworm
 
-# what opencv and SAPIEN load; the driver's own libraries come from the host, with the toolkit
+# libraries that opencv and SAPIEN load; the driver's own come from the host, through the toolkit
 RUN apt-get update \
  && apt-get install -y --no-install-recommends libvulkan1 libegl1 libgl1 libglib2.0-0 libxext6 \
  && rm -rf /var/lib/apt/lists/*
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics
-# the toolkit mounts the libraries, but not always the files that tell Vulkan and EGL of them
+# the toolkit mounts the libraries, but not always the files through which Vulkan and EGL find them
 RUN mkdir -p /usr/share/vulkan/icd.d /usr/share/glvnd/egl_vendor.d \
  && echo '{"file_format_version": "1.0.0", "ICD": {"library_path": "libGLX_nvidia.so.0", "api_version": "1.3"}}' \
     > /usr/share/vulkan/icd.d/nvidia_icd.json \
@@ -16,4 +16,7 @@ RUN mkdir -p /usr/share/vulkan/icd.d /usr/share/glvnd/egl_vendor.d \
 
 WORKDIR /manifeel
 COPY . .
-RUN pip install --no-cache-dir --no-compile -e ".[train,report,matrix,audit]"
+# torch for CUDA of the version in scripts/setup.sh, then every other package by its hash
+RUN pip install --no-cache-dir --no-compile "$(sed -n 's/^TORCH_VERSION=/torch==/p' scripts/setup.sh)" \
+ && pip install --no-cache-dir --no-compile --no-deps --require-hashes -r requirements.lock \
+ && pip install --no-cache-dir --no-compile --no-deps -e .

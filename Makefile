@@ -1,23 +1,26 @@
-# make demo: from an empty machine to a trained visuotactile policy and its report. make test: the whole test suite.
-# make data: the paper's number of demonstrations of every task, hours of work; it goes on where it was stopped.
-# make benchmark-smoke: the whole benchmark, with two tasks and tiny networks.
-# All install what is missing first, and do again only what is out of date.
+# make setup            Install what the project needs.
+# make demo             Record, train and evaluate one visuotactile policy, and write its report.
+# make data             Record the paper's number of demonstrations of every task: hours; it goes on where it was stopped.
+# make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
+# make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
+# make lock             Pin the newest versions that pyproject.toml allows in requirements.lock.
+# Every target installs first what is missing, and makes again only what is out of date.
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 RUN := runs/demo
 DEMOS := $(RUN)/demos/trajectory.h5
 TASK := ManiFeel-PegInsertion-v1
-# the loose fit, and half ranges that a small network can learn from 120 demonstrations in minutes; the report states them
+# the loose fit, and half ranges that a small network learns from 120 demonstrations in minutes; the report states them
 TASK_ARGS := {"fit": "loose", "randomization": {"socket_xy": 0.01, "start_xy": 0.02, "start_z": 0.02, "start_rotation": 0.05, "in_hand_pitch": 0.09}}
 READY := .venv/.ready
 WORKERS := $(shell nproc)
-# what is imported is compiled once, whatever the shell says: not anew in each of the many processes
+# modules are compiled once, also where the shell forbids it, instead of anew in each of the many processes
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: setup demo data benchmark-smoke test lint types
+.PHONY: setup demo data benchmark-smoke test lint types docs lock
 setup: $(READY)
 
-$(READY): pyproject.toml scripts/setup.sh
+$(READY): pyproject.toml requirements.lock scripts/setup.sh
 	scripts/setup.sh
 	touch $@
 
@@ -51,7 +54,16 @@ test: $(READY)
 	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 12
 
 lint: $(READY)
-	.venv/bin/ruff check . && .venv/bin/ruff format --check .
+	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/lint-imports
 
 types: $(READY)
 	.venv/bin/pyright
+
+docs: $(READY)
+	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
+
+# for Python 3.10 to 3.12; uv is needed for this alone. --upgrade takes newer versions than those pinned before.
+EXTRAS := train report lerobot zarr audit matrix teleop spacemouse gamepad view docs dev
+lock:
+	uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-emit-index-url --no-annotate \
+		--custom-compile-command "make lock" $(EXTRAS:%=--extra %) --quiet --output-file requirements.lock pyproject.toml

@@ -4,9 +4,9 @@
     manifeel train diffusion_policy cpu --demos trajectory.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
-Each command is a module with an `Args` and a `main` that takes it, and can be run by itself (`python -m`). Other packages add
-commands through the entry point group `manifeel.commands`. Only the command that is asked for is imported; a shell's
-completion, though, knows the flags of all.
+Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). Other
+packages add commands through the entry point group `manifeel.commands`. Only the module of the command that is run is imported,
+except for a shell's completion, which needs the flags of all commands.
 """
 
 import sys
@@ -21,21 +21,11 @@ import tyro
 from manifeel_ms3 import plugins
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import PluginError
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command of `manifeel`."""
-
-    module: str
-    """Module with the command's `Args`, a type that tyro can read, and its function `main(args)`."""
-    about: str
-    """What the command does, in a few words, for the list of all commands."""
-
+from manifeel_ms3.plugins import Command
 
 COMMANDS = {
     "tasks": Command("manifeel_ms3.tasks.__main__", "List the tasks, or describe one of them."),
-    "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and say how to mend what it cannot."),
+    "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and how to repair what it cannot."),
     "record": Command("manifeel_ms3.demonstrations.record", "Record a scripted demonstrator."),
     "teleop": Command("manifeel_ms3.teleop.__main__", "Record demonstrations by hand, in a browser."),
     "dataset": Command("manifeel_ms3.demonstrations.dataset", "Record the paper's number of demonstrations of every task."),
@@ -43,23 +33,23 @@ COMMANDS = {
     "render-observations": Command("manifeel_ms3.demonstrations.render_observations", "Add observations to recorded states."),
     "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files."),
     "view": Command("manifeel_ms3.demonstrations.view", "Look at a recorded episode in Rerun."),
-    "summary": Command("manifeel_ms3.demonstrations.summary", "Summarize what a recorded file holds."),
-    "export": Command(
-        "manifeel_ms3.demonstrations.export", "Write demonstrations for LeRobot, as the paper's zarr, or as npz."
-    ),
+    "summary": Command("manifeel_ms3.demonstrations.summary", "Summarize the content of a recorded file."),
+    "export": Command("manifeel_ms3.demonstrations.export", "Export demonstrations to LeRobot, the paper's zarr, or npz."),
     "eval": Command("manifeel_ms3.evaluation.evaluate", "Evaluate a policy on fixed seeds."),
     "report": Command("manifeel_ms3.evaluation.report", "Write a page about one training run."),
     "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's figures."),
     "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on the results at hand."),
     "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Check a submission, or build the leaderboard's page."),
-    "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how near simulated touch is to real touch."),
-    "audit": Command("manifeel_ms3.analysis.information_audit", "Measure what each sense can tell in each task."),
+    "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how similar simulated and real touch are."),
+    "audit": Command(
+        "manifeel_ms3.analysis.information_audit", "Measure how well each sense answers questions about each task."
+    ),
 }
 
 
 @dataclass
 class _NotImported:
-    """A command in the list of all."""
+    """The arguments of a command whose module is not imported, since only its name is listed."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -73,7 +63,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 @cache
 def all_commands() -> dict[str, Command]:
-    """The package's own commands, then those of plug-ins, by their names.
+    """The package's own commands, followed by those of plug-ins, by their names.
 
     Raises:
         PluginError: A plug-in does not import, is not a `Command`, or has the name of one of the package's own commands.
@@ -82,7 +72,7 @@ def all_commands() -> dict[str, Command]:
     for name in plugins.registered(plugins.COMMANDS):
         command = plugins.load(plugins.COMMANDS, name)
         if not isinstance(command, Command):
-            raise PluginError(f"the plug-in command {name!r} is {command!r}; it must be a manifeel_ms3.cli.Command")
+            raise PluginError(f"the plug-in command {name!r} is {command!r}; it must be a manifeel_ms3.plugins.Command")
         if name in COMMANDS:
             raise PluginError(
                 f"the plug-in command {name!r} ({command.module}) has the name of one of manifeel's own; rename it"
@@ -97,12 +87,15 @@ def _run(arguments: list[str]) -> Any:
         name = arguments[0]
         module = command_module(name)
         return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
-    wanted = any("-completion" in argument for argument in arguments)
-    forms = [
-        Annotated[command_module(name).Args if wanted else _NotImported, tyro.conf.subcommand(name, description=command.about)]
+    completion = any("-completion" in argument for argument in arguments)
+    forms: list[Any] = [
+        Annotated[
+            command_module(name).Args if completion else _NotImported, tyro.conf.subcommand(name, description=command.about)
+        ]
         for name, command in commands.items()
     ]
-    tyro.cli(reduce(or_, forms), prog="manifeel", args=arguments)  # prints the list, a completion, or what is wrong
+    choice: Any = reduce(or_, forms)
+    tyro.cli(choice, prog="manifeel", args=arguments)  # prints the list, a completion, or an error
     return None
 
 

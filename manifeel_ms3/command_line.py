@@ -1,7 +1,7 @@
-"""How a command runs from a shell: what it says while it works, and what it says when it cannot.
+"""How a command runs from a shell: its log, its errors and its exit code.
 
-A `ManifeelError` becomes one line and the place where to read more. Any other exception is a fault of the program and keeps
-its traceback.
+A `ManifeelError` is printed as one line, followed by the path of a page about common problems. Any other exception is a fault
+of the program and keeps its traceback.
 """
 
 import json
@@ -19,18 +19,23 @@ from .errors import InvalidArgumentError, ManifeelError, MissingExtraError
 from .paths import troubleshooting
 
 TRACEBACK = "MANIFEEL_TRACEBACK"
-"""Environment variable: if it is not empty, a command shows the traceback of a `ManifeelError`, too."""
+"""Environment variable; if it is not empty, commands also show the traceback of a `ManifeelError`."""
 INTERRUPTED = 130
-"""Exit code of a command that was stopped with Ctrl-C, as shells have it: 128 + SIGINT."""
+"""Exit code of a command that was interrupted with Ctrl-C: 128 + SIGINT, the convention of shells."""
 PACKAGE = "manifeel-ms3"
 DISTRIBUTIONS = {"sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
-"""Names of distributions by their modules, where the two differ."""
+"""Names of distributions by the names of their modules, where the two differ."""
 
 
 def run(main: Callable[[Any], Any], args: Any) -> int:
     """Run `main(args)` and return the exit code.
 
-    The code is 1 where a `ManifeelError` was raised, or where `main` returns a number of faults that is not 0.
+    The code is 1 if `main` raises a `ManifeelError` or returns a number other than 0, such as the number of faults that it
+    found; otherwise it is 0.
+
+    Args:
+        main: Function of the command.
+        args: Its only argument.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
@@ -48,10 +53,10 @@ def run(main: Callable[[Any], Any], args: Any) -> int:
 
 @contextmanager
 def missing_extras_named() -> Iterator[None]:
-    """Turn the failed import of an optional dependency into an error that names the extra which brings it.
+    """Context manager that turns the failed import of an optional dependency into an error that names the extra to install.
 
     Raises:
-        MissingExtraError: A module is imported in the context that an extra of this package would bring.
+        MissingExtraError: The code in the context imports a module that is not installed and that an extra would install.
     """
     try:
         yield
@@ -64,7 +69,7 @@ def missing_extras_named() -> Iterator[None]:
 
 
 def _extra_with(module: str) -> str | None:
-    """The extra of this package that brings a module."""
+    """The extra of this package that installs a module; None if there is none."""
     package = module.partition(".")[0]
     name = DISTRIBUTIONS.get(package, package).replace("_", "-")
     for requirement in map(Requirement, requires(PACKAGE) or []):
@@ -75,7 +80,11 @@ def _extra_with(module: str) -> str | None:
 
 
 def json_object(flag: str, given: str) -> dict[str, Any]:
-    """The value of a flag that is a json object, as keyword arguments.
+    """Parse the value of a flag that must be a json object.
+
+    Args:
+        flag: Name of the flag, for the error.
+        given: Its value.
 
     Raises:
         InvalidArgumentError: The value is not a json object.

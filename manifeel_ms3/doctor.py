@@ -1,6 +1,6 @@
-"""What this machine can do, and how to mend what it cannot: `python -m manifeel_ms3.doctor`.
+"""What this machine can do, and how to repair what it cannot: `manifeel doctor`.
 
-Each check runs in a process of its own, so that one that crashes (a broken driver, say) is a finding like any other.
+A check that could crash (because of a broken driver, say) runs in a process of its own, so that the crash is a finding, too.
 """
 
 import os
@@ -18,45 +18,55 @@ from rich.console import Console
 from rich.table import Table
 
 from .command_line import PACKAGE, run
+from .paths import cache_dir
 
-PYTHONS = ((3, 10), (3, 12))  # tested: the first and the last
-ROOM = 10.0  # GB: what the paper's demonstrations take, with observations
-PATIENCE = 300  # s
-STATE = (
+PYTHONS = ((3, 10), (3, 12))
+"""First and last version of Python that the tests run on."""
+DISK_SPACE = 10.0
+"""Size of the paper's demonstrations with observations, in GB."""
+TIMEOUT = 300
+"""Time after which a check has failed, in s."""
+MAKE_WITHOUT_RENDERER = (
     "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='tacff', render_backend='none')"
 )
-PICTURE = "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='rgb+tacrgb')"
+MAKE_WITH_IMAGES = "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='rgb+tacrgb')"
 STEP = "; env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
 RENDERER = "; from manifeel_ms3.tasks.rendering import available_render_backend as found; print(found())"
 CUDA = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else 'none')"
+RENDERER_REMEDY = (
+    "Without a GPU: install Mesa 24.3 or newer, libvulkan1, libegl1 and libgl1, as scripts/setup.sh does. With a GPU: install "
+    "its driver and libvulkan1. Until then, use obs_mode='state' or 'tacff' with render_backend='none'."
+)
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What a check found. `ok` is None where it is worth knowing and nothing is wrong."""
+    """The outcome of one check."""
 
     what: str
+    """What was checked."""
     ok: bool | None
+    """Whether it is in order; None for a finding that is only information."""
     found: str
+    """What was found."""
     remedy: str = ""
+    """What to do about it; empty if nothing is wrong."""
 
 
 def examine() -> list[Finding]:
-    """All checks."""
-    return [_python(), *_packages(), _gpu(), _simulation(), _pictures(), _disk(), _cache(), _threads()]
+    """The findings of all checks."""
+    return [_python(), *_packages(), _gpu(), _simulation(), _images(), _disk(), _cache(), _threads()]
 
 
 def _python() -> Finding:
-    here = sys.version_info[:2]
-    good = PYTHONS[0] <= here <= PYTHONS[1]
+    good = PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]
     first, last = (".".join(map(str, one)) for one in PYTHONS)
-    return Finding(
-        "Python", good, platform.python_version(), "" if good else f"make an environment with Python {first} to {last}"
-    )
+    remedy = "" if good else f"Create an environment with Python {first} to {last}."
+    return Finding("Python", good, platform.python_version(), remedy)
 
 
 def _packages() -> list[Finding]:
-    """What this package needs, by its own metadata."""
+    """The dependencies of this package that are missing or of another version, according to its metadata."""
     findings = []
     for requirement in map(Requirement, requires(PACKAGE) or []):
         if requirement.marker and not requirement.marker.evaluate({"extra": ""}):
@@ -65,51 +75,41 @@ def _packages() -> list[Finding]:
             found = version(requirement.name)
         except PackageNotFoundError:
             found = "missing"
-        good = found != "missing" and requirement.specifier.contains(found, prereleases=True)
-        if not good:
+        if found == "missing" or not requirement.specifier.contains(found, prereleases=True):
             findings.append(Finding(requirement.name, False, found, f"pip install '{requirement.name}{requirement.specifier}'"))
-    return findings or [Finding("packages", True, f"{PACKAGE} {version(PACKAGE)}, and all that it needs")]
+    return findings or [Finding("packages", True, f"{PACKAGE} {version(PACKAGE)} and all of its dependencies")]
 
 
 def _gpu() -> Finding:
-    found = _run(CUDA)
-    name = found.out or "none"
+    name = _run(CUDA).out or "none"
     if name != "none":
         return Finding("GPU", True, name)
     if shutil.which("nvidia-smi") is None:
-        return Finding("GPU", None, "none: everything runs on the CPU")
-    return Finding("GPU", False, "there is one, torch does not see it", "install a torch for CUDA: https://pytorch.org")
+        return Finding("GPU", None, "none; everything runs on the CPU")
+    return Finding("GPU", False, "torch does not find the GPU", "Install a torch for CUDA: https://pytorch.org")
 
 
 def _simulation() -> Finding:
-    found = _run(STATE + STEP)
-    return Finding(
-        "a step with touch", found.worked, "works" if found.worked else found.reason, "" if found.worked else "see above"
-    )
+    ran = _run(MAKE_WITHOUT_RENDERER + STEP)
+    if ran.worked:
+        return Finding("a step with touch", True, "works")
+    return Finding("a step with touch", False, ran.reason, "Repair the packages that are listed above.")
 
 
-def _pictures() -> Finding:
-    found = _run(PICTURE + STEP + RENDERER)
-    if found.worked:
-        return Finding("a step with pictures", True, f"works, with Vulkan on the {found.out.upper()}")
-    remedy = (
-        "without a GPU: Mesa 24.3 or newer, libvulkan1, libegl1, libgl1 (scripts/setup.sh installs them); with one: its driver "
-        "and libvulkan1. Until then: obs_mode='state' or 'tacff' with render_backend='none'"
-    )
-    return Finding("a step with pictures", False, found.reason.partition(". ")[0], remedy)
+def _images() -> Finding:
+    ran = _run(MAKE_WITH_IMAGES + STEP + RENDERER)
+    if ran.worked:
+        return Finding("a step with images", True, f"works, with Vulkan on the {ran.out.upper()}")
+    return Finding("a step with images", False, ran.reason.partition(". ")[0], RENDERER_REMEDY)
 
 
 def _disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free / 1e9
-    remedy = (
-        "" if free > ROOM else f"the paper's demonstrations with observations take {ROOM:.0f} GB: go to a folder with more room"
-    )
-    return Finding("disk, here", free > ROOM, f"{free:.0f} GB free", remedy)
+    remedy = f"The paper's demonstrations with observations take {DISK_SPACE:.0f} GB; use a folder on a larger disk."
+    return Finding("disk, here", free > DISK_SPACE, f"{free:.0f} GB free", "" if free > DISK_SPACE else remedy)
 
 
 def _cache() -> Finding:
-    from .paths import cache_dir
-
     folder = cache_dir()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -117,38 +117,43 @@ def _cache() -> Finding:
         probe.write_text("")
         probe.unlink()
     except OSError as error:
-        return Finding("cache", False, f"{folder}: {error}", "set MANIFEEL_CACHE_DIR to a folder that can be written")
+        remedy = "Set the environment variable MANIFEEL_CACHE_DIR to a folder that can be written."
+        return Finding("cache", False, f"{folder}: {error}", remedy)
     return Finding("cache", True, str(folder))
 
 
 def _threads() -> Finding:
-    cores, asked = os.cpu_count() or 1, os.environ.get("OMP_NUM_THREADS")
-    return Finding("cores", None, f"{cores}, OMP_NUM_THREADS {asked or 'not set'}")
+    return Finding("cores", None, f"{os.cpu_count() or 1}, OMP_NUM_THREADS {os.environ.get('OMP_NUM_THREADS') or 'not set'}")
 
 
 @dataclass(frozen=True)
 class _Ran:
+    """How a program ended."""
+
     worked: bool
     out: str
-    """last line"""
+    """Last line of its output."""
     reason: str
+    """Why it did not work."""
 
 
 def _run(code: str) -> _Ran:
-    told = f"try: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
+    """Run a program in a process of its own."""
+    program = f"try: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
     try:
-        done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, timeout=PATIENCE, check=False)
+        done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except subprocess.TimeoutExpired:
-        return _Ran(False, "", f"no answer within {PATIENCE} s")
-    last = (done.stdout.strip().splitlines() or [""])[-1]
-    said = (done.stderr.strip().splitlines() or [""])[-1]
-    reason = f"crashed (signal {-done.returncode})" if done.returncode < 0 else said
-    return _Ran(done.returncode == 0, last if done.returncode == 0 else "", reason)
+        return _Ran(False, "", f"no answer within {TIMEOUT} s")
+    out = (done.stdout.strip().splitlines() or [""])[-1]
+    error = (done.stderr.strip().splitlines() or [""])[-1]
+    reason = f"crashed (signal {-done.returncode})" if done.returncode < 0 else error
+    return _Ran(done.returncode == 0, out if done.returncode == 0 else "", reason)
 
 
 def table(findings: list[Finding]) -> Table:
+    """The findings as a table."""
     marks = {True: "[green]ok[/]", False: "[red]wrong[/]", None: ""}
-    out = Table("", "what", "found", "how to mend it")
+    out = Table("", "what", "found", "how to repair it")
     for finding in findings:
         out.add_row(marks[finding.ok], finding.what, finding.found, finding.remedy)
     return out
@@ -156,11 +161,11 @@ def table(findings: list[Finding]) -> Table:
 
 @dataclass
 class Args:
-    """It takes none."""
+    """`manifeel doctor` takes no arguments."""
 
 
 def main(_args: Args) -> int:
-    """Print all findings; returns how many are wrong."""
+    """Print all findings, and return the number of those that are wrong."""
     findings = examine()
     Console().print(table(findings))
     return sum(finding.ok is False for finding in findings)

@@ -8,6 +8,7 @@ A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows
 Only what an installed package registers is ever imported: never a module that a file or a checkpoint names.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
@@ -19,7 +20,17 @@ TASKS = "manifeel.tasks"
 POLICIES = "manifeel.policies"
 """Objects with a method `load(checkpoint, **kwargs)` that returns a `manifeel_ms3.evaluation.Policy`."""
 COMMANDS = "manifeel.commands"
-"""`manifeel_ms3.cli.Command` objects."""
+"""`Command` objects."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of `manifeel`."""
+
+    module: str
+    """Module with the command's `Args`, a type that tyro can parse, and its function `main(args)`."""
+    about: str
+    """What the command does, in a few words, for the list of all commands."""
 
 
 @cache
@@ -27,7 +38,7 @@ def registered(group: str) -> dict[str, EntryPoint]:
     """The entry points of a group by their names, in alphabetical order.
 
     Raises:
-        PluginError: two packages register different objects under one name.
+        PluginError: Two packages register different objects under one name.
     """
     found: dict[str, EntryPoint] = {}
     for point in sorted(entry_points(group=group), key=lambda point: point.name):
@@ -45,8 +56,8 @@ def load(group: str, name: str) -> Any:
     """The object that a plug-in registers.
 
     Raises:
-        UnknownNameError: no plug-in of this name is registered.
-        PluginError: the plug-in does not import.
+        UnknownNameError: No plug-in of this name is registered.
+        PluginError: The plug-in does not import.
     """
     points = registered(group)
     if name not in points:
@@ -55,8 +66,8 @@ def load(group: str, name: str) -> Any:
         return points[name].load()
     except Exception as error:  # a plug-in is anybody's code
         raise PluginError(
-            f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); mend or "
-            f"uninstall it. Registered in {group} are {list(points)}"
+            f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); repair "
+            f"or uninstall it. Registered in {group} are {list(points)}"
         ) from error
 
 

@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
-# Installs what the project needs on Debian 12 or Ubuntu 22.04/24.04: Vulkan libraries, a virtual environment in .venv, the
-# package with its extras. Safe to run again. Without root it says what is missing and goes on: what needs no picture works.
+# Installs what the project needs on Debian 12 or Ubuntu 22.04/24.04: Vulkan libraries, a virtual environment in .venv
+# with the versions of requirements.lock, and the package itself. It can be run again at any time. Without root it says what
+# is missing and goes on: whatever needs no rendered image works.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-TORCH_CPU_VERSION=2.13.0
+TORCH_VERSION=2.13.0
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
-WITHOUT_PICTURES="only what needs no picture works: obs_mode='state' or 'tacff' with render_backend='none'."
+WITHOUT_PICTURES="only what needs no rendered image works: obs_mode='state' or 'tacff' with render_backend='none'."
 
 LAVAPIPE=/usr/local/lib/mesa-lavapipe
 LAVAPIPE_SHA256=3899f1800424c60a05df5d6913076a526ca8fdbabec43672cd397563d1ca3263
@@ -18,7 +19,9 @@ LAVAPIPE_URLS=(
 
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
-has_library() { ldconfig -p | grep -q "$1"; } # packages have other names from release to release
+# asks for the library, since the package that holds it has another name from release to release; no pipe into `grep -q`,
+# which ends early and so makes `ldconfig` fail, and with it, under pipefail, the question
+has_library() { [[ $(ldconfig -p) == *"$1"* ]]; }
 
 has_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
@@ -93,19 +96,31 @@ install_system_packages() {
   fi
 }
 
+# Every package but torch has the version and the hash of requirements.lock. torch is installed before: its builds for the
+# CPU and for CUDA are different files, so that one lock with hashes cannot name both.
 install_python_packages() {
   [ -x .venv/bin/python ] || python3 -m venv .venv
-  # nothing is compiled ahead: what is imported is compiled then, and most of it never is
+  # nothing is compiled ahead: a module is compiled when it is first imported, and most of them never are
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
-  if ! has_gpu && ! .venv/bin/python -c 'import torch' 2>/dev/null; then
-    say "Installing torch for the CPU"
-    "${pip[@]}" "torch==$TORCH_CPU_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" torch ||
-      say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead"
+  if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
+    say "Installing torch"
+    if has_gpu; then
+      "${pip[@]}" "torch==$TORCH_VERSION"
+    else
+      "${pip[@]}" "torch==$TORCH_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" "torch==$TORCH_VERSION" ||
+        { say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead" && "${pip[@]}" "torch==$TORCH_VERSION"; }
+    fi
   fi
-  say "Installing the package and its extras"
-  "${pip[@]}" -e ".[train,report,lerobot,zarr,audit,matrix,teleop,spacemouse,gamepad,view,docs,dev]"
+  say "Installing the packages of requirements.lock"
+  "${pip[@]}" --no-deps --require-hashes -r requirements.lock
+  "${pip[@]}" --no-deps -e .
   # without libGL the opencv that mani-skill brings does not import; the headless one does
-  .venv/bin/python -c 'import cv2' 2>/dev/null || "${pip[@]}" --force-reinstall --no-deps opencv-python-headless
+  .venv/bin/python -c 'import cv2' 2>/dev/null ||
+    "${pip[@]}" --force-reinstall --no-deps --require-hashes -r <(locked opencv-python-headless)
+}
+
+locked() { # the lines of requirements.lock that pin a package
+  awk -v name="$1" '/^[^ ]/ {found = index($0, name "==") == 1} found' requirements.lock
 }
 
 install_system_packages

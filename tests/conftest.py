@@ -12,15 +12,19 @@ from manifeel_ms3.tasks.rendering import available_render_backend
 
 torch.set_num_threads(1)
 PEG = "ManiFeel-PegInsertion-v1"
-LONG = ("test_matrix", "test_end_to_end", "test_doctor", "test_page")  # few tests of minutes each
+LONG = ("test_studies", "test_extending", "test_end_to_end", "test_doctor", "test_page")  # few tests of minutes each
 needs_renderer = pytest.mark.skipif(
     available_render_backend() == "none" and not os.environ.get("CI"), reason="no Vulkan renderer on this machine"
 )
 
 
 def pytest_collection_modifyitems(items):
-    """Long files first, so that at the end no process waits for one."""
+    """Long files first, so that at the end no process waits for one; tests marked `gpu` are skipped where there is none."""
     items.sort(key=lambda item: item.path.stem not in LONG)
+    if not torch.cuda.is_available():
+        for item in items:
+            if item.get_closest_marker("gpu"):
+                item.add_marker(pytest.mark.skip(reason="needs a CUDA GPU"))
 
 
 @pytest.fixture(scope="module")

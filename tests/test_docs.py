@@ -20,8 +20,8 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
-from tests.baselines.test_studies import TINY
 from tests.conftest import PEG, needs_renderer
+from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[1]
 PAGES = [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *(REPOSITORY / "baselines").rglob("README.md")]
@@ -76,14 +76,14 @@ def test_the_site_builds_without_a_warning(tmp_path):
 SMALLER = {  # what follows a command, by its name or module: of a flag the last counts, and what takes hours takes seconds
     "record": "-n 1 --cameras wrist --tactile-sensors right",
     "dataset": "--num 10 --tasks ManiFeel-BallSorting-v1 --cameras front --tactile-sensors right --image-size 64",
-    "materialize": "--num 1 --image-size 64",
+    "render-observations": "--num 1 --image-size 64",
     "replay": "--num 1",
     "teleop": "--port 8137",
     "view": "--save peg.rrd",
     "train": "--steps 2 --batch-size 2 --image-size 64 --policy.encoder.image small_cnn --policy.encoder.crop 0 "
     "--policy.down-dims 16 32 --device cpu --precision fp32 --no-compile",
     "eval": "--episodes 2 --workers 1 --env-kwargs '{\"max_episode_steps\": 5}'",
-    "matrix": "--address local",
+    "study": "--address local",
     "similarity": "--features tests.analysis.test_sim_real_similarity:brightness --resamples 5",
     "baselines.tactile_representations.pretrain": "--steps 1 --batch-size 2 --image-size 64",
     "mani_skill.trajectory.replay_trajectory": "--count 1",

@@ -17,7 +17,7 @@ def test_a_machine_that_is_in_order():
     assert {finding.what for finding in findings} >= {
         "Python",
         "packages",
-        "a step with pictures",
+        "a step with images",
         "a step with touch",
         "disk, here",
     }
@@ -31,8 +31,8 @@ def test_a_machine_without_a_renderer():
     done = subprocess.run(command, env=environment | dict(COLUMNS="200"), capture_output=True, text=True, check=False)
     assert done.returncode == 1
     lines = {line.split("│")[2].strip(): line for line in done.stdout.splitlines() if line.count("│") == 5}
-    assert "wrong" in lines["a step with pictures"]
-    assert "RuntimeError: " in lines["a step with pictures"]
+    assert "wrong" in lines["a step with images"]
+    assert "Error: " in lines["a step with images"]
     assert "Mesa 24.3" in done.stdout
     assert "ok" in lines["a step with touch"]  # which needs no picture
 

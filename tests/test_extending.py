@@ -1,48 +1,146 @@
-"""What docs/extending.md shows works."""
+"""The package that docs/extending.md shows, installed as a third party's, works in real processes with nothing stubbed."""
 
+import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
-from baselines.common.observation import POSE, observation_spec
-from baselines.common.policy import PolicyConfig
+from tests.conftest import PEG, needs_renderer
 
-PAGE = (Path(__file__).parents[1] / "docs/extending.md").read_text()
-SPEC = observation_spec("tacrgb+tacff", (), ("right",), 32)
-
-
-@pytest.fixture
-def example(monkeypatch):
-    """The definitions of a named block; tables that it adds to are put back."""
-    monkeypatch.setattr("baselines.common.encoders.TACRGB_ENCODERS", dict(TACRGB_ENCODERS))
-
-    def run(name: str) -> dict:
-        (code,) = re.findall(rf"```python\n# {name}\n(.*?)```", PAGE, flags=re.DOTALL)
-        scope: dict = {}
-        exec(code, scope)
-        return scope
-
-    return run
+REPOSITORY = Path(__file__).parents[1]
+PAGE = (REPOSITORY / "docs/extending.md").read_text()
+TASK = "My-LiftBlock-v1"
+NO_RENDERER = json.dumps(dict(render_backend="none"))
+SHORT = json.dumps(dict(render_backend="none", max_episode_steps=3))
+STUDY = f"""
+grids:
+  - {{tasks: [{TASK}], obs_modes: [rgb+tacff], policies: [regression], seeds: [0], preset: cpu, episodes: 2, checkpoints: 1}}
+"""
 
 
-def observation() -> dict[str, torch.Tensor]:
-    return {
-        POSE: torch.rand(3, 2, 9),
-        SPEC.images[0]: torch.randint(0, 255, (3, 2, 32, 32, 3), dtype=torch.uint8),
-        SPEC.force_fields[0]: torch.rand(3, 2, 10, 14, 3),
-    }
+def install(site: Path, *, name: str = "my_package", files: dict[str, str] | None = None, entry_points: str = "") -> None:
+    """What `pip install` leaves behind: the package's modules and a dist-info folder with its entry points."""
+    for path, code in (files or {}).items():
+        (site / path).parent.mkdir(parents=True, exist_ok=True)
+        (site / path).write_text(code)
+    about = site / f"{name}-0.1.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+    (about / "entry_points.txt").write_text(entry_points)
 
 
-def test_an_encoder_and_a_policy_of_ones_own(example):
-    example("encoder")
-    encoder = EncoderConfig(tacrgb="flat", force_field="small")
-    policy = example("policy")["RegressionPolicy"](PolicyConfig(encoder=encoder, down_dims=(32, 64)), SPEC, 6)
+def manifeel(site: Path, *arguments: object) -> subprocess.CompletedProcess:
+    """Run a command in a process that finds what is installed at `site`."""
+    environment = os.environ | dict(PYTHONPATH=f"{site}:{REPOSITORY}", OMP_NUM_THREADS="1", COLUMNS="200")
+    command = [sys.executable, "-m", "manifeel_ms3.cli", *map(str, arguments)]
+    return subprocess.run(command, cwd=site, env=environment, capture_output=True, text=True, check=False)
+
+
+def done(site: Path, *arguments: object) -> str:
+    """The output of a command that must succeed."""
+    ran = manifeel(site, *arguments)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return ran.stdout
+
+
+def refusal(site: Path, *arguments: object) -> str:
+    """The only line with which a command refuses, after "error: "."""
+    ran = manifeel(site, *arguments)
+    assert ran.returncode == 1, ran.stdout + ran.stderr
+    assert "Traceback" not in ran.stderr
+    (line,) = [line for line in ran.stderr.splitlines() if line.startswith("error: ")]
+    return line
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """A folder on the path with the page's package."""
+    site = tmp_path_factory.mktemp("site")
+    files = dict(re.findall(r"```python\n# (my_package/\w+\.py)\n(.*?)```", PAGE, flags=re.DOTALL))
+    assert set(files) == {f"my_package/{name}.py" for name in ("lift_block", "encoders", "regression", "count")}
+    (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", PAGE, flags=re.DOTALL)
+    entry_points = re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', "")
+    install(site, files=files | {"my_package/__init__.py": ""}, entry_points=entry_points)
+    return site
+
+
+@pytest.fixture(scope="module")
+def demos(site) -> Path:
+    """Two demonstrations of the page's task."""
+    path = site / "lift.h5"
+    sensing = ["--obs-mode", "tacrgb+tacff", "--tactile-sensors", "right", "--env-kwargs", NO_RENDERER]
+    done(site, "record", TASK, "-n", 2, "--workers", 1, *sensing, "--out", path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint(site, demos) -> Path:
+    """The page's policy with the page's encoder, trained for four steps."""
+    flags = ["--demos", demos, "--env-id", TASK, "--obs-mode", "tacrgb+tacff", "--run-dir", site / "run"]
+    flags += ["--steps", 4, "--batch-size", 2, "--policy.encoder.tacrgb", "flat"]
+    done(site, "train", "regression", "cpu", *flags)
+    return site / "run/checkpoints/last"
+
+
+def test_a_task_is_listed_and_recorded(site, demos):
+    assert "My-LiftBlock" in done(site, "tasks")
+    assert "lifts it by 30 mm" in done(site, "tasks", TASK)
+    header = json.loads(demos.with_suffix(".json").read_text())
+    assert header["env_info"]["env_id"] == f"my_package.lift_block:{TASK}"
+    assert [episode["success"] for episode in header["episodes"]] == [True, True]
+    done(site, "replay", demos)
+
+
+def test_a_command_runs(site, demos):
+    assert "Count the episodes" in done(site, "--help")
+    assert done(site, "count", demos).strip() == "2 episodes"
+
+
+def test_a_policy_is_trained_and_evaluated_and_its_result_is_taken(site, checkpoint):
+    config = json.loads((checkpoint / "config.json").read_text())
+    assert (config["policy_name"], config["policy"]["encoder"]["tacrgb"]) == ("regression", "flat")
+    folder = site / "submission"
+    done(site, "eval", "--checkpoint", checkpoint, "--episodes", 50, "--env-kwargs", SHORT, "--out", folder / "00000004.json")
+    result = json.loads((folder / "00000004.json").read_text())
+    assert (result["env_id"], result["policy"], result["revision"]) == (TASK, "regression", 1)
+    assert [episode["error"] for episode in result["episodes"]] == [None] * 50
+    (folder / "submission.json").write_text(json.dumps(dict(name="Regression", authors="A page")))
+    done(site, "leaderboard", "submit", folder, "--checkpoint", checkpoint, "--rerun", 1, "--check-only")
+
+
+@needs_renderer
+def test_a_study_plans_a_task_and_a_policy(site):
+    (site / "study.yaml").write_text(STUDY)
+    table = done(site, "study", "study.yaml", "--dry-run")
+    assert "LiftBlock, regression, rgb+tacff, wrist" in table
+    assert "all jobs that are left" in table
+    assert f"manifeel record {TASK} --num 10" in done(site, "study", "study.yaml", "--print-commands")
+
+
+def test_a_policy_learns(site, monkeypatch):
+    monkeypatch.syspath_prepend(site)
+    from baselines.common import encoders
+    from baselines.common.observation import POSE, observation_spec
+    from baselines.common.policy import PolicyConfig
+
+    monkeypatch.setattr(encoders, "TACRGB_ENCODERS", dict(encoders.TACRGB_ENCODERS))  # put back what the page adds
+    from my_package.regression import RegressionPolicy  # pyright: ignore[reportMissingImports]
+
+    spec = observation_spec("tacrgb+tacff", (), ("right",), 32)
+    encoder = encoders.EncoderConfig(tacrgb="flat", force_field="small")
+    policy = RegressionPolicy(PolicyConfig(encoder=encoder, down_dims=(32, 64)), spec, 6)
     optimizer = torch.optim.Adam(policy.parameters(), 3e-3)
-    obs, actions = observation(), torch.rand(3, 16, 6) * 2 - 1
-    losses = []
+    obs = {
+        POSE: torch.rand(3, 2, 9),
+        spec.images[0]: torch.randint(0, 255, (3, 2, 32, 32, 3), dtype=torch.uint8),
+        spec.force_fields[0]: torch.rand(3, 2, 10, 14, 3),
+    }
+    actions, losses = torch.rand(3, 16, 6) * 2 - 1, []
     for _ in range(60):
         loss = policy(obs, actions)
         optimizer.zero_grad()
@@ -51,3 +149,72 @@ def test_an_encoder_and_a_policy_of_ones_own(example):
         losses.append(loss.item())
     assert losses[-1] < 0.1 * losses[0]
     assert policy.sample(obs, 1, torch.Generator()).shape == (3, 8, 6)
+
+
+# -------------------------------------------------------------------- bad plug-ins
+
+
+def test_a_task_plugin_that_does_not_import_is_named_and_others_work(tmp_path):
+    install(tmp_path, files={"broken.py": "import no_such_library"}, entry_points="[manifeel.tasks]\nbroken = broken\n")
+    ran = manifeel(tmp_path, "tasks")
+    assert ran.returncode == 0
+    assert "the plug-in 'broken' of broken (my_package) cannot be loaded" in ran.stderr
+    said = refusal(tmp_path, "tasks", "Knitting")
+    assert "'Knitting' is not registered; registered are ['ManiFeel-PegInsertion-v1'" in said
+    assert said.endswith("(1 plug-ins do not import: broken)")
+
+
+def test_a_policy_or_a_command_that_does_not_import_is_one_line(tmp_path):
+    broken = {"broken.py": "raise KeyError('what')"}
+    install(tmp_path / "policy", files=broken, entry_points="[manifeel.policies]\nbroken = broken:SPEC\n")
+    said = refusal(tmp_path / "policy", "train", "broken")
+    assert "the plug-in 'broken' of broken:SPEC (my_package) cannot be loaded (KeyError: 'what')" in said
+    assert "Registered in manifeel.policies are ['broken', 'diffusion_policy'" in said
+    install(tmp_path / "command", files=broken, entry_points="[manifeel.commands]\nbroken = broken:COMMAND\n")
+    said = refusal(tmp_path / "command", "tasks")
+    assert "the plug-in 'broken' of broken:COMMAND (my_package) cannot be loaded" in said
+    assert "Registered in manifeel.commands are ['broken', 'study', 'train']" in said
+
+
+def test_a_task_that_is_registered_twice_is_refused(tmp_path):
+    again = (
+        "from manifeel_ms3.tasks import PegInsertionEnv\n"
+        "from manifeel_ms3.tasks.registry import register_task\n"
+        "@register_task('ManiFeel-PegInsertion-v1', max_episode_steps=5, category='insertion', paper_demos=1)\n"
+        "class Other(PegInsertionEnv): ...\n"
+    )
+    install(tmp_path, files={"again.py": again}, entry_points="[manifeel.tasks]\nagain = again\n")
+    ran = manifeel(tmp_path, "tasks")
+    assert "the task 'ManiFeel-PegInsertion-v1' is registered twice, by manifeel_ms3" in ran.stderr
+    assert "and by again.Other; give one of them another id" in ran.stderr
+
+
+def test_two_packages_with_one_name_are_refused(tmp_path):
+    for name in ("first", "second"):
+        code = {f"{name}.py": "from manifeel_ms3.plugins import Command\nCOMMAND = Command('json', 'About')"}
+        install(tmp_path, name=name, files=code, entry_points=f"[manifeel.commands]\nsing = {name}:COMMAND\n")
+    said = refusal(tmp_path, "tasks")
+    assert "manifeel.commands: 'sing' is registered twice" in said
+    assert "first:COMMAND (first)" in said
+    assert "second:COMMAND (second)" in said
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("Command('json', 'About')", "the plug-in command 'record' (json) has the name of one of manifeel's own; rename it"),
+        ("3", "the plug-in command 'record' is 3; it must be a manifeel_ms3.plugins.Command"),
+    ],
+)
+def test_a_command_with_a_name_that_is_taken_or_of_another_kind_is_refused(tmp_path, command, said):
+    code = {"mine.py": f"from manifeel_ms3.plugins import Command\nCOMMAND = {command}"}
+    install(tmp_path, files=code, entry_points="[manifeel.commands]\nrecord = mine:COMMAND\n")
+    assert said in refusal(tmp_path, "tasks")
+
+
+def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
+    config = dict(policy_name="knitting", env_id=PEG, obs_mode="tacff", cameras=[], tactile_sensors=["right"])
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER)
+    assert "its policy is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
+    assert "['diffusion_policy', 'equivariant_diffusion_policy', 'flow_matching']" in said

@@ -9,7 +9,14 @@ import pytest
 from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.ownership import owned
 
-HOLD = "import sys, time; from manifeel_ms3.ownership import owned\nwith owned(sys.argv[1]): print('held', flush=True); time.sleep(60)"
+HOLD = """
+import sys, time
+from manifeel_ms3.ownership import owned
+
+with owned(sys.argv[1]):
+    print("held", flush=True)
+    time.sleep(60)
+"""
 PATIENCE = 60  # s
 
 

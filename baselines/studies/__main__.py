@@ -1,8 +1,9 @@
-"""Run a study: `python -m baselines.studies configs/smoke.yaml`.
+"""Run a study: `manifeel study configs/smoke.yaml`.
 
-Records demonstrations, trains policies on them and evaluates these, for every combination that the study lists, on Ray: on this
-machine, or with --address on a cluster whose machines share the folder. What is done is kept under a name made of all that it
-depends on, and never done twice; a worker that dies is started again; a study that was stopped goes on.
+A study records demonstrations, trains policies on them and evaluates these policies, for every combination that its file
+lists. It runs on Ray: on this machine, or with `--address` on a cluster whose machines share the folder. Each job's output is
+kept in a folder that is named by everything the job depends on, and no job is done twice. A worker that dies is started
+again, and a study that was stopped goes on where it stopped.
 """
 
 import logging
@@ -11,6 +12,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import ray
 import tyro
@@ -20,128 +22,151 @@ from rich.progress import track
 from rich.table import Table
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import MachineError, WorkFailedError
 
 from . import cost
-from .jobs import FAILED, STARTED, is_done, is_running, listen_to_children, perform, read_note
-from .study import KINDS, Stage, Study, StudyError, read_study, stages_of
+from .command_lines import shell_command
+from .jobs import FAILED, STARTED, is_done, is_running, perform, read_status, restore_child_signals
+from .study import KINDS, Job, Kind, Study, jobs_of, read_study
 
 log = logging.getLogger(__name__)
 RETRIES = 3
-SHOWN = 8  # running stages in the table
-RAY_SETTINGS = {  # read by a Ray that is started here
+"""How often Ray starts a job again whose worker has died."""
+SHOWN = 8
+"""Number of running jobs in the table."""
+POLL_SECONDS = 2
+"""Time between two updates of the table, in s."""
+RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
-    "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # a killed worker's own processes go with it
+    "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
 }
+"""Environment variables of a Ray that is started here."""
 
 
 @dataclass
 class Args:
+    """Arguments of `manifeel study`."""
+
     study: tyro.conf.Positional[Path]
-    """yaml; see configs/"""
-    root: Path = Path("runs/matrix")
-    """folder of all stages, of all studies"""
+    """Path of the study's file in yaml; `configs/` has examples."""
+    root: Path = Path("runs/study")
+    """Folder of the output of all jobs. Studies can share it: a job that two studies have in common is done once."""
     address: str | None = None
-    """of a Ray cluster; default: this machine"""
+    """Address of a Ray cluster; this machine if not given."""
     dry_run: bool = False
-    """print the plan and what it will cost"""
+    """Print the plan and the hours that it will take, without running it."""
+    print_commands: bool = False
+    """Print the shell commands that do the same by hand, one line for each job, without running them."""
 
 
-class StudyFailed(RuntimeError):
-    """Some stages did not succeed."""
+class StudyFailed(WorkFailedError):  # noqa: N818 (a state of the study, as its jobs' failed.json)
+    """Some jobs of a study did not succeed."""
 
 
 def main(args: Args) -> None:
     """Run a study.
 
     Raises:
-        StudyError: the study's file cannot be used, or asks for more than the machine has.
-        StudyFailed: stages failed; the others are done.
+        StudyError: The study's file cannot be used.
+        MachineError: The study asks for more than the machine has.
+        StudyFailed: Some jobs failed; the others are done.
     """
     study = read_study(args.study)
-    stages = stages_of(study)
+    jobs = jobs_of(study)
     console = Console()
-    if args.dry_run:
-        console.print(plan(study, stages, args.root))
+    if args.print_commands:
+        for job in jobs:
+            line = shell_command(job, args.root, study.resources[job.kind].workers)
+            console.print(f"# {job.kind}: {job.title}\n{line}", soft_wrap=True, markup=False, highlight=False)
         return
-    open_stages = [stage for stage in stages if not is_done(stage, args.root)]
-    if open_stages:
-        _run(study, stages, args.root.absolute(), args.address, console)
-    failed = [stage for stage in stages if not is_done(stage, args.root)]
-    console.print(f"{len(stages) - len(failed)} of {len(stages)} stages of {args.study} are done, in {args.root}")
+    if args.dry_run:
+        console.print(plan(study, jobs, args.root))
+        return
+    if not all(is_done(job, args.root) for job in jobs):
+        _run(study, jobs, args.root.absolute(), args.address, console)
+    failed = [job for job in jobs if not is_done(job, args.root)]
+    console.print(f"{len(jobs) - len(failed)} of {len(jobs)} jobs of {args.study} are done, in {args.root}")
     if failed:
-        reasons = "\n".join(f"  {stage.kind}: {stage.title}: {_reason(stage, args.root)}" for stage in failed)
-        raise StudyFailed(f"{len(failed)} stages are not done; give the same command to try them again:\n{reasons}")
+        reasons = "\n".join(f"  {job.kind}: {job.title}: {_reason(job, args.root)}" for job in failed)
+        raise StudyFailed(f"{len(failed)} jobs are not done; give the same command to try them again:\n{reasons}")
 
 
-def _run(study: Study, stages: list[Stage], root: Path, address: str | None, console: Console) -> None:
+def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console: Console) -> None:
+    """Give every job to Ray, and show the progress until none is left."""
     for name, value in RAY_SETTINGS.items():
         os.environ.setdefault(name, value)
     ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False)
-    listen_to_children()
+    restore_child_signals()
     try:
-        worker = ray.remote(max_calls=1, max_retries=RETRIES)(perform)  # a process of its own for each
+        worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform)  # a new process for each job
         _require_resources(study)
         results = {}
-        for stage in stages:
-            needs = study.resources[stage.kind]
-            task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=stage.title)
-            results[stage.key] = task.remote(stage, root, needs.workers, *(results[need.key] for need in stage.needs))
+        for job in jobs:
+            needs = study.resources[job.kind]
+            task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
+            results[job.key] = task.remote(job, root, needs.workers, *(results[need.key] for need in job.needs))
         waiting = list(results.values())
         with Live(console=console, refresh_per_second=1) as live:
             while waiting:
-                _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=2, fetch_local=False)
-                live.update(progress(study, stages, root))
+                _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=POLL_SECONDS, fetch_local=False)
+                live.update(progress(study, jobs, root))
     finally:
         ray.shutdown()
 
 
 def _require_resources(study: Study) -> None:
-    there = ray.cluster_resources()
+    available = ray.cluster_resources()
     for kind, needs in study.resources.items():
         for name, wanted in (("CPU", needs.cpus), ("GPU", needs.gpus)):
-            if wanted > there.get(name, 0):
-                raise StudyError(
-                    f"{study.name}: {kind} needs {wanted:g} {name}s, there are {there.get(name, 0):g}; change `resources`, or "
-                    "give the --address of a Ray cluster"
+            if wanted > available.get(name, 0):
+                raise MachineError(
+                    f"{study.name}: {kind} needs {wanted:g} {name}s, and {available.get(name, 0):g} are available; change "
+                    "`resources` in the study's file, or give the --address of a Ray cluster"
                 )
 
 
-def _reason(stage: Stage, root: Path) -> str:
-    if (folder := stage.folder(root) / FAILED).is_file():
-        return f"{read_note(folder)['error']} ({folder} has it all)"
-    return "its worker died" if (stage.folder(root) / STARTED).is_file() else "what it needs is not done"
+def _reason(job: Job, root: Path) -> str:
+    """Why a job is not done."""
+    if (path := job.folder(root) / FAILED).is_file():
+        return f"{read_status(path)['error']} ({path} has the traceback)"
+    return "its worker died" if (job.folder(root) / STARTED).is_file() else "a job that it needs is not done"
 
 
-def progress(study: Study, stages: list[Stage], root: Path) -> Group:
-    """A table of what is done, and one of what is running."""
-    counts = Table("stage", "done", "running", "failed", "all", "CPU hours left")
-    running = [stage for stage in stages if not is_done(stage, root) and is_running(stage, root)]
+def progress(study: Study, jobs: list[Job], root: Path) -> Group:
+    """A table with the numbers of jobs by their status, and one of the jobs that are running."""
+    running = [job for job in jobs if is_running(job, root)]
+    counts = Table("job", "done", "running", "failed", "all", "CPU hours left")
     for kind in KINDS:
-        alike = [stage for stage in stages if stage.kind == kind]
-        done = [stage for stage in alike if is_done(stage, root)]
-        failed = [stage for stage in alike if (stage.folder(root) / FAILED).is_file()]
-        now = [stage for stage in running if stage.kind == kind]
-        needs = study.resources[kind]
-        costs = [cost.estimate(stage, root, needs.workers, try_out=False) for stage in alike if stage not in done]
-        left = "?" if None in costs else f"{sum(one.seconds for one in costs if one) / 3600 * needs.cpus:.2f}"
-        counts.add_row(kind, *map(str, (len(done), len(now), len(failed), len(alike))), left)
+        counts.add_row(kind, *_counts(study, kind, jobs, running, root))
     names = Table("running", "for, min")
-    for stage in running[:SHOWN]:
-        since = time.time() - (stage.folder(root) / STARTED).stat().st_mtime
-        names.add_row(f"{stage.kind}: {stage.title}", f"{since / 60:.1f}")
+    for job in running[:SHOWN]:
+        since = time.time() - (job.folder(root) / STARTED).stat().st_mtime
+        names.add_row(f"{job.kind}: {job.title}", f"{since / 60:.1f}")
     return Group(counts, names)
 
 
-def plan(study: Study, stages: list[Stage], root: Path) -> Table:
-    """What is to be done, and the hours that it takes on this machine; seeds together."""
-    table = Table("stage", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
-    alike: dict[tuple[str, str], list[Stage]] = {}
-    for stage in stages:
-        alike.setdefault((stage.kind, stage.title.partition(", seed")[0]), []).append(stage)
+def _counts(study: Study, kind: Kind, jobs: list[Job], running: list[Job], root: Path) -> list[str]:
+    """A row of the table of progress."""
+    of_kind = [job for job in jobs if job.kind == kind]
+    left = [job for job in of_kind if not is_done(job, root)]
+    failed = [job for job in of_kind if (job.folder(root) / FAILED).is_file()]
+    now = [job for job in running if job.kind == kind]
+    needs = study.resources[kind]
+    costs = [cost.estimate(job, root, needs.workers, try_out=False) for job in left]
+    hours = "?" if None in costs else f"{sum(one.seconds for one in costs if one) / 3600 * needs.cpus:.2f}"
+    return [*map(str, (len(of_kind) - len(left), len(now), len(failed), len(of_kind))), hours]
+
+
+def plan(study: Study, jobs: list[Job], root: Path) -> Table:
+    """A table of the jobs to do and of their hours on this machine; jobs that differ in their seed share a row."""
+    table = Table("job", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
+    groups: dict[tuple[Kind, str], list[Job]] = {}
+    for job in jobs:
+        groups.setdefault((job.kind, job.title.partition(", seed")[0]), []).append(job)
     cpu = gpu = 0.0
-    for (kind, title), group in track(alike.items(), "measuring", transient=True):
+    for (kind, title), group in track(groups.items(), "measuring", transient=True):
         needs = study.resources[kind]
-        costs = [cost.estimate(stage, root, needs.workers) for stage in group if not is_done(stage, root)]
+        costs = [cost.estimate(job, root, needs.workers) for job in group if not is_done(job, root)]
         hours = sum(one.seconds for one in costs if one) / 3600
         cpu, gpu = cpu + hours * needs.cpus, gpu + hours * needs.gpus
         source = costs[0].source if costs and costs[0] else "done"
@@ -149,7 +174,7 @@ def plan(study: Study, stages: list[Stage], root: Path) -> Table:
             kind, title, f"{len(costs)} of {len(group)}", f"{hours * needs.cpus:.2f}", f"{hours * needs.gpus:.2f}", source
         )
     table.add_section()
-    table.add_row("", "all that is to do", "", f"{cpu:.2f}", f"{gpu:.2f}", "")
+    table.add_row("", "all jobs that are left", "", f"{cpu:.2f}", f"{gpu:.2f}", "")
     return table
 
 

@@ -1,4 +1,4 @@
-"""What stages cost on this machine: what those like them took here, or else what a trial of their work says."""
+"""What jobs cost on this machine, from jobs like them that were done here, or else from short trials."""
 
 import hashlib
 import json
@@ -13,176 +13,225 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-import manifeel_ms3  # noqa: F401
 from baselines.common.agent import spec_of
 from baselines.common.observation import POSE, POSE_FEATURES
 from baselines.common.train_args import default_steps
-from baselines.registry import policy_spec
+from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
+from manifeel_ms3.sensors.config import TactileSensorConfig
+from manifeel_ms3.tasks.registry import task_spec
 
-from .jobs import DONE, read_note, training_args
-from .study import Stage
+from .command_lines import OBS_MODE, train_flags, training_args
+from .jobs import DONE, read_status
+from .study import Job
 
 TRIALS = "trials.json"
-STEPS = 20  # of simulation, in a trial
-AMOUNTS = {
-    "num",
-    "episodes",
-    "checkpoints",
-    "version",
-    "revision",
-}  # settings, and flags of training, that do not change what a unit takes
-AMOUNT_FLAGS = {"seed", "env-id", "steps", "keep", "save-every", "num-demos", "tacrgb-weights"}
+SIMULATION_STEPS = 20
+"""Number of control steps in a trial of a simulation."""
+GRADIENT_STEPS = 2
+"""Number of gradient steps in a trial of training, after a first one that is not timed."""
+ACTION_SIZE = 7
+"""Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
+AMOUNTS = ("num", "episodes", "checkpoints", "version", "revision")
+"""Settings on which the cost of one demonstration, gradient step or episode does not depend."""
+AMOUNT_FLAGS = ("seed", "env-id", "cameras", "steps", "keep", "save-every", "num-demos", "tacrgb-weights")
+"""Flags of training on which the cost of one gradient step does not depend; a study's policies have one camera each."""
 
 
 @dataclass(frozen=True)
-class Estimate:
+class CostEstimate:
+    """How long a job will take."""
+
     seconds: float
-    """of wall clock, with the resources asked for"""
+    """Wall-clock time with the resources that the study gives the job."""
     source: str
+    """Where the figure is from: "runs here" or "a trial"."""
 
 
-def estimate(stage: Stage, root: Path, workers: int, try_out: bool = True) -> Estimate | None:
-    """How long a stage will take, with so many processes that simulate.
+@dataclass(frozen=True)
+class Trial:
+    """A short piece of work whose time an estimate is made from."""
+
+    measure: Callable[..., float]
+    """Function that returns the seconds of one step."""
+    arguments: tuple[str, ...]
+
+    @property
+    def key(self) -> str:
+        """Hash of what is measured and of the machine; the name under which the outcome is kept."""
+        content = json.dumps([self.measure.__name__, self.arguments, machine()], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def seconds(self, root: Path) -> float:
+        """The outcome; it is measured at the first time and then kept in a file under `root`."""
+        known = read_status(root / TRIALS)
+        if self.key not in known:
+            what = f"{self.measure.__name__}: {', '.join(self.arguments)}"
+            known[self.key] = dict(seconds=self.measure(*self.arguments), what=what)
+            root.mkdir(parents=True, exist_ok=True)
+            write_json(root / TRIALS, known)
+        return known[self.key]["seconds"]
+
+
+def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEstimate | None:
+    """How long a job will take.
 
     Args:
-        try_out: measure what has not been done here yet; otherwise the answer is None then.
+        job: The job.
+        root: Folder of all jobs.
+        workers: Number of processes that simulate.
+        try_out: Whether to run trials if no job like this one was done here; otherwise the answer is None then.
     """
-    parallel = 1 if stage.kind == "train" else workers
-    took = [note["seconds"] / max(note["units"], 1) * note["parallel"] for note in _done(stage, root)]
+    parallel = 1 if job.kind == "train" else workers
+    took = [status["seconds"] / max(status["units"], 1) * status["parallel"] for status in _done(job, root)]
     if took:
-        return Estimate(float(np.median(took)) * _units(stage) / parallel, "runs here")
+        return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")
     if not try_out:
         return None
-    return Estimate(_tried(stage, root) * _units(stage) / parallel, "a trial")
+    return CostEstimate(_unit_seconds(job, root) * _units(job) / parallel, "a trial")
 
 
-def _done(stage: Stage, root: Path) -> list[dict[str, Any]]:
-    """Notes of stages that were done here and differ in amounts and seeds alone."""
+def _done(job: Job, root: Path) -> list[dict[str, Any]]:
+    """Status files of jobs that were done on a machine like this one and differ from `job` in amounts and seeds alone."""
     here = machine()
-    notes = [_note(path, path.stat().st_mtime) for path in root.glob(f"{stage.kind}/*/{DONE}")]
-    return [note for note in notes if note["machine"] == here and _work(note["settings"]) == _work(stage.settings)]
+    found = [_status(path, path.stat().st_mtime) for path in root.glob(f"{job.kind}/*/{DONE}")]
+    return [status for status in found if status["machine"] == here and _work(status["settings"]) == _work(job.settings)]
 
 
 @cache
-def _note(path: Path, _changed: float) -> dict[str, Any]:
-    return read_note(path)
+def _status(path: Path, _changed: float) -> dict[str, Any]:
+    return read_status(path)
 
 
 def _work(settings: dict[str, Any]) -> dict[str, Any]:
-    """What a unit's cost depends on."""
+    """The settings on which the cost of one demonstration, gradient step or episode depends."""
     flags = {name: value for name, value in settings.get("flags", {}).items() if name not in AMOUNT_FLAGS}
     return {name: value for name, value in settings.items() if name not in AMOUNTS} | dict(flags=flags)
 
 
-def _units(stage: Stage) -> int:
-    """Demonstrations, gradient steps, episodes."""
-    settings = stage.settings
-    if stage.kind == "record":
+def _units(job: Job) -> int:
+    """Number of demonstrations, gradient steps or episodes of a job."""
+    settings = job.settings
+    if job.kind == "record":
         return settings["num"]
-    if stage.kind == "evaluate":
+    if job.kind == "evaluate":
         return settings["episodes"] * settings["checkpoints"]
-    args, (record,) = training_args(stage), stage.needs
+    args, (record,) = training_args(job), job.needs
     demos = args.num_demos or record.settings["num"]
-    samples = demos * _steps_of_a_demonstration(record.settings["env_id"])
+    samples = demos * _demonstration_steps(record.settings["env_id"])
     return args.steps or default_steps(demos, samples, args.batch_size)
 
 
 @cache
-def _steps_of_a_demonstration(env_id: str) -> float:
-    """Of those that come along."""
-    episodes = read_header(data_dir() / "sample" / env_id / "states.h5")["episodes"]
-    return float(np.mean([episode["elapsed_steps"] for episode in episodes]))
+def _demonstration_steps(env_id: str) -> float:
+    """Mean number of control steps of the sample demonstrations; the time limit of a task that has none."""
+    sample = data_dir() / "sample" / env_id / "states.h5"
+    if not sample.is_file():
+        return task_spec(env_id).max_episode_steps
+    return float(np.mean([episode["elapsed_steps"] for episode in read_header(sample)["episodes"]]))
 
 
 # -------------------------------------------------------------------- trials
 
 
-def _tried(stage: Stage, root: Path) -> float:
-    """Seconds a unit, from a short trial; kept under the root."""
-    work = [stage.kind, _work(stage.settings), [_work(need.settings) for need in stage.needs], machine()]
-    key = hashlib.sha256(json.dumps(work, sort_keys=True).encode()).hexdigest()[:16]
-    known = read_note(root / TRIALS)
-    if key not in known:
-        known[key] = dict(seconds=TRIAL[stage.kind](stage), title=stage.title)
-        root.mkdir(parents=True, exist_ok=True)
-        write_json(root / TRIALS, known)
-    return known[key]["seconds"]
+def trials_of(job: Job) -> tuple[Trial, ...]:
+    """The trials from which the cost of a job is estimated."""
+    if job.kind == "record":
+        return (_simulation_trial(job, OBS_MODE),)
+    train = job if job.kind == "train" else job.needs[0]
+    network = train.settings["policy"], *train_flags(_work(train.settings))
+    if job.kind == "train":
+        return (Trial(gradient_step, network),)
+    return _simulation_trial(train.needs[0], training_args(train).obs_mode), Trial(inference, network)
 
 
-def _try_recording(stage: Stage) -> float:
-    settings = stage.settings
-    step = _seconds_a_step(settings["env_id"], "rgb+tacrgb+tacff", settings["camera"], settings["env_kwargs"])
-    return step * _steps_of_a_demonstration(settings["env_id"])
+def _unit_seconds(job: Job, root: Path) -> float:
+    """Seconds of one demonstration, gradient step or episode, with one process."""
+    seconds = [trial.seconds(root) for trial in trials_of(job)]
+    if job.kind == "train":
+        return seconds[0]
+    env_id = job.settings["env_id"]
+    if job.kind == "record":
+        return seconds[0] * _demonstration_steps(env_id)
+    limit = json.loads(job.settings["env_kwargs"]).get("max_episode_steps") or task_spec(env_id).max_episode_steps
+    return limit * (seconds[0] + seconds[1] / training_args(job.needs[0]).policy.action_horizon)
 
 
-def _try_training(stage: Stage) -> float:
-    """One gradient step of the networks as they will be, on made-up observations."""
-    args = training_args(stage)
-    policy, obs, actions = _made_up(stage, args, args.batch_size)
-    optimizer = torch.optim.AdamW(policy.parameters(), fused=True)
+def _simulation_trial(record: Job, obs_mode: str) -> Trial:
+    settings = record.settings
+    return Trial(simulation_step, (settings["env_id"], obs_mode, settings["camera"], settings["env_kwargs"]))
+
+
+def simulation_step(env_id: str, obs_mode: str, camera: str, env_kwargs: str) -> float:
+    """Seconds of a control step with a random action.
+
+    Args:
+        env_id: Id of the task.
+        obs_mode: Observation mode.
+        camera: Name of the camera.
+        env_kwargs: Further arguments of the task, as json.
+    """
+    sensing = dict(obs_mode=obs_mode, cameras=(camera,), tactile_sensors=("right",), sim_backend="physx_cpu")
+    env = gym.make(task_spec(env_id).env_id, **sensing | json.loads(env_kwargs))
+    env.reset(seed=0)
+    seconds = _seconds(lambda: env.step(env.action_space.sample()), SIMULATION_STEPS)
+    env.close()
+    return seconds
+
+
+def gradient_step(policy: str, *flags: str) -> float:
+    """Seconds of a gradient step of a policy on made-up observations.
+
+    Args:
+        policy: Registered name of the policy.
+        flags: Preset and flags of training.
+    """
+    network, args, obs, actions = _made_up(policy, flags)
+    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
 
     def step() -> None:
         with torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16"):
-            loss = policy(obs, actions)
+            loss = network(obs, actions)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         loss.item()
 
-    return _seconds(step, repeats=2)
+    return _seconds(step, GRADIENT_STEPS)
 
 
-def _try_evaluation(stage: Stage) -> float:
-    """An episode that goes on to its end."""
-    (train,) = stage.needs
-    args = training_args(train)
-    policy, obs, _ = _made_up(train, args, 1)
-    policy.to("cpu").eval()
-    obs = {name: value.cpu() for name, value in obs.items()}
-    inference = _seconds(lambda: policy.sample(obs, args.inference_steps, torch.Generator()), repeats=1)
-    step = _seconds_a_step(args.env_id, args.obs_mode, args.cameras[0], stage.settings["env_kwargs"])
-    limit = json.loads(stage.settings["env_kwargs"]).get("max_episode_steps") or gym.spec(args.env_id).max_episode_steps
-    return limit * (step + inference / args.policy.action_horizon)
+def inference(policy: str, *flags: str) -> float:
+    """Seconds in which a policy generates its actions on the CPU.
+
+    Args:
+        policy: Registered name of the policy.
+        flags: Preset and flags of training.
+    """
+    network, args, obs, _ = _made_up(policy, (*flags, "--batch-size", "1", "--device", "cpu"))
+    network.eval()
+    return _seconds(lambda: network.sample(obs, args.inference_steps, torch.Generator()), 1)
 
 
-TRIAL: dict[str, Callable[[Stage], float]] = dict(record=_try_recording, train=_try_training, evaluate=_try_evaluation)
-
-
-def _made_up(train: Stage, args: Any, batch: int) -> tuple[Any, dict[str, torch.Tensor], torch.Tensor]:
-    """A policy, and a batch of noise as it takes."""
-    policy_class = policy_spec(train.settings["policy"]).policy_class
-    spec = spec_of(vars(args))
-    env_kwargs = json.loads(train.needs[0].settings["env_kwargs"])
-    env = gym.make(args.env_id, **dict(obs_mode="none", render_backend="none") | env_kwargs)
-    (size,) = env.unwrapped.single_action_space.shape
-    env.close()
-    policy = policy_class(args.policy, spec, size).to(args.device, memory_format=torch.channels_last)
-    shapes = dict.fromkeys(spec.images, (spec.image_size, spec.image_size, 3))
-    shapes |= dict.fromkeys(spec.force_fields, (10, 14, 3)) | {POSE: (POSE_FEATURES,)}
-    obs = {}
-    for key, shape in shapes.items():
-        values = torch.rand(batch, args.policy.obs_horizon, *shape, device=args.device)
-        obs[key] = (255 * values).to(torch.uint8) if key in spec.images else values
-    return policy, obs, torch.rand(batch, args.policy.pred_horizon, size, device=args.device)
-
-
-@cache
-def _seconds_a_step(env_id: str, obs_mode: str, camera: str, env_kwargs: str) -> float:
-    """Of simulation, by random actions."""
-    sensing = dict(obs_mode=obs_mode, cameras=(camera,), tactile_sensors=("right",), sim_backend="physx_cpu")
-    env = gym.make(env_id, **sensing | json.loads(env_kwargs))
-    env.reset(seed=0)
-    seconds = _seconds(lambda: env.step(env.action_space.sample()), repeats=STEPS)
-    env.close()
-    return seconds
+def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:
+    """An untrained policy, its training arguments, and a batch of random observations and actions."""
+    preset, *rest = flags
+    args = preset_cli(policy_spec(policy), [preset, "--demos", "-", *rest])
+    spec, horizon, batch = spec_of(vars(args)), args.policy.obs_horizon, args.batch_size
+    network: Any = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE)
+    network.to(args.device, memory_format=torch.channels_last)  # as in training; torch's stubs do not know the argument
+    images = torch.rand(batch, horizon, spec.image_size, spec.image_size, 3, device=args.device)
+    obs = {key: (255 * images).to(torch.uint8) for key in spec.images}
+    field = (*TactileSensorConfig.taxel_shape, 3)
+    obs |= {key: torch.rand(batch, horizon, *field, device=args.device) for key in spec.force_fields}
+    obs[POSE] = torch.rand(batch, horizon, POSE_FEATURES, device=args.device)
+    return network, args, obs, torch.rand(batch, args.policy.pred_horizon, ACTION_SIZE, device=args.device)
 
 
 def _seconds(do: Callable[[], Any], repeats: int) -> float:
-    """Of one, after a first that is not counted."""
+    """Mean seconds of a call, after a first call that is not timed."""
     do()
     begin = time.perf_counter()
     for _ in range(repeats):

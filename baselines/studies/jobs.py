@@ -1,4 +1,7 @@
-"""What a stage does, in a process of its own. All of it goes on where it was stopped."""
+"""How a job runs, in a process of its own, and the files in its folder that hold its status.
+
+A job that was stopped goes on where it stopped when it is run again.
+"""
 
 import json
 import os
@@ -11,119 +14,104 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+import tyro
 
-from baselines.registry import policy_spec, preset_cli
+from baselines.registry import policy_spec
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import write_json
 
-from .study import Stage
+from .command_lines import evaluate_arguments, record_arguments, training_args, trajectory_of
+from .study import Job
 
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
 
 
-def is_done(stage: Stage, root: Path) -> bool:
-    return (stage.folder(root) / DONE).is_file()
+def is_done(job: Job, root: Path) -> bool:
+    """Whether a job has finished its work."""
+    return (job.folder(root) / DONE).is_file()
 
 
-def is_running(stage: Stage, root: Path) -> bool:
-    """Whether a worker has begun and not ended; one of this machine must be alive."""
-    folder = stage.folder(root)
-    started = read_note(folder / STARTED)
-    if not started or is_done(stage, root) or (folder / FAILED).is_file():
+def is_running(job: Job, root: Path) -> bool:
+    """Whether a worker has started a job and not ended it; a worker of this machine must also be alive."""
+    folder = job.folder(root)
+    started = read_status(folder / STARTED)
+    if not started or is_done(job, root) or (folder / FAILED).is_file():
         return False
     return started["host"] != socket.gethostname() or psutil.pid_exists(started["pid"])
 
 
-def perform(stage: Stage, root: Path, workers: int = 1, *_needed: None) -> None:
-    """Do a stage's work, unless it is done, and note what it cost.
+def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
+    """Run a job unless it is done, and write down what it cost.
 
     Args:
-        workers: processes that simulate.
-        _needed: what other stages returned: Ray waits for them.
+        job: The job.
+        root: Folder of all jobs.
+        workers: Number of processes that simulate.
+        _needed: Return values of the jobs that this one needs; Ray waits for them.
 
     Raises:
-        Exception: whatever went wrong; failed.json has it, too.
+        Exception: Any error of the job; it is also written to failed.json.
     """
-    listen_to_children()
-    if is_done(stage, root):
+    restore_child_signals()
+    if is_done(job, root):
         return
-    folder = stage.folder(root)
+    folder = job.folder(root)
     folder.mkdir(parents=True, exist_ok=True)
-    before = read_note(folder / STARTED)
-    attempts = before.get("attempts", 0) + 1
-    started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=stage.title, settings=stage.settings)
+    attempts = read_status(folder / STARTED).get("attempts", 0) + 1
+    started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=job.title, settings=job.settings)
     write_json(folder / STARTED, started)
     (folder / FAILED).unlink(missing_ok=True)
     begin = time.time()
     try:
-        units = WORK[stage.kind](stage, root, workers)
+        units = WORK[job.kind](job, root, workers)
     except Exception as error:
         write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
-    parallel = 1 if stage.kind == "train" else workers
+    parallel = 1 if job.kind == "train" else workers
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
 
 
-def listen_to_children() -> None:
-    """Ray lets the system reap a process's children unheard: their exit codes, which say whether one died, would be lost."""
+def restore_child_signals() -> None:
+    """Let this process wait for its children again.
+
+    Ray ignores SIGCHLD, so that the system discards the exit codes of a process's children. Those codes tell whether a
+    simulating process has died.
+    """
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
-def _record(stage: Stage, root: Path, workers: int) -> int:
-    """Demonstrations with everything that any policy sees; returns how many."""
-    settings = stage.settings
-    path = stage.folder(root) / "trajectory.h5"
-    sensing = dict(obs_mode="rgb+tacrgb+tacff", cameras=(settings["camera"],), tactile_sensors=("right",))
-    record.main(
-        record.Args(settings["env_id"], settings["num"], workers, env_kwargs=settings["env_kwargs"], out=path, **sensing),
-        on_episode=lambda: None,
-    )
-    return len(read_header(path)["episodes"])
+def _record(job: Job, root: Path, workers: int) -> int:
+    """Record demonstrations with everything that any policy observes, and return their number."""
+    record.main(tyro.cli(record.Args, args=record_arguments(job, root, workers)), on_episode=lambda: None)
+    return len(read_header(trajectory_of(job, root))["episodes"])
 
 
-def _train(stage: Stage, root: Path, _workers: int) -> int:
-    """A policy; returns its gradient steps."""
-    settings, (demos,) = stage.settings, stage.needs
-    folder = stage.folder(root)
-    args = replace(
-        training_args(stage),
-        demos=(demos.folder(root) / "trajectory.h5",),
-        run_dir=folder,
-        resume=(folder / "checkpoints/last").exists(),
-    )
-    last = policy_spec(settings["policy"]).train(args)
+def _train(job: Job, root: Path, _workers: int) -> int:
+    """Train a policy, and return the number of its gradient steps."""
+    resume = (job.folder(root) / "checkpoints/last").exists()
+    last = policy_spec(job.settings["policy"]).train(replace(training_args(job, root), resume=resume))
     return json.loads((last / "config.json").read_text())["step"]
 
 
-def _evaluate(stage: Stage, root: Path, workers: int) -> int:
-    """A result file a checkpoint; returns how many episodes."""
-    settings, (train,) = stage.settings, stage.needs
+def _evaluate(job: Job, root: Path, workers: int) -> int:
+    """Write one result file for each checkpoint, and return the number of episodes."""
+    settings, (train,) = job.settings, job.needs
     checkpoints = sorted(path for path in (train.folder(root) / "checkpoints").iterdir() if path.name.isdigit())
     chosen = checkpoints[-settings["checkpoints"] :]
-    wanted = {name: settings[name] for name in ("episodes", "env_kwargs")}
     for checkpoint in chosen:
-        out = stage.folder(root) / f"{checkpoint.name}.json"
+        out = job.folder(root) / f"{checkpoint.name}.json"
         if not out.is_file():
-            evaluate.main(evaluate.Args(checkpoint, out=out, workers=workers, **wanted))
+            evaluate.main(tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out))))
     return len(chosen) * settings["episodes"]
 
 
 WORK = dict(record=_record, train=_train, evaluate=_evaluate)
 
 
-def training_args(stage: Stage) -> Any:
-    """What train.py is given, but for where its data and its run are."""
-    settings = stage.settings
-    flags = [settings["preset"], "--demos", "-"]
-    for name, value in settings["flags"].items():
-        flags += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
-    return preset_cli(policy_spec(settings["policy"]), flags)
-
-
-def read_note(path: Path) -> dict[str, Any]:
-    """A note that was left; {} if there is none."""
+def read_status(path: Path) -> dict[str, Any]:
+    """The content of a status file; {} if there is none."""
     return json.loads(path.read_text()) if path.is_file() else {}

@@ -1,4 +1,4 @@
-"""What is to be run: studies from yaml, and the stages that they come to."""
+"""What a study runs: its file in yaml, and the jobs that its grids come to."""
 
 import hashlib
 import json
@@ -8,184 +8,230 @@ from functools import cached_property
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 import yaml
 
 from baselines.registry import policy_spec
 from manifeel_ms3.command_line import PACKAGE
 from manifeel_ms3.errors import InvalidFileError, UnknownNameError
-from manifeel_ms3.tasks.registry import short_name, task_spec
+from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
 Kind = Literal["record", "train", "evaluate"]
 KINDS: tuple[Kind, ...] = ("record", "train", "evaluate")
+TABLE = "table "
+"""What `tasks` begins with where it names a table of the paper instead of listing tasks: "table I"."""
 
 
 class StudyError(InvalidFileError):
-    """A study's file that cannot be used."""
+    """A study's file cannot be used."""
 
 
 @dataclass(frozen=True)
 class Resources:
+    """What each job of a kind occupies while it runs."""
+
     cpus: float = 1
+    """Number of CPU cores."""
     gpus: float = 0
+    """Number of GPUs; a fraction where several jobs share one."""
 
     @property
     def workers(self) -> int:
-        """Processes that simulate."""
+        """Number of processes that simulate."""
         return max(int(self.cpus), 1)
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Every combination of its lists is a set-up."""
+    """Lists of choices; every combination of them is recorded, trained and evaluated."""
 
     tasks: tuple[str, ...]
+    """Ids of tasks, or a table of the paper whose tasks are meant: "table I"."""
     obs_modes: tuple[str, ...] = ("rgb", "rgb+tacrgb", "rgb+tacff")
+    """Observation modes of the policies."""
     policies: tuple[str, ...] = ("diffusion_policy",)
     """Registered names of policies."""
     encoders: tuple[str, ...] = ("",)
-    """of TacRGB; "" is the preset's"""
+    """Encoders of TacRGB; "" is the preset's. They apply to the observation modes with TacRGB alone."""
     cameras: tuple[str, ...] = ("policy",)
-    """one each; "policy" is the task's own"""
+    """Cameras, of which each policy gets one; "policy" is the task's own."""
     num_demos: tuple[int | None, ...] = (None,)
-    """demonstrations trained on; null: all"""
+    """Numbers of demonstrations to train on; all of a task's where it has fewer. null stands for all."""
     seeds: tuple[int, ...] = (0, 1, 2)
+    """Training seeds."""
     task_args: dict[str, Any] = field(default_factory=dict)
-    """arguments of the tasks other than their defaults"""
+    """Arguments of the tasks that differ from their defaults."""
     demos: int | None = None
-    """demonstrations recorded; null: the paper's number, or as many as are trained on"""
+    """Number of demonstrations to record of each task; the paper's number if not given."""
     preset: str = "paper"
+    """Preset of training."""
     train: dict[str, Any] = field(default_factory=dict)
-    """further flags of train.py, such as {steps: 2000, policy.down-dims: [64, 128]}"""
+    """Further flags of `manifeel train`, such as {steps: 2000, batch-size: 16}."""
     encoder_flags: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """flags that come with an encoder of TacRGB, such as {t3: {image-size: 224}}"""
+    """Flags of `manifeel train` that one encoder of TacRGB needs, such as {t3: {image-size: 224}}."""
     episodes: int = 50
-    """starts evaluated"""
+    """Number of evaluation episodes of a checkpoint."""
     checkpoints: int = 10
-    """the last so many are evaluated"""
+    """Number of checkpoints to evaluate, counted from the last one."""
 
 
 @dataclass(frozen=True)
 class Study:
+    """The content of a study's file."""
+
     name: str
+    """Name of the file, without its ending."""
     grids: tuple[Grid, ...]
     resources: dict[Kind, Resources]
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A piece of work with a folder of its own, named by everything that it depends on."""
+class Job:
+    """One recording, one training run or one evaluation, with a folder that is named by everything it depends on."""
 
     kind: Kind
     title: str
     settings: dict[str, Any]
-    """all that its work depends on, but for what it needs"""
-    needs: tuple["Stage", ...] = ()
+    """Everything that the job's outcome depends on, apart from the jobs in `needs`."""
+    needs: tuple["Job", ...] = ()
+    """Jobs whose output this one reads."""
 
     @cached_property
     def key(self) -> str:
-        content = json.dumps([self.kind, self.settings, [stage.key for stage in self.needs]], sort_keys=True)
+        """Hash of everything that the job depends on."""
+        content = json.dumps([self.kind, self.settings, [job.key for job in self.needs]], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def folder(self, root: Path) -> Path:
+        """Folder of the job's output and of the files that hold its status."""
         return root / self.kind / self.key
 
 
 def read_study(path: Path) -> Study:
-    """A study's file; `include` adds the grids of others.
+    """Read a study's file; its key `include` adds the grids of other files.
 
     Raises:
-        StudyError: it is missing, no yaml, or has something in it that is not known.
+        StudyError: The file is missing, is not yaml, or holds a key, a task or a policy that is not known.
     """
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, yaml.YAMLError) as error:
-        raise StudyError(f"{path} cannot be read as a study ({error}); see configs/ for some") from error
-    if not isinstance(content, dict):
-        raise StudyError(f"{path} is no study: it must hold `grids:`; see configs/ for some")
-    _require_known(content, {"grids", "include", "resources"}, f"{path}")
+    content = _content(path)
     included = [read_study(path.parent / name) for name in content.get("include", [])]
-    grids = [_made(Grid, entry, f"{path}: grids/{k}") for k, entry in enumerate(content.get("grids", []))]
-    grids = [grid for study in included for grid in study.grids] + grids
+    own = [_grid(entry, f"{path}: grids/{k}") for k, entry in enumerate(content.get("grids", []))]
+    grids = [grid for study in included for grid in study.grids] + own
     if not grids:
-        raise StudyError(f"{path} has no grids; see configs/ for some")
+        raise StudyError(f"{path} has no grids; see configs/ for examples")
     given = content.get("resources", {})
     _require_known(given, set(KINDS), f"{path}: resources")
-    resources = {kind: _made(Resources, given.get(kind, {}), f"{path}: resources/{kind}") for kind in KINDS}
-    for k, grid in enumerate(grids):
-        _require_registered(grid, f"{path}: grids/{k}")
+    resources: dict[Kind, Resources] = {
+        kind: _section(Resources, given.get(kind, {}), f"{path}: resources/{kind}") for kind in KINDS
+    }
     return Study(path.stem, tuple(grids), resources)
 
 
-def _require_registered(grid: Grid, place: str) -> None:
+def _content(path: Path) -> dict[str, Any]:
+    """The file's mapping, with keys of the right kinds."""
     try:
-        for task in grid.tasks:
-            task_spec(task)
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise StudyError(f"{path} cannot be read as a study ({error}); see configs/ for examples") from error
+    if not isinstance(content, dict):
+        raise StudyError(f"{path} is not a study: it must be a mapping with the key `grids`; see configs/ for examples")
+    _require_known(content, {"grids", "include", "resources"}, f"{path}")
+    for name, expected in (("grids", list[Any]), ("include", list[str]), ("resources", dict[str, Any])):
+        if name in content and not _is_of(content[name], expected):
+            raise StudyError(f"{path}: `{name}` has the wrong type: {content[name]!r}; see configs/ for examples")
+    return content
+
+
+def _grid(entry: Any, place: str) -> Grid:
+    """A grid whose tasks and policies are registered; a table of the paper is replaced by its tasks."""
+    try:
+        if isinstance(entry, dict) and isinstance(tasks := entry.get("tasks"), str):
+            entry = entry | dict(tasks=tasks_of_table(tasks.removeprefix(TABLE)) if tasks.startswith(TABLE) else [tasks])
+        grid = _section(Grid, entry, place)
+        recorded = [grid.demos or task_spec(task).paper_demos for task in grid.tasks]
         for policy in grid.policies:
             policy_spec(policy)
     except UnknownNameError as error:
         raise StudyError(f"{place}: {error}") from error
+    if too_many := [count for count in grid.num_demos if count and count > max(recorded, default=0)]:
+        raise StudyError(f"{place}: num_demos {too_many} are more than the {max(recorded)} recorded; raise `demos`")
+    return grid
 
 
-def _made(kind: type, entry: Any, place: str) -> Any:
+def _section(kind: type, entry: Any, place: str) -> Any:
+    """One of the dataclasses above, from a mapping of its fields."""
     if not isinstance(entry, dict):
         raise StudyError(f"{place} must be a mapping, not {entry!r}")
-    _require_known(entry, {item.name for item in fields(kind)}, place)
+    types = {item.name: item.type for item in fields(kind)}
+    _require_known(entry, set(types), place)
+    for name, value in entry.items():
+        if not _is_of(value, types[name]):
+            raise StudyError(f"{place}: `{name}` has the wrong type: {value!r}; see configs/ for examples")
     try:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
     except TypeError as error:
         raise StudyError(f"{place}: {error}") from error
 
 
-def _require_known(entry: dict, known: set[str], place: str) -> None:
+def _is_of(value: Any, annotation: Any) -> bool:
+    """Whether a value from yaml is of an annotated type; a list stands for a tuple."""
+    inner = get_args(annotation)
+    if get_origin(annotation) in (tuple, list):
+        return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
+    if get_origin(annotation) is dict:
+        return isinstance(value, dict) and all(isinstance(key, str) and _is_of(item, inner[1]) for key, item in value.items())
+    return annotation is Any or isinstance(value, int | float if annotation is float else annotation)
+
+
+def _require_known(entry: dict[Any, Any], known: set[str], place: str) -> None:
     if unknown := set(entry) - known:
-        raise StudyError(f"{place}: {sorted(unknown)} are not known; choose from {sorted(known)}")
+        raise StudyError(f"{place}: {sorted(map(str, unknown))} are not known; choose from {sorted(known)}")
 
 
-def stages_of(study: Study) -> list[Stage]:
-    """Every stage once, each after what it needs."""
-    stages: dict[str, Stage] = {}
+def jobs_of(study: Study) -> list[Job]:
+    """Every job of a study once, each after the jobs that it needs."""
+    jobs: dict[str, Job] = {}
     for grid in study.grids:
         for evaluate in _evaluations(grid):
             (train,) = evaluate.needs
-            for stage in (*train.needs, train, evaluate):
-                stages.setdefault(stage.key, stage)
-    return sorted(stages.values(), key=lambda stage: KINDS.index(stage.kind))
+            for job in (*train.needs, train, evaluate):
+                jobs.setdefault(job.key, job)
+    return sorted(jobs.values(), key=lambda job: KINDS.index(job.kind))
 
 
-def _evaluations(grid: Grid) -> Iterator[Stage]:
-    """One a trained policy."""
+def _evaluations(grid: Grid) -> Iterator[Job]:
+    """One evaluation for each policy that the grid trains."""
     choices = (grid.tasks, grid.policies, grid.obs_modes, grid.encoders, grid.cameras, grid.num_demos, grid.seeds)
     for task, policy, mode, encoder, camera, num_demos, seed in product(*choices):
         if encoder and "tacrgb" not in mode.split("+"):
             continue
         camera = task_spec(task).policy_camera if camera == "policy" else camera
         train = _training(grid, _recording(grid, task, camera), policy, mode, encoder, num_demos, seed)
-        wanted = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
-        wanted |= dict(env_kwargs=_env_kwargs(grid), version=version(PACKAGE))
-        yield Stage("evaluate", train.title, wanted, (train,))
+        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
+        settings |= dict(env_kwargs=_env_kwargs(grid), version=version(PACKAGE))
+        yield Job("evaluate", train.title, settings, (train,))
 
 
-def _recording(grid: Grid, task: str, camera: str) -> Stage:
-    trained_on = max((count for count in grid.num_demos if count), default=0)
-    count = grid.demos or max(task_spec(task).paper_demos, trained_on)
+def _recording(grid: Grid, task: str, camera: str) -> Job:
+    count = grid.demos or task_spec(task).paper_demos
     settings = dict(env_id=task, num=count, camera=camera, env_kwargs=_env_kwargs(grid))
     settings |= dict(revision=task_spec(task).revision)
-    return Stage("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
+    return Job("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
 
 
-def _training(grid: Grid, record: Stage, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Stage:
+def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Job:
     task, camera = record.settings["env_id"], record.settings["camera"]
     flags = {"env-id": task, "obs-mode": mode, "cameras": camera, "seed": seed, "keep": grid.checkpoints} | grid.train
-    if num_demos is not None:
+    some = num_demos is not None and num_demos < record.settings["num"]
+    if some:
         flags["num-demos"] = num_demos
     if encoder:
         flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
-    demonstrations = f"{num_demos} demonstrations" if num_demos else ""
+    demonstrations = f"{num_demos} demonstrations" if some else ""
     title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
     settings = dict(policy=policy, preset=grid.preset, flags=flags, version=version(PACKAGE))
-    return Stage("train", title, settings, (record,))
+    return Job("train", title, settings, (record,))
 
 
 def _env_kwargs(grid: Grid) -> str:

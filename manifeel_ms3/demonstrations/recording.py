@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from manifeel_ms3.tasks.registry import all_tasks, task_spec
+from manifeel_ms3.tasks.registry import make_env, task_spec
 
 from .formats.maniskill_h5 import DemonstrationError, Episode, finished_episodes, read_header, write_episode
 
@@ -29,10 +29,9 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
         UnknownNameError: The task is not registered.
     """
     spec = task_spec(env_id)
-    module = spec.env_class.__module__.partition(".")[0]
     kept = {name: value for name, value in env_kwargs.items() if name != "render_backend"}
     return dict(
-        env_info=dict(env_id=f"{module}:{env_id}", env_kwargs=kept, max_episode_steps=spec.max_episode_steps),
+        env_info=dict(env_id=spec.gym_id, env_kwargs=kept, max_episode_steps=spec.max_episode_steps),
         source_type="scripted",
         source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
         versions={name: version(name) for name in PACKAGES},
@@ -80,5 +79,4 @@ class Recorder:
 
 def make_recorder(env_id: str, env_kwargs: dict[str, Any], path: Path) -> Recorder:
     """Make the state of a worker process."""
-    all_tasks()  # registers the tasks in this process, those of plug-ins, too
-    return Recorder(gym.make(env_id, **env_kwargs), env_id, path)
+    return Recorder(make_env(env_id, **env_kwargs), env_id, path)

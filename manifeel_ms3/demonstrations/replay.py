@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import tyro
 from mani_skill.utils import common
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import make_env
 
 from .formats.maniskill_h5 import open_trajectories, read_header
 
@@ -57,7 +56,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     """
     header = read_header(path)
     kwargs = header["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = gym.make(task_spec(header["env_info"]["env_id"]).env_id, **kwargs)
+    env = make_env(header["env_info"]["env_id"], **kwargs)
     base: Any = env.unwrapped
     results = []
     with progress_bar() as bar:

@@ -23,7 +23,7 @@ import tyro
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds, task_spec
+from manifeel_ms3.tasks.registry import evaluation_seeds, make_env, task_spec
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
 from .checkpoint_config import CheckpointError, checkpoint_config
@@ -159,8 +159,7 @@ def run_episodes(evaluation: Evaluation, seeds: list[int], workers: int, step_ti
 
 def _make_env_and_policy(evaluation: Evaluation) -> tuple[gym.Env, Policy]:
     """In a worker process: what it keeps from one episode to the next."""
-    all_tasks()  # registers the tasks in this process, those of plug-ins, too
-    return gym.make(evaluation.env_id, **evaluation.env_kwargs), evaluation.source.make()
+    return make_env(evaluation.env_id, **evaluation.env_kwargs), evaluation.source.make()
 
 
 def _run_seed(env_and_policy: tuple[gym.Env, Policy], seed: int, step_timeout: float) -> EpisodeOutcome:

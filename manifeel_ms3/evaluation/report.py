@@ -14,14 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import gymnasium as gym
 import numpy as np
 import tyro
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import write_text
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import make_env
 
 from .policy import load_policy
 from .result import read_result
@@ -85,7 +83,7 @@ def training_curve(log_file: Path) -> str:
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     """The task's randomisation in an evaluation: pairs of its value there and the task's default, by its name."""
     kwargs: dict[str, Any] = result["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = gym.make(task_spec(result["env_id"]).env_id, **kwargs)
+    env = make_env(result["env_id"], **kwargs)
     task: Any = env.unwrapped
     used, default = task.randomization, task.Randomization()
     env.close()
@@ -103,7 +101,7 @@ def main(args: Args) -> Path:
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
     policy = load_policy(args.run_dir / "checkpoints/last")
-    outcome, frames = record_episode(task_spec(result["env_id"]).env_id, result["env_kwargs"], policy, seed)
+    outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         result=result,

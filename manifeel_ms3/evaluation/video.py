@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import torch
 
-import manifeel_ms3  # noqa: F401
 from manifeel_ms3.sensors.visualisation import observation_images
+from manifeel_ms3.tasks.registry import make_env
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .policy import Policy
@@ -46,7 +45,7 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
     torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
     cameras = tuple(dict.fromkeys([*env_kwargs.get("cameras", ()), "wrist", "front"]))
     kwargs: dict[str, Any] = env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras)
-    env = gym.make(env_id, **kwargs)
+    env = make_env(env_id, **kwargs)
     frames: list[Frame] = []
 
     def keep(obs: dict[str, Any]) -> None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar
 
+import gymnasium as gym
 from mani_skill.utils.registration import register_env
 
 from manifeel_ms3 import plugins
@@ -57,6 +58,12 @@ class TaskSpec:
     def name(self) -> str:
         """Short name, such as "PegInsertion"."""
         return short_name(self.env_id)
+
+    @property
+    def gym_id(self) -> str:
+        """Id after the module that gymnasium is to import for it, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
+        package, module = __name__.partition(".")[0], self.env_class.__module__
+        return f"{package if module.startswith(f'{package}.') else module}:{self.env_id}"
 
     @property
     def policy_camera(self) -> str:
@@ -124,6 +131,19 @@ def task_spec(env_id: str) -> TaskSpec:
     """
     _load_plugins()
     return _known(env_id.rpartition(":")[2])
+
+
+def make_env(env_id: str, **kwargs: Any) -> gym.Env:
+    """Make a task's environment, as `gym.make` does, also in a process that has not loaded the tasks of other packages.
+
+    Args:
+        env_id: Id of the task, with or without a module before a colon.
+        kwargs: Arguments of the environment.
+
+    Raises:
+        UnknownNameError: The task is not registered; the message lists those that are.
+    """
+    return gym.make(task_spec(env_id).env_id, **kwargs)
 
 
 def all_tasks() -> dict[str, TaskSpec]:

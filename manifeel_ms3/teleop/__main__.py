@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import gymnasium as gym
 import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import make_env, task_spec
 
 from .devices import DEVICES, follow
 from .operator import Operator, steerable_axes
@@ -65,7 +64,7 @@ def main(args: Args) -> Path:
     if args.cameras is not None:
         kwargs["cameras"] = list(args.cameras)
     kwargs |= json_object("--env-kwargs", args.env_kwargs)
-    env = gym.make(args.env_id, **kwargs)
+    env = make_env(args.env_id, **kwargs)
     base: Any = env.unwrapped
     operator = Operator(steerable_axes(base.control_mode))
     if args.device:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -9,28 +10,22 @@ import time
 from pathlib import Path
 
 import pytest
+import tyro
 
-from baselines.studies import __main__ as matrix
+from baselines.registry import all_policies
+from baselines.studies import __main__ as study_command
 from baselines.studies import cost
-from baselines.studies.jobs import is_done, perform, training_args
-from baselines.studies.study import StudyError, read_study, stages_of
+from baselines.studies.command_lines import shell_command, training_args
+from baselines.studies.jobs import is_done, perform
+from baselines.studies.study import StudyError, jobs_of, read_study
+from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
+from manifeel_ms3.errors import MachineError
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.tasks.registry import tasks_of_table
+from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[2]
-TINY = """
-resources: {record: {cpus: 1}, train: {cpus: 1}, evaluate: {cpus: 1}}
-grids:
-  - tasks: [ManiFeel-PegInsertion-v1]
-    obs_modes: [tacff]
-    seeds: [0]
-    demos: 1
-    preset: cpu
-    task_args: {fit: loose, max_episode_steps: 110, randomization: {socket_xy: 0.0, start_xy: 0.0, start_z: 0.0}}
-    train: {steps: 12, save-every: 6, warmup-steps: 2, batch-size: 4, policy.down-dims: [8, 16]}
-    episodes: 1
-    checkpoints: 2
-"""
 
 
 @pytest.fixture
@@ -51,42 +46,109 @@ grids:
      encoder_flags: {t3: {image-size: 224}}, seeds: [0, 1]}
   - {tasks: [ManiFeel-PegInsertion-v1], obs_modes: [rgb], seeds: [0]}
 """)
-    stages = stages_of(read_study(path))
-    kinds = [stage.kind for stage in stages]
+    jobs = jobs_of(read_study(path))
+    kinds = [job.kind for job in jobs]
     assert (kinds.count("record"), kinds.count("train"), kinds.count("evaluate")) == (2, 12, 12)  # rgb; rgb+tacrgb with two
-    touched = [stage for stage in stages if stage.settings.get("flags", {}).get("policy.encoder.tacrgb") == "t3"]
+    touched = [job for job in jobs if job.settings.get("flags", {}).get("policy.encoder.tacrgb") == "t3"]
     assert len(touched) == 4
-    assert all(stage.settings["flags"]["image-size"] == 224 for stage in touched)
-    assert {stage.settings["camera"] for stage in stages if stage.kind == "record"} == {"wrist", "front"}
-    assert len({stage.key for stage in stages}) == len(stages)
+    assert all(job.settings["flags"]["image-size"] == 224 for job in touched)
+    assert {job.settings["camera"] for job in jobs if job.kind == "record"} == {"wrist", "front"}
+    assert len({job.key for job in jobs}) == len(jobs)
 
 
-def test_a_stage_is_named_by_all_that_it_depends_on(study):
-    keys = {stage.kind: stage.key for stage in stages_of(read_study(study))}
+def test_a_job_is_named_by_all_that_it_depends_on(study):
+    keys = {job.kind: job.key for job in jobs_of(read_study(study))}
     study.write_text(TINY.replace("demos: 1", "demos: 2"))
-    other = {stage.kind: stage.key for stage in stages_of(read_study(study))}
+    other = {job.kind: job.key for job in jobs_of(read_study(study))}
     assert all(keys[kind] != other[kind] for kind in keys)  # other data: another policy, another result
     study.write_text(TINY.replace("episodes: 1", "episodes: 2"))
-    other = {stage.kind: stage.key for stage in stages_of(read_study(study))}
+    other = {job.kind: job.key for job in jobs_of(read_study(study))}
     assert [keys[kind] == other[kind] for kind in ("record", "train", "evaluate")] == [True, True, False]
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda path: path.stem)
-def test_the_studies_that_come_along_can_be_planned(path):
-    stages = stages_of(read_study(path))
-    assert {stage.kind for stage in stages} == {"record", "train", "evaluate"}
-    for stage in stages:
-        if stage.kind == "train":
-            training_args(stage)  # its flags are known to train.py
+def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
+    study = read_study(path)
+    jobs = jobs_of(study)
+    assert {job.kind for job in jobs} == {"record", "train", "evaluate"}
+    trials = [trial for job in jobs for trial in cost.trials_of(job)]
+    measured = {trial.key: dict(seconds=0.5) for trial in trials}  # the trials themselves: the tests below
+    (tmp_path / cost.TRIALS).write_text(json.dumps(measured))
+    table = study_command.plan(study, jobs, tmp_path)
+    assert table.row_count == len({(job.kind, job.title.partition(", seed")[0]) for job in jobs}) + 1
+    assert list(table.columns[1].cells)[-1] == "all jobs that are left"
+    assert float(list(table.columns[3].cells)[-1]) > 0
+    assert {json.dumps(trial.arguments) for trial in trials if trial.measure is cost.gradient_step}
+    for job in jobs:
+        if job.kind == "train":
+            training_args(job)  # the trainer knows the flags
+
+
+@pytest.mark.parametrize("obs_mode", ["rgb", "rgb+tacrgb", "tacff"])
+@pytest.mark.parametrize("policy", sorted(all_policies()))
+def test_every_policy_is_tried_out(policy, obs_mode):
+    flags = ["cpu", "--obs-mode", obs_mode, "--image-size", "48", "--policy.encoder.crop", "0", "--batch-size", "2"]
+    assert 0 < cost.gradient_step(policy, *flags) < 60
+    assert 0 < cost.inference(policy, *flags, "--inference-steps", "1") < 60
+
+
+def test_trials_do_not_repeat_for_what_costs_the_same():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))
+    steps = {trial.key for job in jobs if job.kind == "train" for trial in cost.trials_of(job)}
+    assert len(steps) == 3  # one network for each observation mode, whatever the task, the camera and the seed
+
+
+def test_a_table_of_the_paper_stands_for_its_tasks(study):
+    study.write_text("grids: [{tasks: table I, num_demos: [50]}]")
+    (grid,) = read_study(study).grids
+    assert list(grid.tasks) == tasks_of_table("I")
+    counts = {
+        job.settings["flags"]["env-id"]: job.settings["flags"].get("num-demos") for job in jobs_of(read_study(study))[9:90]
+    }
+    assert counts["ManiFeel-GearAssembly-v1"] == 50
+    assert counts["ManiFeel-BulbInstallation-v1"] is None  # the paper recorded 20: all are used
+
+
+def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
+    jobs = jobs_of(read_study(study))
+    study_command.main(study_command.Args(study, tmp_path, print_commands=True))
+    lines = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("#")]
+    assert lines == [shell_command(job, tmp_path, 1) for job in jobs]
+    record, train = (shlex.split(line) for line in lines[:2])
+    assert record[:2] == ["manifeel", "record"]
+    recording = tyro.cli(cli.command_module("record").Args, args=record[2:])
+    assert recording.out == jobs[0].folder(tmp_path) / "trajectory.h5"
+    assert train[:3] == ["manifeel", "train", "diffusion_policy"]
+    training = tyro.cli(cli.command_module("train").Args, args=train[2:])
+    assert training == training_args(jobs[1], tmp_path)
+    assert training.demos == (recording.out,)
+    (tmp_path / "train" / jobs[1].key / "checkpoints/00000006").mkdir(parents=True)
+    (tmp_path / "train" / jobs[1].key / "checkpoints/last").mkdir()
+    shown = lines[2].replace("do manifeel", "do echo")
+    said = subprocess.run(["bash", "-c", shown], capture_output=True, text=True, check=True).stdout.splitlines()
+    evaluation = tyro.cli(cli.command_module("eval").Args, args=shlex.split(said[0])[1:-1])
+    assert len(said) == 1
+    assert evaluation.checkpoint == tmp_path / "train" / jobs[1].key / "checkpoints/00000006"
 
 
 @pytest.mark.parametrize(
     ("content", "word"),
     [
         ("grids: [", "cannot be read as a study"),
-        ("[1, 2]", "is no study"),
+        ("[1, 2]", "is not a study"),
         ("grids: []", "has no grids"),
-        ("grids: [{tasks: [ManiFeel-Knitting-v1]}]", "ManiFeel-Knitting-v1.* are unknown"),
+        (
+            "grids: [{tasks: [ManiFeel-Knitting-v1]}]",
+            r"'ManiFeel-Knitting-v1' is not registered; registered are \['ManiFeel-Peg",
+        ),
+        ("grids: [{tasks: table IX}]", r"no task is in table 'IX' of the paper; its tables are \['I', 'II', 'III'\]"),
+        (
+            "grids: [{tasks: table I, policies: [knitting]}]",
+            r"'knitting' is not registered; registered are \['diffusion_policy', 'equivariant_diffusion_policy', 'flow_",
+        ),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], num_demos: [900]}]", r"num_demos \[900\] are more than the 50 recorded"),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seeds: 3}]", "`seeds` has the wrong type: 3"),
+        ("grids: {tasks: table I}", "`grids` has the wrong type"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seed: 1}]", "'seed'.* are not known"),
         ("grids: [{seeds: [0]}]", "tasks"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1]}]\nresources: {training: {}}", "'training'.* are not known"),
@@ -94,28 +156,30 @@ def test_the_studies_that_come_along_can_be_planned(path):
 )
 def test_what_is_wrong_with_a_study_is_said(study, content, word):
     study.write_text(content)
-    with pytest.raises(StudyError, match=word):
+    with pytest.raises(StudyError, match=word) as error:
         read_study(study)
+    if "cannot be read" not in word:  # yaml's own message has several lines
+        assert len(str(error.value).splitlines()) == 1
 
 
 def test_a_plan_tells_the_hours_from_a_trial(study, tmp_path):
-    stages = stages_of(read_study(study))
-    table = matrix.plan(read_study(study), stages, tmp_path)
+    jobs = jobs_of(read_study(study))
+    table = study_command.plan(read_study(study), jobs, tmp_path)
     assert table.row_count == 4
-    assert [cost.estimate(stage, tmp_path, 1).source for stage in stages] == ["a trial"] * 3
-    one, two = (cost.estimate(stages[2], tmp_path, workers).seconds for workers in (1, 2))
+    assert [cost.estimate(job, tmp_path, 1).source for job in jobs] == ["a trial"] * 3
+    one, two = (cost.estimate(jobs[2], tmp_path, workers).seconds for workers in (1, 2))
     assert one == pytest.approx(2 * two)
-    hours = cost.estimate(stages[0], tmp_path, 1).seconds / 3600
+    hours = cost.estimate(jobs[0], tmp_path, 1).seconds / 3600
     assert 1e-4 < hours < 0.1  # one demonstration
     before = (tmp_path / "trials.json").stat().st_mtime_ns
-    matrix.plan(read_study(study), stages, tmp_path)
+    study_command.plan(read_study(study), jobs, tmp_path)
     assert (tmp_path / "trials.json").stat().st_mtime_ns == before  # measured once
 
 
 def test_what_a_machine_does_not_have_is_said(study, tmp_path):
     study.write_text(TINY.replace("train: {cpus: 1}", "train: {cpus: 1, gpus: 99}"))
-    with pytest.raises(StudyError, match="train needs 99 GPUs"):
-        matrix.main(matrix.Args(study, tmp_path))
+    with pytest.raises(MachineError, match="train needs 99 GPUs"):
+        study_command.main(study_command.Args(study, tmp_path))
     assert subprocess.run([sys.executable, "-c", "raise SystemExit(3)"], check=False).returncode == 3  # Ray has hidden nothing
 
 
@@ -137,14 +201,14 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 240) -> dic
 
 
 def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_path):
-    root = tmp_path / "matrix"
-    record, train, evaluate = stages_of(read_study(study))
+    root = tmp_path / "study"
+    record, train, evaluate = jobs_of(read_study(study))
     process = start(study, root)
     os.kill(wait_for(train.folder(root) / "started.json", process)["pid"], signal.SIGKILL)
     said = process.communicate(timeout=400)[0]
     assert process.returncode == 0, said
-    assert "3 of 3 stages" in said
-    done = {stage.kind: json.loads((stage.folder(root) / "done.json").read_text()) for stage in (record, train, evaluate)}
+    assert "3 of 3 jobs" in said
+    done = {job.kind: json.loads((job.folder(root) / "done.json").read_text()) for job in (record, train, evaluate)}
     assert [done[kind]["attempts"] for kind in ("record", "train", "evaluate")] == [1, 2, 1]
     assert [done[kind]["units"] for kind in ("record", "train", "evaluate")] == [1, 12, 2]
     results = results_in(root)
@@ -156,22 +220,22 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
     assert (tmp_path / "images/page.png").stat().st_size > 1000  # the curve of training
 
     before = {path: path.stat().st_mtime for path in root.rglob("*.json")}
-    matrix.main(matrix.Args(study, root))  # all is done: Ray is not even started
+    study_command.main(study_command.Args(study, root))  # all is done: Ray is not even started
     assert {path: path.stat().st_mtime for path in root.rglob("*.json")} == before
 
 
 def test_what_fails_is_told_and_tried_again(study, tmp_path):
     study.write_text(TINY.replace("steps: 12", "steps: 12, image-size: -1, policy.encoder.force-field: nonsense"))
-    record, train, _ = stages_of(read_study(study))
-    root = tmp_path / "matrix"
+    record, train, _ = jobs_of(read_study(study))
+    root = tmp_path / "study"
     (record.folder(root)).mkdir(parents=True)
     (record.folder(root) / "done.json").write_text(json.dumps(dict(settings=record.settings)))
-    with pytest.raises(Exception, match="trajectory.h5"):  # what it needs is said to be done, and is not there
+    with pytest.raises(Exception, match=r"trajectory\.h5"):  # what it needs is said to be done, and is not there
         perform(train, root)
     failed = json.loads((train.folder(root) / "failed.json").read_text())
     assert "trajectory.h5" in failed["error"]
     assert not is_done(train, root)
-    assert "trajectory.h5" in matrix._reason(train, root)
+    assert "trajectory.h5" in study_command._reason(train, root)
     (record.folder(root) / "done.json").unlink()
     perform(record, root)
     with pytest.raises(ValueError, match="nonsense"):

@@ -1,0 +1,72 @@
+"""The commands that do a study's jobs; a job runs with exactly the arguments that are printed here."""
+
+import shlex
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from baselines.registry import policy_spec, preset_cli
+
+from .study import Job
+
+OBS_MODE = "rgb+tacrgb+tacff"
+"""Recordings hold everything that any policy of a study observes."""
+
+
+def trajectory_of(job: Job, root: Path) -> Path:
+    """File of the demonstrations that a recording writes."""
+    return job.folder(root) / "trajectory.h5"
+
+
+def record_arguments(job: Job, root: Path, workers: int) -> list[str]:
+    """Arguments of `manifeel record` for a job."""
+    settings = job.settings
+    sensing = ["--obs-mode", OBS_MODE, "--cameras", settings["camera"], "--tactile-sensors", "right"]
+    amount = ["--num", str(settings["num"]), "--workers", str(workers)]
+    out = ["--env-kwargs", settings["env_kwargs"], "--out", str(trajectory_of(job, root))]
+    return [settings["env_id"], *amount, *sensing, *out]
+
+
+def train_arguments(job: Job, root: Path) -> list[str]:
+    """Arguments of `manifeel train <policy>` for a job; the first is the preset."""
+    (record,) = job.needs
+    preset, *flags = train_flags(job.settings)
+    return [preset, "--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root)), *flags]
+
+
+def train_flags(settings: dict[str, Any]) -> list[str]:
+    """Preset and flags of a training job, without its data and its folder."""
+    flags = [settings["preset"]]
+    for name, value in settings["flags"].items():
+        flags += [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
+    return flags
+
+
+def evaluate_arguments(job: Job, workers: int, checkpoint: str, out: str) -> list[str]:
+    """Arguments of `manifeel eval` for one checkpoint of a job."""
+    amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(workers)]
+    return ["--checkpoint", checkpoint, *amount, "--env-kwargs", job.settings["env_kwargs"], "--out", out]
+
+
+def training_args(job: Job, root: Path = Path()) -> Any:
+    """The `TrainArgs` of a training job, of its policy's own class."""
+    return _parsed(job.settings["policy"], *train_arguments(job, root))
+
+
+@cache
+def _parsed(policy: str, *arguments: str) -> Any:
+    return preset_cli(policy_spec(policy), list(arguments))
+
+
+def shell_command(job: Job, root: Path, workers: int) -> str:
+    """One line of shell that does a job by hand; the jobs that it needs must be done before."""
+    if job.kind == "record":
+        return shlex.join(["manifeel", "record", *record_arguments(job, root, workers)])
+    if job.kind == "train":
+        return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root)])
+    (train,) = job.needs
+    checkpoints = shlex.quote(str(train.folder(root) / "checkpoints"))
+    out = shlex.quote(str(job.folder(root)))
+    command = shlex.join(["manifeel", "eval", *evaluate_arguments(job, workers, "CHECKPOINT", "OUT")])
+    command = command.replace("CHECKPOINT", f"{checkpoints}/$step").replace("OUT", f"{out}/$step.json")
+    return f"for step in $(ls {checkpoints} | grep -x '[0-9]*' | tail -n {job.settings['checkpoints']}); do {command}; done"
