@@ -124,10 +124,13 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
     assert training.demos == (recording.out,)
     (tmp_path / "train" / jobs[1].key / "checkpoints/00000006").mkdir(parents=True)
     (tmp_path / "train" / jobs[1].key / "checkpoints/last").mkdir()
-    shown = lines[2].replace("do manifeel", "do echo")
-    said = subprocess.run(["bash", "-c", shown], capture_output=True, text=True, check=True).stdout.splitlines()
-    evaluation = tyro.cli(cli.command_module("eval").Args, args=shlex.split(said[0])[1:-1])
-    assert len(said) == 1
+    shown = lines[2].replace("do manifeel", "do printf '%s\\n'")  # the words of each command, one a line
+    name, *words = subprocess.run(["bash", "-c", shown], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert name == "eval"
+    assert "eval" not in words  # one command: "last" is not a checkpoint of its own
+    evaluation = tyro.cli(cli.command_module("eval").Args, args=words)
+    assert json.loads(evaluation.env_kwargs)["fit"] == "loose"
+    assert evaluation.out == tmp_path / "evaluate" / jobs[2].key / "00000006.json"
     assert evaluation.checkpoint == tmp_path / "train" / jobs[1].key / "checkpoints/00000006"
 
 
