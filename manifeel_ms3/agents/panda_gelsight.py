@@ -1,7 +1,7 @@
 """The robot of every ManiFeel task: a Franka Panda with a GelSight R1.5 finger on each side and a wrist camera."""
 
-# pyright: reportArgumentType=false
-# (controllers' configurations are built from dicts of mixed types, as ManiSkill's own robots do it)
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# (ManiSkill builds controller configurations from dicts of mixed types, and annotates a combined controller by its base class)
 from typing import Any, ClassVar
 
 import numpy as np

@@ -9,6 +9,8 @@ the gel's face lies in its plane y = 0. A gel link (`gel_left`, `gel_right`) is 
 the untouched face, x along image rows (across the finger), y along image columns (towards the tip), z out of the gel.
 """
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+# (trimesh's annotations do not tell scenes and visuals of different kinds apart)
 import hashlib
 import tempfile
 import xml.etree.ElementTree as ET

@@ -4,6 +4,8 @@ A skill is a generator of actions. It reads the state of the world again after e
 same controller as a policy does, within the same limits. The load that it acts on is the sum of the force fields of both pads.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (ManiSkill annotates a combined controller by its base class)
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,6 +1,7 @@
 """Fits: a held plug with a leading end, and the socket that takes it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -48,7 +49,7 @@ class Fit:
     @staticmethod
     def into_hole(
         prong: tuple[float, float], hole: tuple[float, float], at: tuple[float, float] = (0.0, 0.0)
-    ) -> dict[str, tuple[float, float]]:
+    ) -> dict[str, Any]:
         """`corner`, `aim` and `lean` of a prong that finds the (+x, +y) corner of a hole.
 
         Args:

@@ -158,7 +158,7 @@ class Part:
             # the engine takes negative restitution as a spring, and averages it with the other body's
             material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
             piece.add_to(builder, material, self.density, look)
-        builder.initial_pose = initial_pose
+        builder.initial_pose = initial_pose  # pyright: ignore[reportAttributeAccessIssue]  (ManiSkill annotates its own poses alone)
         builder.set_physx_body_type(body_type)
         actor = builder.build(self.name)
         if self.relief is not None:

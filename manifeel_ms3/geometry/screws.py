@@ -2,12 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+import torch
 import trimesh
 
 from .part import Ball, Box, Cylinder, Hulls, Part, Solid, ring_of_wedges
 from .threads import FLANK, edison, external_mesh, internal_mesh, iso_metric, ridge
+
+Height = TypeVar("Height", float, np.ndarray, torch.Tensor)
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,7 @@ def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int
     )
 
 
-def bulb_yaw(height: float | np.ndarray) -> float | np.ndarray:
+def bulb_yaw(height: Height) -> Height:
     """Yaw, in rad, of a bulb whose ridge lies in the middle of the holder's groove.
 
     Args:

@@ -1,5 +1,7 @@
 """Observation with cameras and tactile pads."""
 
+# pyright: reportArgumentType=false, reportCallIssue=false
+# (ManiSkill annotates images as arrays of any library, and sensors by their base class)
 from typing import Any
 
 import torch

@@ -1,5 +1,7 @@
 """The base class of every ManiFeel task: table, robot, cameras, light, touch, and the contents of an observation."""
 
+# pyright: reportArgumentType=false
+# (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
@@ -262,7 +264,7 @@ class VisuotactileEnv(SensingEnv):
         """Let the grip take its load before the first observation; the other environments' states are restored afterwards."""
         others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         others[env_idx] = False
-        state = self.get_state_dict() if others.any() else None
+        state: Any = self.get_state_dict() if others.any() else None
         for _ in range(round(SETTLE_SECONDS * self._sim_freq)):
             self.scene.step()
         if self.gpu_sim_enabled:
@@ -285,7 +287,7 @@ class VisuotactileEnv(SensingEnv):
 
     def _step_action(self, action):
         if action is not None:
-            shape = self.single_action_space.shape
+            shape: Any = self.single_action_space.shape
             action = checked_action(action, (shape, (self.num_envs, *shape)), self.device)
         self._pad_forces = []
         action = super()._step_action(action)

@@ -1,5 +1,6 @@
 """The shipped sample demonstrations, replayed from their seeds: the tasks' outcomes and their rewards."""
 
+from dataclasses import dataclass
 from functools import cache
 
 import gymnasium as gym
@@ -14,60 +15,73 @@ from manifeel_ms3.tasks.registry import all_tasks
 TASKS = sorted(name for name in all_tasks() if name.startswith("ManiFeel-"))
 SAMPLE_REVISIONS = dict.fromkeys(TASKS, 1)
 """Revision of each task with which its sample was recorded."""
-SAME_PLACE = 1e-6
-"""Largest difference of a final pose, in m and of a quaternion's components. On the machine of the recording it is 0; other
-processors may round differently, which moves a part by less than this, whereas a change of the task moves it by more."""
+EPISODES = dict.fromkeys(TASKS, 0) | {"ManiFeel-PegInsertion-v1": 1}
+"""The episode that is replayed. The first one of PegInsertion feels its way along the rim of a hole with 0.04 mm of clearance:
+there the rounding of another processor decides whether the peg enters."""
+FREE_STEPS = 20
+"""Steps before the first contact of any sample; until then a replay repeats the recording on every processor."""
+SAME_MOTION = 1e-5
+"""Largest difference of a pose during the free steps, in m and of a quaternion's components; 0 on the processor of the
+recording, 2e-6 seen on another."""
+SAME_PLACE = 1e-2
+"""Largest difference of a final pose, in m and of a quaternion's components; 0 on the processor of the recording, 7e-3 seen on
+another, where contacts round differently."""
 HOW_TO_MEND = (
     "the sample of {task} has another outcome than when it was recorded: "
     "raise the revision of {task} in its register_task(...) and record the sample anew"
 )
 
 
+@dataclass
+class Replay:
+    """An episode as it was recorded and as it is now."""
+
+    episode: dict
+    """Entry of the recording's json."""
+    success: bool
+    rewards: np.ndarray
+    """(T,)"""
+    deviation: np.ndarray
+    """(T,) largest difference of any object's pose from the recorded one, in m and of a quaternion's components."""
+
+
 @cache
-def replayed(task: str) -> tuple[dict, dict[str, np.ndarray], dict, np.ndarray, dict[str, np.ndarray]]:
-    """The first episode as it was recorded (header, final poses) and as it is now (last info, rewards, final poses)."""
+def replayed(task: str) -> Replay:
     path = data_dir() / "sample" / task / "states.h5"
-    episode = read_header(path)["episodes"][0]
+    episode = read_header(path)["episodes"][EPISODES[task]]
     with h5py.File(path) as file:
         trajectory = file[f"traj_{episode['episode_id']}"]
         actions = trajectory["actions"][()]
-        recorded = {name: poses[-1] for name, poses in trajectory["env_states/actors"].items()}
-    env = gym.make(
-        task,
-        obs_mode="none",
-        reward_mode="normalized_dense",
-        control_mode=episode["control_mode"],
-        sim_backend="physx_cpu",
-        render_backend="none",
-    )
+        recorded = {name: poses[1:, :7] for name, poses in trajectory["env_states/actors"].items()}
+    modes = dict(obs_mode="none", reward_mode="normalized_dense", control_mode=episode["control_mode"])
+    env = gym.make(task, **modes, sim_backend="physx_cpu", render_backend="none")
     env.reset(seed=episode["episode_seed"])
-    info, rewards = {}, []
-    for action in actions:
+    info, rewards, deviation = {}, [], []
+    for t, action in enumerate(actions):
         _, reward, *_, info = env.step(action)
         rewards.append(float(reward))
-    final = {name: state[0].cpu().numpy() for name, state in env.unwrapped.get_state_dict()["actors"].items()}
+        actors = env.unwrapped.get_state_dict()["actors"]
+        assert set(actors) == set(recorded), HOW_TO_MEND.format(task=task)
+        deviation.append(max(np.abs(actors[name][0, :7].cpu().numpy() - poses[t]).max() for name, poses in recorded.items()))
     env.close()
-    return episode, recorded, info, np.array(rewards), final
+    return Replay(episode, bool(info["success"]), np.array(rewards), np.array(deviation))
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_outcome_of_the_sample_has_not_changed(task):
-    episode, recorded, info, rewards, final = replayed(task)
-    complaint = HOW_TO_MEND.format(task=task)
+    replay, complaint = replayed(task), HOW_TO_MEND.format(task=task)
     assert all_tasks()[task].revision == SAMPLE_REVISIONS[task], f"record the sample of {task} with its new revision"
-    assert bool(info["success"]) == episode["success"], complaint
-    assert len(rewards) == episode["elapsed_steps"], complaint
-    assert set(final) == set(recorded), complaint
-    for name, state in recorded.items():
-        assert np.abs(final[name][:7] - state[:7]).max() <= SAME_PLACE, f"{name}: {complaint}"
+    assert replay.success == replay.episode["success"], complaint
+    assert replay.deviation[:FREE_STEPS].max() <= SAME_MOTION, complaint
+    assert replay.deviation[-1] <= SAME_PLACE, complaint
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_rewards_are_normalised_and_rise_to_the_goal(task):
-    _, _, info, rewards, _ = replayed(task)
-    assert info["success"].all()
-    assert rewards.min() >= 0.0
-    assert rewards.max() <= 1.0
-    assert rewards[-1] > 0.9
-    first, middle, last = (part.mean() for part in np.array_split(rewards, 3))
+    replay = replayed(task)
+    assert replay.success
+    assert replay.rewards.min() >= 0.0
+    assert replay.rewards.max() <= 1.0
+    assert replay.rewards[-1] > 0.9
+    first, middle, last = (part.mean() for part in np.array_split(replay.rewards, 3))
     assert first < middle < last
