@@ -300,7 +300,7 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
         ObservationEncoder(EncoderConfig(tacrgb="sparsh", crop=30), SPEC, 1)
     with pytest.raises(ValueError, match="'resnet18' is no representation"):
         ObservationEncoder(EncoderConfig(freeze_tacrgb=True), SPEC, 1)
-    with pytest.raises(ValueError, match="no network takes them"):
+    with pytest.raises(ValueError, match="no network of this policy takes them"):
         load_pretrained(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")
 
 
