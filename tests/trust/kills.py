@@ -26,7 +26,7 @@ args = record.Args(out=Path(arguments.pop("out")), cameras=(), tactile_sensors=(
 
 
 def kill(event, given):
-    if moment and event == moment[0] and moment[1] in str(given[-1] if event == "os.rename" else given[0]):
+    if moment and event == moment[0] and moment[1] in str(given):
         moment[2] -= 1
         if moment[2] < 0:
             os.kill(os.getpid(), signal.SIGKILL)

@@ -375,7 +375,7 @@ def test_a_missing_folder_of_episodes_is_named(tmp_path):
         pass
     recording.begin()
     remove_folder(episode_folder(path))
-    with open_recording(path, HEADER):
+    with pytest.raises(DemonstrationError, match=r"lacks the episodes of the seeds \[0\]"), open_recording(path, HEADER):
         pass
 
 
