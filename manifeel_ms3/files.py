@@ -2,10 +2,12 @@
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import jsonschema
 
@@ -87,6 +89,36 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
     except (OSError, ValueError) as error:
         raise InvalidFileError(_not(path, kind, str(error))) from error
     return content
+
+
+def move(source: Path, target: Path) -> None:
+    """Rename a file or a folder, and let the new name reach the disk.
+
+    Raises:
+        FileWriteError: It cannot be renamed.
+    """
+    try:
+        source.replace(target)
+        _flush(target.parent)
+    except OSError as error:
+        raise FileWriteError(
+            f"{source} cannot be moved to {target} ({error}); get the permission, or give another path"
+        ) from error
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder, which need not exist, in one step: it is renamed first, and then deleted.
+
+    Where a deletion is interrupted, the next call for the same path completes it.
+
+    Raises:
+        FileWriteError: The folder cannot be renamed.
+    """
+    prefix = f".{folder.name}.removed-"
+    if folder.exists():
+        move(folder, folder.with_name(prefix + uuid4().hex))
+    for removed in [path for path in folder.parent.iterdir() if path.name.startswith(prefix)]:
+        shutil.rmtree(removed, ignore_errors=True)  # what cannot be deleted now is deleted by a later call
 
 
 def _not(path: Path, kind: str, reason: str) -> str:

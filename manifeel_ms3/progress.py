@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -30,18 +31,23 @@ def progress_bar(disable: bool = False) -> Progress:
 @contextmanager
 def episode_counter(
     description: str, total: int, done: int, on_episode: Callable[[], None] | None = None
-) -> Iterator[Callable[[], None]]:
-    """A context with the function to call after each episode: `on_episode`, or else one that advances a progress bar.
+) -> Iterator[Callable[[int], None]]:
+    """A context with the function to call with a number of further episodes: it calls `on_episode`, or advances a progress bar.
 
     Args:
         description: Text beside the bar.
         total: Number of episodes.
         done: Number of episodes that are finished already.
-        on_episode: Called instead of showing a bar.
+        on_episode: Called once for each episode instead of showing a bar.
     """
     if on_episode is not None:
-        yield on_episode
+        yield partial(_repeat, on_episode)
         return
     with progress_bar() as bar:
         task = bar.add_task(description, total=total, completed=done)
-        yield lambda: bar.advance(task)
+        yield lambda number: bar.advance(task, number)
+
+
+def _repeat(function: Callable[[], None], number: int) -> None:
+    for _ in range(number):
+        function()

@@ -7,11 +7,13 @@ with WorkerPool(2, partial(gym.make, "ManiFeel-PegInsertion-v1")) as pool:
         print(finished.task, finished.result())
 """
 
+import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import get_context
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -64,8 +66,8 @@ class WorkerPool(Generic[State, Task]):
     """Processes that share tasks; a process that dies fails its task and is replaced.
 
     Processes are spawned, because a forked renderer does not work, and use one thread each for torch, because they share the
-    cores and because sums then do not depend on the number of threads. Where the context is left by an exception, tasks that
-    wait are cancelled and those that run are ended.
+    cores and because sums then do not depend on the number of threads. They end when the process that made them is killed.
+    Where the context is left by an exception, tasks that wait are cancelled and those that run are ended.
 
     Args:
         workers: Number of worker processes.
@@ -80,7 +82,7 @@ class WorkerPool(Generic[State, Task]):
         if workers < 1:
             raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
         worker = _Worker(make_state)
-        self._pool = ProcessPool(workers, context=get_context("spawn"), initializer=_start, initargs=(worker,))
+        self._pool = ProcessPool(workers, context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(worker,))
         self._running: dict[Future[Any], Task] = {}
 
     def __enter__(self) -> "WorkerPool[State, Task]":
@@ -130,7 +132,16 @@ _this_worker: _Worker | None = None
 def _start(worker: _Worker) -> None:
     global _this_worker
     torch.set_num_threads(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _this_worker = worker
+
+
+def _end_with_parent() -> None:
+    """End this process when the one that made it has ended, even if that was killed and could not tell."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _run(function: Callable[[Any, Any], Any], task: Any) -> Any:

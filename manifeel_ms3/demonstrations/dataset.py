@@ -19,15 +19,18 @@ import tyro
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import read_json, write_json
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import record, render_observations
-from .formats.maniskill_h5 import DemonstrationError, finished_episodes, read_header
+from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header
 
 SCHEMA = "manifeel-demonstrations-1"
 """Name and version of the manifest's form."""
+MANIFEST_FILE = "manifest.json"
+"""Name of the manifest in its folder."""
 IMAGE_SIZE = 256
 """Width and height of the tasks' camera images in pixels, for which `TaskSpec.demo_megabytes` holds."""
 SMALLEST_SHARE = 0.2
@@ -69,16 +72,22 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: A task is not registered, or has no demonstrator.
-        MachineError: The disk has too little room.
+        MachineError: The disk has too little room, or the folder cannot be written.
+        InUseError: Another process writes the folder.
     """
+    with owned(args.out / MANIFEST_FILE):
+        return _record_all(args)
+
+
+def _record_all(args: Args) -> Path:
     counts = {task: args.num or task_spec(task).paper_demos for task in args.tasks}
     observed = args.obs_mode != "none"
-    args.out.mkdir(parents=True, exist_ok=True)
     _check_room(args, counts if observed else {})
     files = {task: (args.out / task / "states.h5", args.out / task / "trajectory.h5") for task in counts}
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
-        done = sum(len(finished_episodes(path)) for paths in files.values() for path in paths[: 1 + observed])
+        wanted = [path for paths in files.values() for path in paths[: 1 + observed]]
+        done = sum(count_episodes(path) for path in wanted if path.is_file())
         progress = bar.add_task("all tasks", total=total, completed=min(done, total))
         count = partial(bar.advance, progress)
         for task, (states, trajectory) in files.items():
@@ -89,7 +98,7 @@ def main(args: Args) -> Path:
                 images = (args.obs_mode, args.cameras, args.tactile_sensors, args.image_size)
                 render_observations.main(render_observations.Args(states, trajectory, *images, workers=args.workers), count)
             write_manifest(args.out)
-    return args.out / "manifest.json"
+    return args.out / MANIFEST_FILE
 
 
 def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
@@ -117,7 +126,7 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
 def write_manifest(folder: Path) -> None:
     """Write `manifest.json` for the trajectory files under a folder."""
     files = {path.relative_to(folder).as_posix(): describe(path) for path in sorted(folder.glob("*/*.h5"))}
-    write_json(folder / "manifest.json", dict(schema=SCHEMA, version=version("manifeel-ms3"), files=files))
+    write_json(folder / MANIFEST_FILE, dict(schema=SCHEMA, version=version("manifeel-ms3"), files=files))
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -154,7 +163,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     Raises:
         DemonstrationError: There is no manifest, or it has another form or a newer version.
     """
-    path = Path(folder) / "manifest.json"
+    path = Path(folder) / MANIFEST_FILE
     if not path.is_file():
         raise DemonstrationError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
     try:

@@ -10,7 +10,7 @@ from mani_skill.utils import common
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks import VisuotactileEnv
 
-from .formats.maniskill_h5 import Episode
+from .formats.maniskill_h5_writing import Episode
 
 FORCE_DECIMALS = 3
 """Decimals of a peak force in the json, in N: millinewtons, far below what matters in contact."""

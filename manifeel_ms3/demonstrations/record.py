@@ -23,8 +23,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
-from .formats.maniskill_h5 import consolidate, open_for_more, write_index
-from .recording import Recorder, finished_before, make_header, make_recorder
+from .recording import Recorder, Recording, make_header, make_recorder, open_recording
 
 log = logging.getLogger(__name__)
 
@@ -85,49 +84,50 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         UnknownNameError: The task is not registered, or has no demonstrator.
         InvalidArgumentError: Seeds are asked for that are for evaluation, or an argument is not allowed.
         DemonstrationError: The file was recorded with other arguments.
+        InUseError: Another process records into the file.
         WorkFailedError: Too many seeds failed, or a worker process died.
     """
     require_demonstrator(args.env_id)
     path, seeds = args.path, args.seeds
     images = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     env_kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | images | json_object("--env-kwargs", args.env_kwargs)
-    header = make_header(args.env_id, env_kwargs)
-    infos, failed = finished_before(path, header)
-    if len(infos) >= args.num:
-        log.info("%s already holds %d episodes", path, len(infos))
-        return path
-    open_for_more(path)
-    with (
-        episode_counter(f"recording {args.env_id}", args.num, len(infos), on_episode) as count,
-        WorkerPool(args.workers, partial(make_recorder, args.env_id, env_kwargs, path)) as pool,
-    ):
-        left = (seed for seed in seeds if seed not in infos and seed not in failed)
-        _submit(pool, left, args, infos)
-        for finished in pool.as_finished():
-            info = finished.result()
-            if info is None:
-                failed.add(finished.task)
-            else:
-                infos[finished.task] = info
-                count()
-            write_index(path, header | dict(failed_seeds=sorted(failed)), dict(sorted(infos.items())))
-            _submit(pool, left, args, infos)
-    consolidate(path)
+    header = make_header(args.env_id, env_kwargs) | dict(failed_seeds=[])
+    with open_recording(path, header, seeds) as recording:
+        if recording.is_complete and len(recording.infos) >= args.num:
+            log.info("%s already holds %d episodes", path, len(recording.infos))
+            return path
+        recording.begin()
+        with (
+            episode_counter(f"recording {args.env_id}", args.num, len(recording.infos), on_episode) as count,
+            WorkerPool(args.workers, partial(make_recorder, args.env_id, env_kwargs, recording.drafts)) as pool,
+        ):
+            left = (seed for seed in seeds if seed not in recording.infos and seed not in recording.failed)
+            _submit(pool, left, args, recording, count)
+            for finished in pool.as_finished():
+                seed, info = finished.task, finished.result()
+                count(recording.reject(seed) if info is None else recording.accept(seed, info))
+                _submit(pool, left, args, recording, count)
+        recording.finish()
     return path
 
 
-def _submit(pool: WorkerPool[Recorder, int], seeds: Iterator[int], args: Args, infos: dict[int, Any]) -> None:
+def _submit(
+    pool: WorkerPool[Recorder, int], seeds: Iterator[int], args: Args, recording: Recording, count: Callable[[int], None]
+) -> None:
     """Submit seeds: each one only once the seeds before it cannot be enough, so that the episodes never depend on timing."""
-    while len(infos) + pool.num_running < args.num:
+    while recording.num_finished + pool.num_running < args.num:
         seed = next(seeds, None)
         if seed is None and pool.num_running > 0:
             return  # episodes that run may still succeed
         if seed is None:
             raise WorkFailedError(
-                f"{len(args.seeds)} seeds were tried and {len(infos)} of {args.num} episodes succeeded; see whether the "
-                f"demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
+                f"{len(args.seeds)} seeds were tried and {len(recording.infos)} of {args.num} episodes succeeded; see whether "
+                f"the demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
             )
-        pool.submit(_record_seed, seed)
+        if seed in recording.kept:
+            count(recording.accept_kept(seed))
+        else:
+            pool.submit(_record_seed, seed)
 
 
 def _record_seed(recorder: Recorder, seed: int) -> dict[str, Any] | None:

@@ -1,16 +1,36 @@
-"""Shared by everything that records: a trajectory file's json, the episodes of earlier runs, and the state of a worker."""
+"""Shared by everything that records: a trajectory file to which episodes are added, its json, and the state of a worker."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import gymnasium as gym
 
+from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
-from .formats.maniskill_h5 import DemonstrationError, Episode, finished_episodes, read_header, write_episode
+from .formats.maniskill_h5 import DemonstrationError, read_header
+from .formats.maniskill_h5_writing import (
+    Episode,
+    consolidate,
+    episode_file,
+    episode_folder,
+    finished_episodes,
+    indexed_seeds,
+    is_index,
+    remove_recording,
+    separate,
+    write_episode,
+    write_index,
+)
 
+SESSION = "session-"
+"""Start of the name of the folder into which the workers of one recording session write."""
 PACKAGES = ("manifeel-ms3", "mani-skill", "sapien", "torch")
 """Packages whose versions a trajectory file names: the outcome of an episode can depend on them."""
 
@@ -39,44 +59,176 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     )
 
 
-def finished_before(path: Path, header: dict[str, Any]) -> tuple[dict[int, dict], set[int]]:
-    """Json entries of the episodes by seed, and the failed seeds, that earlier runs have left in a trajectory file.
+@contextmanager
+def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | None = None) -> Iterator["Recording"]:
+    """Hold a trajectory file for as long as the context lasts, to add episodes to it.
 
     Args:
-        path: The trajectory file; nothing is left if it does not exist.
-        header: The json that this run writes.
+        path: The trajectory file, which need not exist.
+        header: The json of the file, but for its episodes. `failed_seeds` is kept up to date if it is among the fields.
+        order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
 
     Raises:
-        DemonstrationError: The file was recorded with other arguments or with another revision of the task.
+        InUseError: Another process records into the file; the message names it.
+        DemonstrationError: The file was recorded with other arguments or another revision of the task, or is damaged.
+        MachineError: The folder cannot be written.
     """
-    failed: set[int] = set()
-    if path.is_file():
-        before = read_header(path)
+    with owned(path):
+        yield Recording(path, header, order)
+
+
+class Recording:
+    """A trajectory file to which episodes are added; `open_recording` makes one.
+
+    Worker processes write episodes into `drafts`, a folder of this recording session alone; `accept` moves them into the folder
+    of episodes. A worker that outlives a killed session therefore cannot write into a later one.
+
+    Args:
+        path: The trajectory file.
+        header: The json of the file, but for its episodes.
+        order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any], order: Sequence[int] | None):
+        self.path = path
+        self.infos: dict[int, dict[str, Any]] = {}
+        """Json entries of the episodes in the file, by seed in the order of the file."""
+        self.kept: dict[int, dict[str, Any]] = {}
+        """Json entries of episodes that an earlier session has finished but not yet entered into the file, by seed."""
+        self.failed: set[int] = set()
+        """Seeds whose episodes failed."""
+        self.is_complete = False
+        """Whether the file holds its episodes itself and is not an index."""
+        self._waiting: dict[int, dict[str, Any]] = {}
+        self._header, self._order = header, order
+        self._folder = episode_folder(path)
+        self.drafts = self._folder / f"{SESSION}{uuid4().hex}"
+        """Folder into which the workers of this session write episodes."""
+        if path.is_file():
+            self._load()
+        elif finished_episodes(self._folder):
+            raise DemonstrationError(
+                f"{self._folder} holds episodes of a recording whose file {path} is missing; put the file back, or move the "
+                "folder away, or give another --out"
+            )
+
+    def _load(self) -> None:
+        before = read_header(self.path)
         for name in ("env_info", "revision"):
-            if before.get(name, header[name]) != header[name]:
+            if before.get(name, self._header[name]) != self._header[name]:
                 raise DemonstrationError(
-                    f"{path} was recorded with {name}={before[name]}, this run asks for {header[name]}; give another --out, or "
-                    "delete the file"
+                    f"{self.path} was recorded with {name}={before[name]}, this run asks for {self._header[name]}; give "
+                    "another --out, or delete the file"
                 )
-        failed = set(before.get("failed_seeds", []))
-    return finished_episodes(path), failed
+        self.failed = set(before.get("failed_seeds", []))
+        self.is_complete = not is_index(self.path)
+        if self.is_complete:
+            remove_folder(self._folder)
+            self.infos = {info["episode_seed"]: info for info in before["episodes"]}
+            return
+        found = finished_episodes(self._folder)
+        seeds = indexed_seeds(self.path)
+        if lost := [seed for seed in seeds if seed not in found or not episode_file(self._folder, seed).is_file()]:
+            raise DemonstrationError(
+                f"{self.path} lacks the episodes of the seeds {lost}, which should be in {self._folder}; put that folder back, "
+                "or delete the file to record anew"
+            )
+        self.infos = {seed: found.pop(seed) for seed in seeds}
+        self.kept = found
+
+    @property
+    def num_finished(self) -> int:
+        """Number of episodes in the file, and of those that wait until the seeds before theirs are done."""
+        return len(self.infos) + len(self._waiting)
+
+    def begin(self) -> None:
+        """Prepare the file for further episodes.
+
+        Raises:
+            FileWriteError: The folder cannot be written.
+        """
+        if self.is_complete:
+            separate(self.path)
+            self.is_complete = False
+        write_index(self.path, self._fields(), self.infos)
+        for stale in self._folder.glob(f"{SESSION}*"):  # of sessions that were killed
+            remove_folder(stale)
+        self.drafts.mkdir(parents=True)
+
+    def accept(self, seed: int, info: dict[str, Any]) -> int:
+        """Take over an episode that lies among the drafts.
+
+        Args:
+            seed: Seed of the episode.
+            info: The episode's entry in the json.
+
+        Returns:
+            Number of episodes that the file holds more than before.
+
+        Raises:
+            FileWriteError: The episode cannot be written; it is as if it had not been given.
+        """
+        file = episode_file(self._folder, seed)
+        entry = file.with_suffix(".json")
+        move(self.drafts / file.name, file)
+        try:
+            write_json(entry, info | dict(episode_seed=seed))
+            return self._enter({seed: info | dict(episode_seed=seed)})
+        except FileWriteError:
+            if seed not in indexed_seeds(self.path):
+                entry.unlink(missing_ok=True)
+            raise
+
+    def accept_kept(self, seed: int) -> int:
+        """Take over an episode of `kept`, and return the number of episodes that the file holds more than before."""
+        return self._enter({seed: self.kept.pop(seed)})
+
+    def reject(self, seed: int) -> int:
+        """Remember that an episode failed, and return the number of episodes that the file holds more than before."""
+        self.failed.add(seed)
+        return self._enter({})
+
+    def _enter(self, finished: dict[int, dict[str, Any]]) -> int:
+        """Append to the file what has finished and whose turn it is."""
+        infos, waiting = dict(self.infos), self._waiting | finished
+        for seed in list(waiting) if self._order is None else self._order:
+            if seed in waiting:
+                infos[seed] = waiting.pop(seed)
+            elif seed not in infos and seed not in self.failed:
+                break
+        write_index(self.path, self._fields(), infos)
+        more = len(infos) - len(self.infos)
+        self.infos, self._waiting = infos, waiting
+        return more
+
+    def finish(self) -> None:
+        """Turn the index and the episodes into one file; a recording without episodes leaves none."""
+        if self.infos:
+            consolidate(self.path)
+        else:
+            remove_recording(self.path)
+
+    def _fields(self) -> dict[str, Any]:
+        """The json of the file as it is now, but for its episodes."""
+        failed = dict(failed_seeds=sorted(self.failed)) if "failed_seeds" in self._header else {}
+        return self._header | failed
 
 
 @dataclass(frozen=True)
 class Recorder:
-    """State of a worker process that records: one environment, and the file that its episodes belong to."""
+    """State of a worker process that records: one environment, and the folder that its episodes are written to."""
 
     env: gym.Env
     env_id: str
-    path: Path
-    """Trajectory file beside which finished episodes are written."""
+    drafts: Path
+    """Folder of the recording session, `Recording.drafts`."""
 
     def write(self, episode: Episode) -> dict[str, Any]:
         """Write an episode, and return its entry in the json."""
-        write_episode(self.path, episode)
+        write_episode(self.drafts, episode)
         return episode.info | dict(episode_seed=episode.seed)
 
 
-def make_recorder(env_id: str, env_kwargs: dict[str, Any], path: Path) -> Recorder:
+def make_recorder(env_id: str, env_kwargs: dict[str, Any], drafts: Path) -> Recorder:
     """Make the state of a worker process."""
-    return Recorder(make_env(env_id, **env_kwargs), env_id, path)
+    return Recorder(make_env(env_id, **env_kwargs), env_id, drafts)

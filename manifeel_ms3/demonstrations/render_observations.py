@@ -23,8 +23,8 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import run_episode
-from .formats.maniskill_h5 import DemonstrationError, consolidate, open_for_more, open_trajectories, read_header, write_index
-from .recording import Recorder, finished_before, make_header, make_recorder
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .recording import Recorder, make_header, make_recorder, open_recording
 
 log = logging.getLogger(__name__)
 
@@ -61,6 +61,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     Raises:
         InvalidArgumentError: The file to write is the file to read, or an argument is not allowed.
         DemonstrationError: A file cannot be used, or an episode does not come out as it was recorded.
+        InUseError: Another process writes the file.
         WorkFailedError: A worker process died.
     """
     source = read_header(args.path)
@@ -73,24 +74,25 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     if args.image_size is not None:
         env_kwargs["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
     header = make_header(env_id, env_kwargs) | dict(recorded_with=source["versions"])
-    infos, _ = finished_before(args.out, header)
-    episodes = source["episodes"][: args.num]
-    left = [episode for episode in episodes if episode["episode_seed"] not in infos]
-    if not left:
-        log.info("%s already holds %d episodes", args.out, len(infos))
-        return args.out
-    open_for_more(args.out)
-    with (
-        episode_counter(f"rendering {env_id}", len(episodes), len(infos), on_episode) as count,
-        WorkerPool(args.workers, partial(make_recorder, env_id, env_kwargs, args.out)) as pool,
-    ):
-        for episode in left:
-            pool.submit(partial(_render_episode, path=args.path), episode)
-        for finished in pool.as_finished():
-            infos[finished.task["episode_seed"]] = finished.result()
-            write_index(args.out, header, dict(sorted(infos.items())))
-            count()
-    consolidate(args.out)
+    episodes = {episode["episode_seed"]: episode for episode in source["episodes"][: args.num]}
+    with open_recording(args.out, header, list(episodes)) as recording:
+        left = [seed for seed in episodes if seed not in recording.infos]
+        if recording.is_complete and not left:
+            log.info("%s already holds %d episodes", args.out, len(recording.infos))
+            return args.out
+        recording.begin()
+        with (
+            episode_counter(f"rendering {env_id}", len(episodes), len(recording.infos), on_episode) as count,
+            WorkerPool(args.workers, partial(make_recorder, env_id, env_kwargs, recording.drafts)) as pool,
+        ):
+            for seed in left:
+                if seed in recording.kept:
+                    count(recording.accept_kept(seed))
+                else:
+                    pool.submit(partial(_render_episode, path=args.path), episodes[seed])
+            for finished in pool.as_finished():
+                count(recording.accept(finished.task["episode_seed"], finished.result()))
+        recording.finish()
     return args.out
 
 

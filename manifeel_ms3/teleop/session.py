@@ -3,6 +3,7 @@
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -10,14 +11,8 @@ import gymnasium as gym
 import numpy as np
 
 from manifeel_ms3.demonstrations.episode import run_episode
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import (
-    Episode,
-    consolidate,
-    open_for_more,
-    write_episode,
-    write_index,
-)
-from manifeel_ms3.demonstrations.recording import finished_before, make_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, write_episode
+from manifeel_ms3.demonstrations.recording import make_header, open_recording
 
 from .operator import EpisodeCommand, Mode, Operator
 
@@ -41,7 +36,7 @@ class Screen(Protocol):
 
 
 class Session:
-    """Episodes with rising seeds, recorded into one trajectory file.
+    """Episodes with rising seeds, recorded into one trajectory file, which the session holds until `finish` is called.
 
     Args:
         env: Environment with `num_envs=1`.
@@ -53,32 +48,36 @@ class Session:
 
     Raises:
         DemonstrationError: The file was recorded with other arguments.
+        InUseError: Another process records into the file.
     """
 
     def __init__(self, env: gym.Env, env_id: str, env_kwargs: dict[str, Any], out: Path, seed: int, operator: Operator):
         self.env, self.out, self.operator = env, out, operator
-        self._header = make_header(env_id, env_kwargs) | SOURCE
-        self._infos, self._failed = finished_before(out, self._header)
-        self._seed = max([seed, *(saved + 1 for saved in self._infos)])
         base: Any = env.unwrapped
         self._period = 1.0 / base.control_freq
-        out.parent.mkdir(parents=True, exist_ok=True)
-        open_for_more(out)
+        header = make_header(env_id, env_kwargs) | SOURCE | dict(failed_seeds=[])
+        with ExitStack() as stack:
+            self._recording = stack.enter_context(open_recording(out, header))
+            self._recording.begin()
+            for kept in list(self._recording.kept):  # a kill came just before it was entered into the file
+                self._recording.accept_kept(kept)
+            self._held = stack.pop_all()
+        self._seed = max([seed, *(saved + 1 for saved in self._recording.infos)])
 
     def run(self, screen: Screen) -> None:
         """Run episodes until the operator ends the session."""
         while self.operator.mode is not Mode.CLOSED:
             self.operator.begin()
-            screen.set_message(f"seed {self._seed}, {len(self._infos)} saved")
+            screen.set_message(f"seed {self._seed}, {len(self._recording.infos)} saved")
             episode = run_episode(self.env, self._seed, self._actions, screen.show)
             command = self._decision(screen, episode)
             if command is not EpisodeCommand.RETRY:
                 self._seed += 1
 
     def finish(self) -> None:
-        """Turn the saved episodes into one file."""
-        if self.out.is_file():
-            consolidate(self.out)
+        """Turn the saved episodes into one file, and let others record into it."""
+        with self._held:
+            self._recording.finish()
 
     def _actions(self) -> Iterator[np.ndarray]:
         """Actions at the environment's control rate, while the operator lets the robot move."""
@@ -113,11 +112,9 @@ class Session:
     def _save(self, screen: Screen, episode: Episode) -> bool:
         """Write an episode, and return whether that worked; the person reads the reason where it did not."""
         try:
-            write_episode(self.out, episode)
-            infos = self._infos | {episode.seed: episode.info | dict(episode_seed=episode.seed)}
-            write_index(self.out, self._header | dict(failed_seeds=sorted(self._failed)), dict(sorted(infos.items())))
+            write_episode(self._recording.drafts, episode)
+            self._recording.accept(episode.seed, episode.info)
         except OSError as error:
             screen.set_message(f"the episode could not be saved ({error}); make room, then save again: it is still here")
             return False
-        self._infos = infos
         return True

@@ -14,7 +14,8 @@ import psutil
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import episode_folder, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import episode_folder
 from manifeel_ms3.demonstrations.recording import make_header
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.tasks import registry

@@ -1,15 +1,11 @@
-"""Trajectory files: ManiSkill's h5 with a json beside it, written so that a killed run loses nothing that was finished.
+"""Reading of trajectory files: ManiSkill's h5 with a json beside it.
 
-While a recording runs, every finished episode is a file of its own in `<name>.episodes/`, and `<name>.h5` is a small index of
-links to them that is replaced as a whole after each episode. The index can be read at any time like the finished file, into
-which `consolidate` turns it at the end.
+While a file is recorded, it is an index of links to the files of its episodes in the folder `<name>.episodes`, and can be read
+like the finished file; `maniskill_h5_writing` has the two forms.
 """
 
-import json
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +13,10 @@ import h5py
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
-from manifeel_ms3.files import atomic_write, read_json, write_json
+from manifeel_ms3.files import read_json
 
 from .demonstration_format import DemonstrationFormat, Progress
 
-COMPRESSION_LEVEL = 4
-"""Level of gzip, which is lossless; 4 is h5py's default."""
-IMAGE_NDIM = 4
-"""Axes of an array over time of images or force fields: (T, H, W, channels)."""
 HEADER = {
     "type": "object",
     "required": ["env_info", "episodes"],
@@ -52,103 +44,6 @@ HEADER = {
 
 class DemonstrationError(InvalidFileError):
     """A file or folder of demonstrations cannot be used as asked."""
-
-
-@dataclass
-class Episode:
-    """One recorded episode."""
-
-    seed: int
-    """Seed of the reset."""
-    arrays: dict[str, Any]
-    """Arrays in ManiSkill's tree: actions (T, A), obs/... and env_states/... (T + 1, ...), success (T,), and so on."""
-    info: dict[str, Any] = field(default_factory=dict)
-    """The episode's entry in the json."""
-
-
-# -------------------------------------------------------------------- writing
-
-
-def episode_folder(path: Path) -> Path:
-    """Folder in which the episodes of a trajectory file are kept while it is recorded."""
-    return path.with_suffix(".episodes")
-
-
-def write_episode(path: Path, episode: Episode) -> None:
-    """Write one finished episode beside the trajectory file `path`; it appears whole or not at all."""
-    folder = episode_folder(path)
-    name = f"seed_{episode.seed:08d}"
-    with atomic_write(folder / f"{name}.h5") as partial, h5py.File(partial, "w") as file:
-        _write_tree(file.create_group("traj_0", track_order=True), episode.arrays)
-    # written last, because an episode counts as finished once its json exists
-    write_json(folder / f"{name}.json", episode.info | dict(episode_seed=episode.seed))
-
-
-def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            _write_tree(group.create_group(name, track_order=True), value)
-        elif value.ndim > 1 and len(value):
-            chunks = (1, *value.shape[1:]) if value.ndim >= IMAGE_NDIM else None  # one chunk a step, which can be read alone
-            group.create_dataset(name, data=value, chunks=chunks, compression="gzip", compression_opts=COMPRESSION_LEVEL)
-        else:
-            group.create_dataset(name, data=value)
-
-
-def finished_episodes(path: Path) -> dict[int, dict[str, Any]]:
-    """Json entries of the episodes in `path`, or finished beside it, by seed in rising order."""
-    if episode_folder(path).is_dir():
-        infos = [json.loads(file.read_text()) for file in sorted(episode_folder(path).glob("seed_*.json"))]
-    else:
-        infos = read_header(path)["episodes"] if path.is_file() else []
-    return {info["episode_seed"]: info for info in infos}
-
-
-def write_index(path: Path, header: dict[str, Any], infos: dict[int, dict[str, Any]]) -> None:
-    """Replace a trajectory file by an index of links to finished episodes, and its json accordingly.
-
-    Args:
-        path: The trajectory file.
-        header: The json but for its episodes.
-        infos: Json entries of the episodes by seed, in the order that they shall have.
-    """
-    folder = episode_folder(path)
-    with atomic_write(path) as partial, h5py.File(partial, "w") as index:
-        for i, seed in enumerate(infos):
-            index[f"traj_{i}"] = h5py.ExternalLink(f"{folder.name}/seed_{seed:08d}.h5", "traj_0")
-    write_json(path.with_suffix(".json"), header | dict(episodes=_numbered(infos)))
-
-
-def consolidate(path: Path) -> None:
-    """Turn an index and its episodes into one file, and remove the folder of episodes."""
-    with atomic_write(path) as partial, h5py.File(path, "r") as index, h5py.File(partial, "w") as whole:
-        for i in range(len(index)):
-            index.copy(index[f"traj_{i}"], whole, f"traj_{i}")
-    shutil.rmtree(episode_folder(path), ignore_errors=True)
-
-
-def open_for_more(path: Path) -> None:
-    """Prepare a trajectory file for further episodes: where it is whole, put its episodes back into files of their own."""
-    folder = episode_folder(path)
-    if folder.is_dir() or not path.is_file():
-        return
-    draft = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir()
-    with h5py.File(path, "r") as whole:
-        for i, info in enumerate(read_header(path)["episodes"]):
-            name = f"seed_{info['episode_seed']:08d}"
-            with h5py.File(draft / f"{name}.h5", "w") as file:
-                whole.copy(f"traj_{i}", file, "traj_0")
-            write_json(draft / f"{name}.json", info)
-    draft.rename(folder)
-
-
-def _numbered(infos: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
-    return [dict(episode_id=i) | {k: v for k, v in info.items() if k != "episode_id"} for i, info in enumerate(infos.values())]
-
-
-# -------------------------------------------------------------------- reading
 
 
 def read_header(path: Path) -> dict[str, Any]:

@@ -1,0 +1,417 @@
+"""Recordings: nothing that was finished is lost, whenever and however often a process is killed."""
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import psutil
+import pytest
+
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, render_observations
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, episode_folder, write_episode
+from manifeel_ms3.demonstrations.recording import make_header, open_recording
+from manifeel_ms3.errors import InUseError, ManifeelError
+from manifeel_ms3.files import remove_folder
+from manifeel_ms3.ownership import owned
+from manifeel_ms3.teleop.operator import Operator
+from manifeel_ms3.teleop.session import Session
+from tests.conftest import PEG
+from tests.trust.kills import PATIENCE, forked, recorded, start_recording
+
+HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
+KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="loose")
+few_and_hundred = pytest.mark.parametrize("count", [6, pytest.param(100, marks=pytest.mark.slow)])
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """All arrays of a file by name."""
+    out = {}
+    with open_trajectories(path) as file:
+        for i in range(len(file)):
+            group = file[f"traj_{i}"]
+            group.visititems(
+                lambda name, item, i=i: (
+                    out.__setitem__(f"{i}/{name}", item[()].tobytes()) if isinstance(item, h5py.Dataset) else None
+                )
+            )
+    return out
+
+
+def seeds(path: Path) -> list[int]:
+    """Seeds that a file's json names, each held against the seed that its arrays were made of or begin with."""
+    episodes = read_header(path)["episodes"]
+    with open_trajectories(path) as file:
+        for episode in episodes:
+            assert len(file[f"traj_{episode['episode_id']}/actions"]) == episode["elapsed_steps"]
+    return [episode["episode_seed"] for episode in episodes]
+
+
+def assert_same(path: Path, undisturbed: Path) -> None:
+    """Two recordings are equal, and nothing is left of a killed one but the lock."""
+    assert path.read_bytes() == undisturbed.read_bytes() or contents(path) == contents(undisturbed)
+    assert path.with_suffix(".json").read_text() == undisturbed.with_suffix(".json").read_text()
+    assert sorted(file.name for file in path.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))) == sorted(
+        file.name for file in undisturbed.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))
+    )
+
+
+def made_up(seed: int) -> Episode:
+    """A small episode, all of whose arrays tell its seed."""
+    steps = 3 + seed
+    arrays = dict(actions=np.full((steps, 6), seed, np.float32), env_states=dict(peg=np.full((steps + 1, 13), seed)))
+    return Episode(seed, arrays, dict(elapsed_steps=steps, success=True, peak_contact_force=1.0))
+
+
+def record_made_up(path: Path, num: int, say=lambda word: None) -> None:
+    """What `record` does with its files, without a simulator; episodes finish in another order than they enter the file."""
+    with open_recording(path, HEADER, range(20)) as recording:
+        if recording.is_complete and len(recording.infos) >= num:
+            return
+        recording.begin()
+        left = [seed for seed in range(num + 1) if seed not in recording.infos and seed not in recording.failed]
+        for seed in sorted(left, key=lambda seed: seed ^ 1):
+            if seed == 1:
+                recording.reject(seed)
+            elif seed in recording.kept:
+                recording.accept_kept(seed)
+            else:
+                write_episode(recording.drafts, made_up(seed))
+                recording.accept(seed, made_up(seed).info)
+            for entered in recording.infos:
+                say(str(entered))
+        recording.finish()
+
+
+# -------------------------------------------------------------------- kills at every moment, without a simulator
+
+
+def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.Random) -> int:
+    """Kill `work` again and again at random file events, and look at the file after each; the number of kills.
+
+    Args:
+        work: Called with a function that reports seeds.
+        path: The trajectory file.
+        count: Number of kills.
+        held: Seeds that the file holds already.
+        chance: Where the moments are drawn from.
+    """
+    kills, limit = 0, 12
+    while kills < count:
+        status, _, words = forked(work, chance.randrange(limit))
+        if status == 0:
+            break
+        assert status == -signal.SIGKILL
+        kills += 1
+        limit += 3  # later and later, so that it comes to an end
+        held |= {int(word) for word in words}
+        if held or path.exists():
+            assert held <= set(seeds(path))
+    return kills
+
+
+@few_and_hundred
+def test_a01_recording_is_killed_at_random_file_events(tmp_path, count):
+    record_made_up(tmp_path / "undisturbed/t.h5", 6)
+    chance, kills, rounds = random.Random(0), 0, 0
+    while kills < count:
+        path = tmp_path / f"killed{rounds}/t.h5"
+        held: set[int] = set()
+        for num in (3, 6):  # a finished file, and further episodes to it
+            kills += kill_at_random(partial(record_made_up, path, num), path, count, held, chance)
+            record_made_up(path, num)
+            assert len(seeds(path)) == num
+        assert_same(path, tmp_path / "undisturbed/t.h5")
+        rounds += 1
+
+
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
+def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step):
+    record_made_up(tmp_path / "undisturbed/t.h5", 9)
+
+    def prepare(path: Path) -> None:
+        with open_recording(path, HEADER, range(20)) as recording:
+            recording.begin()
+            for seed in range(10):
+                write_episode(recording.drafts, made_up(seed))
+                recording.reject(seed) if seed == 1 else recording.accept(seed, made_up(seed).info)
+
+    def consolidate(path: Path) -> None:
+        with open_recording(path, HEADER, range(20)) as recording:
+            if not recording.is_complete:
+                recording.finish()
+
+    prepare(tmp_path / "counted/t.h5")
+    events = forked(lambda _: consolidate(tmp_path / "counted/t.h5"))[1]
+    for moment in range(0, events, step):
+        path = tmp_path / f"killed{moment}/t.h5"
+        prepare(path)
+        assert forked(lambda _, path=path: consolidate(path), moment)[0] == -signal.SIGKILL
+        assert seeds(path) == [0, *range(2, 10)]
+        consolidate(path)
+        assert_same(path, tmp_path / "undisturbed/t.h5")
+
+
+class Silent:
+    """A screen that nobody looks at."""
+
+    def show(self, obs, info): ...
+
+    def set_message(self, text): ...
+
+
+@few_and_hundred
+def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count):
+    env = make_env(**KWARGS)
+
+    def save(path: Path, say=lambda word: None) -> None:
+        session = Session(env, PEG, KWARGS, path, 0, Operator(("x",)))
+        for seed in range(session._seed, 4):
+            assert session._save(Silent(), made_up(seed))
+            say(str(seed))
+        session.finish()
+
+    save(tmp_path / "undisturbed/t.h5")
+    chance, kills, rounds = random.Random(1), 0, 0
+    while kills < count:
+        path = tmp_path / f"killed{rounds}/t.h5"
+        kills += kill_at_random(partial(save, path), path, count, set(), chance)
+        save(path)
+        assert_same(path, tmp_path / "undisturbed/t.h5")
+        rounds += 1
+
+
+# -------------------------------------------------------------------- real recordings
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("undisturbed") / "t.h5"
+    assert recorded(path, 3)[:2] == (0, 3)
+    return path
+
+
+def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
+    path = tmp_path / "t.h5"
+    assert recorded(path, 2, ["os.remove", "seed_", 1])[0] == -signal.SIGKILL
+    assert len(seeds(path)) == 2
+    assert recorded(path, 3)[:2] == (0, 1)
+    assert_same(path, undisturbed)
+
+
+def test_a09_a_kill_around_the_first_index_does_not_block(undisturbed, tmp_path):
+    path = tmp_path / "t.h5"
+    assert recorded(path, 1, ["os.rename", "t.json", 0])[0] == -signal.SIGKILL
+    assert recorded(path, 1, ["os.rename", "t.h5", 0])[0] == -signal.SIGKILL
+    assert recorded(path, 3)[:2] == (0, 3)
+    assert_same(path, undisturbed)
+
+
+def test_a09_other_settings_are_noticed_from_the_first_moment(tmp_path):
+    path = tmp_path / "t.h5"
+    assert recorded(path, 1, ["os.rename", "seed_", 1])[0] == -signal.SIGKILL  # its .h5 is there, its .json is not
+    code, _, errors = recorded(path, 1, fit="tight")
+    assert code == 1
+    assert "was recorded with env_info" in errors
+
+
+def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
+    path = tmp_path / "t.h5"
+    first = start_recording(path, 3)
+    assert first.stdout.readline() == "begin\n"
+    wait_until(path.is_file)
+    code, episodes, errors = recorded(path, 3)
+    assert (code, episodes) == (1, 0)
+    assert f"t.h5 is in use by process {first.pid}" in errors
+    assert "Traceback" not in errors
+    assert first.communicate(timeout=PATIENCE)[0].count("episode") == 3
+    assert_same(path, undisturbed)
+
+
+def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
+    with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
+        render_observations.main(render_observations.Args(undisturbed, tmp_path / "t.h5"))
+    with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
+        Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",)))
+    with owned(tmp_path / "manifest.json"), pytest.raises(InUseError):
+        dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
+    with owned(tmp_path / PEG / "states.h5"), pytest.raises(InUseError):
+        dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
+    Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",))).finish()  # nothing was saved
+    assert not list(tmp_path.glob("t.*"))
+
+
+def wait_until(condition, patience: float = PATIENCE) -> None:
+    end = time.monotonic() + patience
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
+    path = tmp_path / "t.h5"
+    process = start_recording(path, 3, workers=2)
+    assert process.stdout.readline() == "begin\n"
+    assert process.stdout.readline() == "episode\n"
+    workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    assert len(workers) == 2
+    process.kill()
+    begin = time.monotonic()
+    process.wait()
+    alive = psutil.wait_procs(workers, PATIENCE)[1]
+    figure("time until workers have ended after kill -9 of the main process, s", time.monotonic() - begin, at_most=5)
+    assert not alive
+    assert recorded(path, 3)[0] == 0
+    assert_same(path, undisturbed)
+
+
+def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
+    with open_recording(tmp_path / "t.h5", HEADER) as dead:
+        dead.begin()
+    with open_recording(tmp_path / "t.h5", HEADER) as recording:
+        recording.begin()
+        write_episode(dead.drafts, made_up(0))
+        write_episode(recording.drafts, made_up(1))
+        recording.accept(1, made_up(1).info)
+        write_episode(dead.drafts, made_up(1))
+        recording.finish()
+    assert seeds(tmp_path / "t.h5") == [1]
+    assert not episode_folder(tmp_path / "t.h5").exists()
+
+
+@few_and_hundred
+def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count):
+    """Real processes, killed at random times; every second time the workers are left to themselves."""
+    span, chance, kills, rounds = 6.0, random.Random(2), 0, 0
+    while kills < count:
+        path, held = tmp_path / f"killed{rounds}/t.h5", 0
+        for _ in range(10):
+            process = start_recording(path, 3, workers=1 + rounds % 2)
+            assert process.stdout.readline() == "begin\n"
+            begin = time.monotonic()
+            try:
+                process.wait(chance.uniform(0, span))
+                span = 0.5 * (span + time.monotonic() - begin)  # as long as this machine takes
+                break
+            except subprocess.TimeoutExpired:
+                kills += 1
+            process.kill() if kills % 2 else os.killpg(process.pid, signal.SIGKILL)
+            held += process.communicate()[0].count("episode")
+            if held or path.exists():
+                assert len(seeds(path)) >= held
+        assert recorded(path, 3)[0] == 0
+        assert_same(path, undisturbed)
+        rounds += 1
+
+
+# -------------------------------------------------------------------- other misfortunes
+
+
+def test_b10_episodes_reach_the_disk_before_they_count(tmp_path):
+    """Every file and folder is flushed before the renaming that makes it count (seen by strace where it is installed)."""
+    trace = """
+import os, sys
+from pathlib import Path
+flushed, renamed = set(), []
+fsync, sync = os.fsync, lambda fd: (flushed.add(os.readlink(f"/proc/self/fd/{fd}")), fsync(fd))
+os.fsync = sync
+def see(event, given):
+    if event == "os.rename":
+        renamed.append((str(Path(given[0]).absolute()), str(Path(given[0]).absolute()) in flushed))
+sys.addaudithook(see)
+from tests.trust.test_recordings import record_made_up
+record_made_up(Path(sys.argv[1]), 2)
+record_made_up(Path(sys.argv[1]), 3)
+for name, was_flushed in renamed:
+    print(int(was_flushed or Path(name).suffix != ".partial"), name)
+assert str(Path(sys.argv[1]).parent) in flushed
+"""
+    command = [sys.executable, "-c", trace, str(tmp_path / "t.h5")]
+    lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert len(lines) > 20
+    assert [line for line in lines if not line.startswith("1")] == []
+
+
+def test_a_full_disk_keeps_every_episode_and_can_be_gone_on_from(tmp_path):
+    path = tmp_path / "t.h5"
+
+    def full(say) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        large = Episode(
+            2, dict(actions=np.random.default_rng(0).normal(size=(5000, 6))), dict(elapsed_steps=5000, success=True)
+        )
+        with open_recording(path, HEADER) as recording:
+            recording.begin()
+            write_episode(recording.drafts, made_up(0))
+            recording.accept(0, made_up(0).info)
+            with pytest.raises(ManifeelError, match="cannot be written"):
+                write_episode(recording.drafts, large)
+            say("refused")
+
+    assert forked(full)[2] == ["refused"]
+    assert seeds(path) == [0]
+    with open_recording(path, HEADER) as recording:
+        recording.begin()
+        recording.finish()
+    assert seeds(path) == [0]
+
+
+def test_a_missing_folder_of_episodes_is_named(tmp_path):
+    path = tmp_path / "t.h5"
+    with open_recording(path, HEADER) as recording:
+        recording.begin()
+        write_episode(recording.drafts, made_up(0))
+        recording.accept(0, made_up(0).info)
+    path.unlink()
+    with pytest.raises(DemonstrationError, match=r"whose file .*t.h5 is missing"), open_recording(path, HEADER):
+        pass
+    recording.begin()
+    remove_folder(episode_folder(path))
+    with pytest.raises(DemonstrationError, match=r"lacks the episodes of the seeds \[0\]"), open_recording(path, HEADER):
+        pass
+
+
+def test_a29_a_home_that_cannot_be_written_is_named(tmp_path):
+    environment = os.environ | dict(HOME="/proc/none", XDG_CACHE_HOME="/proc/none/cache", MANIFEEL_CACHE_DIR="")
+    command = [sys.executable, "-m", "manifeel_ms3.demonstrations.record", PEG, "-n", "1", "--out", str(tmp_path / "t.h5")]
+    command += ["--obs-mode", "none", "--env-kwargs", '{"render_backend": "none"}']
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "MANIFEEL_CACHE_DIR" in done.stderr
+
+
+ASCII = """
+import sys
+from pathlib import Path
+from manifeel_ms3.files import read_json, write_json, write_text
+from tests.trust.test_recordings import record_made_up, seeds
+
+assert sys.getfilesystemencoding() != "utf-8" or True
+folder = Path(sys.argv[1])
+write_text(folder / "page.html", "\\u00dcbung \\u2713")
+write_json(folder / "file.json", dict(name="\\u00dcbung"))
+assert read_json(folder / "file.json", {}, "a file") == dict(name="\\u00dcbung")
+record_made_up(folder / "\\u00dcbung t.h5", 2)
+record_made_up(folder / "\\u00dcbung t.h5", 3)
+assert len(seeds(folder / "\\u00dcbung t.h5")) == 3
+"""
+
+
+@pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
+def test_a30_an_ascii_locale_writes_the_same(tmp_path, locale):
+    environment = os.environ | dict(LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    folder = tmp_path / "with space"
+    done = subprocess.run(
+        [sys.executable, "-c", ASCII, str(folder)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / "page.html").read_text(encoding="utf-8") == "Übung ✓"
