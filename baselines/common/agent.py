@@ -25,7 +25,7 @@ def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy])
     """
     try:
         return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
-    except (KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # the config is anybody's
         raise CheckpointError(
             f"config is not one of the policy {policy_class.name!r} ({error!r}); evaluate it with the code it was trained with"
         ) from error
@@ -74,7 +74,9 @@ class PolicyAgent:
         self.policy = build_policy(self.config, policy_class).to(device).eval()
         load_weights(self.policy, read_tensors(Path(checkpoint) / WEIGHTS), checkpoint)
         self.device, self.seed = torch.device(device), seed
-        self.inference_steps = inference_steps or self.config["inference_steps"]
+        self.inference_steps = inference_steps or self.config.get("inference_steps")
+        if not isinstance(self.inference_steps, int) or self.inference_steps < 1:
+            raise CheckpointError(f"{checkpoint}: inference_steps={self.inference_steps!r} must be a positive whole number")
         self.reset()
 
     def reset(self) -> None:

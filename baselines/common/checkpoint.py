@@ -68,8 +68,10 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         CheckpointError: The file is missing or broken.
     """
     try:
+        if not Path(path).is_file():  # a pipe would be waited for
+            raise FileNotFoundError("no such file")
         return load_file(path)
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); the checkpoint is broken, use another") from error
 
 

@@ -72,7 +72,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     )
     if args.image_size is not None:
         env_kwargs["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
-    header = make_header(env_id, env_kwargs) | dict(recorded_with=source["versions"])
+    header = make_header(env_id, env_kwargs) | dict(recorded_with=source.get("versions"))
     infos, _ = finished_before(args.out, header)
     episodes = source["episodes"][: args.num]
     left = [episode for episode in episodes if episode["episode_seed"] not in infos]
