@@ -172,9 +172,6 @@ HARM = {
     "2**40 numbers, contiguous": lambda group, _: declared(group, (2**20, 2**20)),
     "2**40 numbers, in chunks": lambda group, _: declared(group, (2**20, 2**20), chunks=(1, 6), compression="gzip"),
     "2**64 numbers": lambda group, _: declared(group, (2**32, 2**32), chunks=(1, 6), compression="gzip"),
-    "a huge chunk": lambda group, _: group.create_dataset(
-        "actions", data=np.zeros((1, 6), "f4"), chunks=(2**24, 6), maxshape=(None, 6), compression="gzip"
-    ),
     "another filter": lambda group, _: group.create_dataset("actions", data=np.zeros((4, 6)), scaleoffset=3),
     "strings": lambda group, _: group.create_dataset("actions", data=[["text"]]),
     "references": lambda group, _: group.create_dataset("actions", data=[[group.ref]], dtype=h5py.ref_dtype),
