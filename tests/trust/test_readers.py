@@ -12,6 +12,7 @@ import sys
 import zipfile
 from argparse import Namespace
 from collections import OrderedDict
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -22,7 +23,7 @@ import torch
 from baselines.common.checkpoint import read_tensors
 from baselines.tactile_representations.released_weights import read_released
 from baselines.tactile_representations.unit import UniT
-from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, render_observations, replay, view
 from manifeel_ms3.demonstrations.export import Args
 from manifeel_ms3.demonstrations.export import main as export
 from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
@@ -101,40 +102,57 @@ def test_a11_a_checkpoint_runs_nothing_that_its_config_names(config, tmp_path, m
 # ------------------------------------------------------------------ A12: environment ids of files
 
 
-@pytest.mark.parametrize("env_id", ["gadget:ManiFeel-PegInsertion-v1", "gadget:Other-v1", "gadget:CartPole-v1"])
-@pytest.mark.parametrize("command", ["replay", "render_observations", "summary", "validate", "view", "export"])
-def test_a12_a_module_that_a_file_names_is_never_imported(command, env_id, tmp_path):
-    if command not in ("replay", "validate") and env_id != "gadget:Other-v1":
-        pytest.skip("one id is enough for a command that makes no environment")
-    for name in ("states" if command in ("replay", "render_observations") else "trajectory",):
-        folder = tmp_path / "set"
-        folder.mkdir()
-        for suffix in (".h5", ".json"):
-            shutil.copy(SAMPLE / f"{name}{suffix}", folder)
-        path = folder / f"{name}.h5"
-    rewrite_json(path.with_suffix(".json"), lambda header: header["env_info"].update(env_id=env_id))
-    (folder / "manifest.json").write_text(
-        json.dumps({"schema": "manifeel-demonstrations-1", "files": {path.name: {"success": 2}}})
-    )
-    (tmp_path / "gadget.py").write_text(EXECUTED)  # `python -m` has the current folder on its path
-    arguments = {
-        "replay": [str(path), "--num", "1"],
-        "render_observations": [str(path), "--out", str(tmp_path / "out.h5"), "--obs-mode", "tacff", "--cameras", "--num", "1"],
-        "summary": [str(path)],
-        "validate": [str(folder), "--replay", "1"],
-        "view": [str(path), "--save", str(tmp_path / "out.rrd")],
-        "export": [str(path), "--to", "npz", "--out", str(tmp_path / "out")],
-    }[command]
+@pytest.fixture
+def gadget(tmp_path, monkeypatch) -> Path:
+    """A folder that is on the path of modules, as the current one is with `python -m`; its module leaves a marker."""
+    (tmp_path / "gadget.py").write_text(EXECUTED)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def naming(env_id: str, name: str, folder: Path) -> Path:
+    """A trajectory file of a set whose json has this id."""
+    for suffix in (".h5", ".json"):
+        shutil.copy(SAMPLE / f"{name}{suffix}", folder)
+    rewrite_json(folder / f"{name}.json", lambda header: header["env_info"].update(env_id=env_id))
+    about = {"schema": "manifeel-demonstrations-1", "files": {f"{name}.h5": {"success": 2}}}
+    (folder / "manifest.json").write_text(json.dumps(about))
+    return folder / f"{name}.h5"
+
+
+def test_a12_replay_from_the_command_line_imports_no_module_of_the_file(gadget):
+    path = naming("gadget:ManiFeel-PegInsertion-v1", "states", gadget)
+    command = [sys.executable, "-m", "manifeel_ms3.demonstrations.replay", str(path), "--num", "1"]
     done = subprocess.run(
-        [sys.executable, "-m", f"manifeel_ms3.demonstrations.{command}", *arguments],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-        capture_output=True,
-        text=True,
-        check=False,
+        command, env=os.environ | {"PYTHONPATH": str(REPOSITORY)}, capture_output=True, text=True, check=False
     )
-    assert not (tmp_path / "executed").exists()
-    assert "Traceback" not in done.stderr, done.stderr
+    assert "1 of 1 episodes succeed again" in done.stdout + done.stderr
+    assert not (gadget / "executed").exists()
+
+
+READ_ENV_ID = {
+    "replay": lambda path: replay.replay(path, 1),
+    "validate": lambda path: validate(path.parent, 1),
+    "render_observations": lambda path: render_observations.main(
+        render_observations.Args(path, path.with_name("out.h5"), "tacff", (), ("right",), num=1)
+    ),
+    "summary": summary,
+    "view": lambda path: view.read_streams(path, 0),
+    "export": lambda path: export(Args(path, "npz", path.with_name("out"))),
+}
+
+
+@pytest.mark.parametrize("env_id", ["gadget:Other-v1", "gadget:ManiFeel-PegInsertion-v1"])
+@pytest.mark.parametrize("command", READ_ENV_ID)
+def test_a12_no_module_that_a_file_names_is_imported(command, env_id, gadget):
+    if command == "render_observations" and "Peg" in env_id:
+        pytest.skip("it renders in worker processes, which the test of the command line stands for")
+    path = naming(env_id, "trajectory" if command in ("view", "export") else "states", gadget)
+    with suppress(ManifeelError):
+        READ_ENV_ID[command](path)
+    assert not (gadget / "executed").exists()
+    assert "gadget" not in sys.modules
 
 
 # ------------------------------------------------------------------ A25: h5 names other files or declares what it lacks
