@@ -86,7 +86,7 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
         jsonschema.validate(content, schema)
     except jsonschema.ValidationError as error:
         raise InvalidFileError(_not(path, kind, f"{error.json_path}: {error.message[:SHOWN_LENGTH]}")) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InvalidFileError(_not(path, kind, str(error))) from error
     return content
 

@@ -12,9 +12,13 @@ from mani_skill.utils import common
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 
-from .checkpoint import WEIGHTS, load_weights, read_tensors
+from .checkpoint import WEIGHTS, load_weights, read_tensors, require_fit
 from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec, prepare
 from .policy import VisuotactilePolicy
+
+MAX_SETTING = 1_000_000
+"""Largest number that a policy's settings may hold; the paper's largest is 2048, so that a checkpoint's config asks for no
+tables of any size."""
 
 
 def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
@@ -25,7 +29,7 @@ def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy])
     """
     try:
         return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
-    except (KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # the config is anybody's
         raise CheckpointError(
             f"config is not one of the policy {policy_class.name!r} ({error!r}); evaluate it with the code it was trained with"
         ) from error
@@ -38,6 +42,9 @@ def _from_json(cls: type, value: Any) -> Any:
         if unknown := set(value) - {f.name for f in fields(cls)}:
             raise TypeError(f"{cls.__name__} has no {sorted(unknown)}")
         return cls(**{name: _from_json(types[name], part) for name, part in value.items()})
+    numbers = value if isinstance(value, list) else [value]
+    if any(isinstance(number, int | float) and not abs(number) <= MAX_SETTING for number in numbers):
+        raise ValueError(f"{value} is beyond {MAX_SETTING}")
     return tuple(value) if typing.get_origin(cls) is tuple else value
 
 
@@ -71,10 +78,19 @@ class PolicyAgent:
         device: str = "cpu",
     ):
         self.config = checkpoint_config(checkpoint)
+        weights = read_tensors(Path(checkpoint) / WEIGHTS)
+        try:
+            with torch.device("meta"):  # takes no memory, whatever size of network the config asks for
+                described = build_policy(self.config, policy_class)
+        except CheckpointError as error:
+            raise CheckpointError(f"{checkpoint}: {error}") from error
+        require_fit(described, weights, checkpoint)
         self.policy = build_policy(self.config, policy_class).to(device).eval()
-        load_weights(self.policy, read_tensors(Path(checkpoint) / WEIGHTS), checkpoint)
+        load_weights(self.policy, weights, checkpoint)
         self.device, self.seed = torch.device(device), seed
-        self.inference_steps = inference_steps or self.config["inference_steps"]
+        self.inference_steps = inference_steps or self.config.get("inference_steps")
+        if not isinstance(self.inference_steps, int) or self.inference_steps < 1:
+            raise CheckpointError(f"{checkpoint}: inference_steps={self.inference_steps!r} must be a positive whole number")
         self.reset()
 
     def reset(self) -> None:

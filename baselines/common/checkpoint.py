@@ -68,8 +68,10 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         CheckpointError: The file is missing or broken.
     """
     try:
+        if not Path(path).is_file():  # a pipe would be waited for
+            raise FileNotFoundError("no such file")
         return load_file(path)
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); the checkpoint is broken, use another") from error
 
 
@@ -84,6 +86,21 @@ def load_weights(module: torch.nn.Module, weights: dict[str, torch.Tensor], sour
     Raises:
         CheckpointError: Names or shapes differ, so the weights belong to another architecture.
     """
+    require_fit(module, weights, source)
+    module.load_state_dict(weights)
+
+
+def require_fit(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:
+    """Check that weights have the names and shapes of a module's own.
+
+    Args:
+        module: The module, which may be on torch's device "meta".
+        weights: The weights by their names.
+        source: The checkpoint or file that they are from, for the error's message.
+
+    Raises:
+        CheckpointError: Names or shapes differ, so the weights belong to another architecture.
+    """
     own = module.state_dict()
     wrong = [n for n in own if n not in weights or weights[n].shape != own[n].shape] + [n for n in weights if n not in own]
     if wrong:
@@ -91,7 +108,6 @@ def load_weights(module: torch.nn.Module, weights: dict[str, torch.Tensor], sour
             f"{source} holds another architecture: {len(wrong)} tensors do not fit, first {wrong[0]!r}; "
             "build the policy from the checkpoint's own config.json"
         )
-    module.load_state_dict(weights)
 
 
 def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set[str], source: Path) -> None:

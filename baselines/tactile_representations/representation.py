@@ -8,6 +8,8 @@ import torch.nn as nn
 from baselines.common.checkpoint import load_weights, read_tensors
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
+from .released_weights import read_released
+
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Mean and standard deviation of the colour channels in ImageNet, as torchvision documents them."""
 
@@ -36,11 +38,22 @@ class Representation(nn.Module):
         if path.suffix == ".safetensors":
             load_weights(self, read_tensors(path), path)
         else:
-            load_weights(self, self.convert_state_dict(self.read_released(path)), path)
+            load_weights(self, self._converted(path), path)
+
+    def _converted(self, path: Path) -> dict[str, torch.Tensor]:
+        released = self.read_released(path)
+        try:
+            return self.convert_state_dict(released)
+        except CheckpointError:
+            raise
+        except (LookupError, ValueError, RuntimeError) as error:  # names and shapes of any file
+            raise CheckpointError(
+                f"{path} holds another architecture ({type(error).__name__}: {error}); give the file that the authors released"
+            ) from error
 
     def read_released(self, path: Path) -> dict[str, torch.Tensor]:
         """The weights that the authors released, under the authors' names."""
-        return read_pickled(path)
+        return read_released(path)
 
 
 class TokenRepresentation(Representation):
@@ -62,21 +75,6 @@ class TokenRepresentation(Representation):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         return self.encode(self.embed(image)).mean(1)
-
-
-def read_pickled(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a .pth or .ckpt file; no other object is loaded and no code of the file runs.
-
-    Raises:
-        CheckpointError: The file cannot be read.
-    """
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch raises many kinds
-        raise CheckpointError(f"{path} cannot be read as weights ({error}); give the file that the authors released") from error
-    for key in ("model", "state_dict"):
-        content = content.get(key, content)
-    return {name: tensor for name, tensor in content.items() if isinstance(tensor, torch.Tensor)}
 
 
 def imagenet_normalised(image: torch.Tensor) -> torch.Tensor:

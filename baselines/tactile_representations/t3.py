@@ -11,7 +11,8 @@ import torch.nn as nn
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
-from .representation import TokenRepresentation, imagenet_normalised, read_pickled
+from .released_weights import read_released
+from .representation import TokenRepresentation, imagenet_normalised
 from .vit import EPS, Block, PatchEmbed, interpolate_pos_embed
 
 SENSOR = "gs_green"
@@ -69,7 +70,7 @@ class T3(TokenRepresentation):
         files = dict(encoder=path / f"encoders/{SENSOR}.pth", trunk=path / "trunk.pth")
         if missing := [str(file) for file in files.values() if not file.is_file()]:
             raise CheckpointError(f"{path} lacks {missing}; give the folder t3_medium that the authors released")
-        return {f"{part}.{name}": t for part, file in files.items() for name, t in read_pickled(file).items()}
+        return {f"{part}.{name}": t for part, file in files.items() for name, t in read_released(file).items()}
 
     def convert_state_dict(self, weights):
         return weights

@@ -73,7 +73,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     )
     if args.image_size is not None:
         env_kwargs["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
-    header = make_header(env_id, env_kwargs) | dict(recorded_with=source["versions"])
+    header = make_header(env_id, env_kwargs) | dict(recorded_with=source.get("versions"))
     episodes = {episode["episode_seed"]: episode for episode in source["episodes"][: args.num]}
     with open_recording(args.out, header, list(episodes)) as recording:
         left = [seed for seed in episodes if seed not in recording.infos]

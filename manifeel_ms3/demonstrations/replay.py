@@ -2,19 +2,22 @@
 
 import logging
 import sys
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import tyro
 from mani_skill.utils import common
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
-from .formats.maniskill_h5 import open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 POSE = slice(0, 7)
@@ -55,11 +58,9 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
         UnknownNameError: The task of the file is not registered.
     """
     header = read_header(path)
-    kwargs = header["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = make_env(header["env_info"]["env_id"], **kwargs)
-    base: Any = env.unwrapped
     results = []
-    with progress_bar() as bar:
+    with closing(_recorded_env(path, header)) as env, progress_bar() as bar:
+        base: Any = env.unwrapped
         for info in bar.track(header["episodes"][:num], description="replaying"):
             actions, ends = _recorded(path, info["episode_id"])
             env.reset(seed=info["episode_seed"])
@@ -68,10 +69,29 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
                 *_, outcome = env.step(action)
                 success |= bool(outcome["success"])
             actors: Any = common.to_numpy(base.get_state_dict()["actors"])
+            if missing := sorted(set(actors) - set(ends)):
+                raise DemonstrationError(f"{path} lacks the states of {missing} in traj_{info['episode_id']}; record it again")
             deviation = max(float(np.abs(state[0, POSE] - ends[name]).max()) for name, state in actors.items())
             results.append(Replay(info["episode_seed"], success, deviation))
-    env.close()
     return results
+
+
+def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
+    """The environment that a file's header describes, without rendering; only a registered task is made.
+
+    Raises:
+        DemonstrationError: The task does not take the arguments.
+        UnknownNameError: The task is not registered.
+    """
+    env_id, kwargs = header["env_info"]["env_id"], header["env_info"]["env_kwargs"]
+    try:
+        return make_env(env_id, **kwargs | dict(obs_mode="none", render_backend="none"))
+    except ManifeelError:
+        raise
+    except Exception as error:  # arguments from a file: ManiSkill raises many kinds
+        raise DemonstrationError(
+            f"{path}: {env_id} cannot be made with {kwargs} ({type(error).__name__}: {error}); record it again"
+        ) from error
 
 
 def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -86,7 +106,7 @@ def main(args: Args) -> int:
     """Replay, and return 1 if an episode fails, else 0."""
     results = replay(args.path, args.num)
     failures = [result.seed for result in results if not result.success]
-    worst = max(result.deviation for result in results)
+    worst = max((result.deviation for result in results), default=0.0)
     log.info("%d of %d episodes succeed again; largest deviation %.1e", len(results) - len(failures), len(results), worst)
     if failures:
         log.error("seeds that failed: %s", failures)

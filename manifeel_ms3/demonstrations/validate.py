@@ -11,11 +11,12 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 
 from .dataset import describe, read_manifest
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .formats.maniskill_h5 import open_trajectories, read_header
 from .replay import replay
 
 log = logging.getLogger(__name__)
@@ -42,30 +43,34 @@ def validate(folder: Path, num_replays: int = 0) -> list[str]:
         DemonstrationError: The folder has no manifest that can be read.
     """
     problems = []
-    files = read_manifest(folder)["files"]
+    folder, files = Path(folder), read_manifest(folder)["files"]
     with progress_bar() as bar:
         for name, entry in bar.track(files.items(), description="checking"):
-            problems += [f"{name}: {problem}" for problem in _problems(Path(folder) / name, entry, num_replays)]
+            problems += [f"{name}: {problem}" for problem in _problems(folder, name, entry, num_replays)]
     return problems
 
 
-def _problems(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
-    """Faults of one trajectory file, given its entry in the manifest."""
+def _problems(folder: Path, name: str, entry: dict[str, Any], num_replays: int) -> list[str]:
+    """Faults of one trajectory file, given its name and its entry in the manifest."""
+    path = folder / name
+    if not path.resolve().is_relative_to(folder.resolve()):
+        return [f"a manifest names files in its own folder {folder} alone; get it again from its source"]
+    replays = []
     try:
         found = describe(path)
         problems = [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in entry if found[key] != entry[key]]
         with open_trajectories(path) as file:
             for episode in read_header(path)["episodes"]:
                 problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
-    except (DemonstrationError, KeyError, OSError) as error:
+        if num_replays:
+            replays = replay(path, num_replays)
+    except (ManifeelError, KeyError, OSError) as error:
         return [str(error)]
     if shared := [seed for seed in found["seeds"] if seed >= FIRST_EVALUATION_SEED]:
         problems.append(f"seeds {sorted(shared)} are evaluation seeds; demonstrations use seeds below {FIRST_EVALUATION_SEED}")
     if len(set(found["seeds"])) < len(found["seeds"]):
         problems.append("a seed occurs twice")
-    if num_replays:
-        replays = replay(path, num_replays)
-        problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in replays if r.deviation > 0]
+    problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in replays if r.deviation > 0]
     return problems
 
 

@@ -23,8 +23,8 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
             f"{checkpoint} is not a checkpoint: it has no config.json; give a folder like runs/<name>/checkpoints/last"
         )
     try:
-        config = json.loads(path.read_text())
-    except ValueError as error:
+        config = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} is not json ({error}); the checkpoint is broken, use another one") from error
     if not isinstance(config, dict):
         raise CheckpointError(

@@ -7,10 +7,19 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from manifeel_ms3.errors import InvalidFileError
+
 Episode = dict[str, np.ndarray]
 """Arrays of one episode: "actions" (T, A), and observations (T + 1, ...) by their keys, such as "sensor_data/wrist/rgb"."""
 Progress = Callable[[Any], Iterable[int]]
 """Wraps a sequence of episode numbers to show a progress bar; `iter` shows none."""
+MAX_COMPRESSION = 1032
+"""Largest ratio by which gzip's deflate compresses (zlib's technical details, zlib.net/zlib_tech.html). Arrays that claim to be
+larger than that many times the bytes that are stored of them are refused before they are read."""
+
+
+class DemonstrationError(InvalidFileError):
+    """A file or folder of demonstrations cannot be used as asked."""
 
 
 class ReadEpisodes(Protocol):

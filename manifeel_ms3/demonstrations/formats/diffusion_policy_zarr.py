@@ -5,6 +5,7 @@ are the cameras under their names (uint8), `right_tactile_camera_taxim` (float i
 degrees), `tactile_force_field_right` (10 x 14 x 3), `state` (pose of the tool, m and xyzw) and `action`.
 """
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,13 @@ import numpy as np
 
 from manifeel_ms3.command_line import missing_extras_named
 
-from .demonstration_format import DemonstrationFormat, Progress
-from .maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
+from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
+from .maniskill_h5 import each_demonstration, observation_keys
+from .own_files import broken_if_fails
+from .zarr_arrays import open_arrays
 
-ENDS = "meta/episode_ends"
+ENDS, ACTION = "meta/episode_ends", "data/action"
+"""Arrays that every store has."""
 STEPS_PER_CHUNK = 64
 """Number of steps in a chunk of an array."""
 XYZW = [0, 1, 2, 4, 5, 6, 3]
@@ -41,8 +45,14 @@ def array_name(key: str) -> str:
 
 
 def count_episodes(folder: Path) -> int:
-    """Number of episodes in a store."""
-    return _open(folder)[ENDS].shape[0]
+    """Number of episodes in a store.
+
+    Raises:
+        DemonstrationError: The store is broken.
+        MissingExtraError: zarr is not installed.
+    """
+    arrays = open_arrays(Path(folder), [ENDS, ACTION])
+    return len(_ends(Path(folder), arrays))
 
 
 def read_zarr(
@@ -60,23 +70,52 @@ def read_zarr(
         env_id: Ignored: a store does not name its task.
 
     Raises:
-        DemonstrationError: The store is broken, or lacks an array.
+        DemonstrationError: The store is broken, lacks an array, has fewer episodes, asks for decoders that could run code, or
+            declares more than it holds.
         MissingExtraError: zarr is not installed.
     """
-    store = _open(folder)
-    names = {key: array_name(key) for key in keys}
-    held = sorted(store["data"].array_keys())
-    if missing := [name for name in (*names.values(), "action") if name not in held]:
-        raise DemonstrationError(f"{folder} lacks {missing}; it holds {held}")
-    ends = np.asarray(store[ENDS][:])
-    starts = np.concatenate([[0], ends[:-1]])
+    folder = Path(folder)
+    names = {key: f"data/{array_name(key)}" for key in keys}
+    held = sorted(path.name for path in (folder / "data").glob("*") if path.is_dir())
+    if missing := [name for name in (*names.values(), ACTION) if Path(name).name not in held]:
+        raise DemonstrationError(f"{folder} lacks {[Path(name).name for name in missing]}; it holds {held}")
+    arrays = open_arrays(folder, [ENDS, ACTION, *names.values()])
+    ends = _ends(folder, arrays)
+    for key, name in names.items():
+        _require_form(folder, key, name, arrays[name].shape)
+    count = len(ends) if num is None else num
+    if not 0 < count <= len(ends):
+        raise DemonstrationError(f"{folder} holds {len(ends)} episodes, {count} are wanted; ask for fewer")
     episodes = []
-    for i in progress(range(len(ends) if num is None else num)):
-        part = slice(int(starts[i]), int(ends[i]))
-        episode = {key: _from_paper(key, np.asarray(store[f"data/{name}"][part])) for key, name in names.items()}
-        episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
-        episodes.append(episode | dict(actions=np.asarray(store["data/action"][part], np.float32)))
+    for i in progress(range(count)):
+        part = slice(ends[i - 1] if i else 0, ends[i])
+        with broken_if_fails(folder, f"episode {i}"):
+            episode = {key: _from_paper(key, np.asarray(arrays[name][part])) for key, name in names.items()}
+            episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
+            episodes.append(episode | dict(actions=np.asarray(arrays[ACTION][part], np.float32)))
     return episodes
+
+
+def _ends(folder: Path, arrays: dict[str, Any]) -> list[int]:
+    """The steps at which the episodes end, in rising order, within every array."""
+    with broken_if_fails(folder, ENDS):
+        ends = np.asarray(arrays[ENDS][:])
+    steps = min(array.shape[0] if array.shape else 0 for name, array in arrays.items() if name != ENDS)
+    whole = ends.ndim == 1 and ends.dtype.kind in "iu"
+    rising = whole and all(start < end <= steps for start, end in pairwise([0, *ends.tolist()]))
+    if not rising or len(arrays[ACTION].shape) != 2:
+        raise DemonstrationError(
+            f"{folder} is no store of the paper's layout: {ENDS} must be rising whole numbers up to the {steps} steps of "
+            f"(steps, numbers) in {ACTION}; export the data set again"
+        )
+    return ends.tolist()
+
+
+def _require_form(folder: Path, key: str, name: str, shape: tuple[int, ...]) -> None:
+    """Check the axes of an observation's array."""
+    expected = (len(XYZW),) if key == "extra/tcp_pose" else ("rows", "columns", 3)
+    if len(shape) != 1 + len(expected) or shape[-1] != expected[-1]:
+        raise DemonstrationError(f"{folder}/{name} has the shape {shape}, expected (steps, {expected}); export it again")
 
 
 def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
@@ -91,7 +130,8 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
         DemonstrationError: The trajectory file is broken, or holds no observations.
         MissingExtraError: zarr is not installed.
     """
-    zarr = _zarr()
+    with missing_extras_named():
+        import zarr
     keys, arrays, ends = observation_keys(path), {}, []
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
     for episode in each_demonstration(path, keys, progress):
@@ -124,24 +164,6 @@ def _to_paper(key: str, values: np.ndarray) -> np.ndarray:
     if "/tactile_" in key and key.endswith("/rgb"):
         return np.ascontiguousarray(np.rot90(values, -1, axes=(1, 2))).astype(np.float32) / 255
     return values
-
-
-def _zarr() -> Any:
-    with missing_extras_named():
-        import zarr
-    return zarr
-
-
-def _open(folder: Path) -> Any:
-    zarr = _zarr()
-    try:
-        store = zarr.open_group(str(folder), mode="r")
-        _ = store[ENDS], store["data"]
-    except (KeyError, ValueError, OSError, zarr.errors.BaseZarrError) as error:
-        raise DemonstrationError(
-            f"{folder} is no store of the paper's layout ({error}): it must have data/ and {ENDS}; copy it again"
-        ) from error
-    return store
 
 
 DIFFUSION_POLICY_ZARR = DemonstrationFormat("zarr", is_zarr, count_episodes, read_zarr, write_zarr)

@@ -12,8 +12,10 @@ installed, read what is written here.
 """
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +27,47 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json, write_json
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
-from .demonstration_format import DemonstrationFormat, Progress
+from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Progress
 from .lerobot_statistics import episode_statistics, joined_statistics
-from .maniskill_h5 import DemonstrationError, each_demonstration, observation_keys, read_header
+from .maniskill_h5 import each_demonstration, observation_keys, read_header
+from .own_files import broken_if_fails, stored_bytes
 
 INFO = "meta/info.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+"""Paths of the files in LeRobot's layout 3.0. The layout that a data set describes is compared and never filled in, because a
+description can name any file."""
+MP4 = b"ftyp"
+"""Bytes 4 to 8 of an mp4 file (ISO 14496-12, section 4.3); a playlist of that name would make ffmpeg read other files."""
+PNG = b"\x89PNG\r\n\x1a\n"
+"""First bytes of a PNG file (W3C PNG, section 5.2); width and height follow as big-endian numbers in bytes 16 to 24."""
+WORD = 8
+"""Largest number of bytes of a number in a table."""
+DESCRIPTION = {
+    "type": "object",
+    "required": ["codebase_version"],
+    "if": {"properties": {"codebase_version": {"type": "string", "pattern": r"^v3\."}}},
+    "then": {
+        "required": ["total_episodes", "features", "fps"],
+        "properties": {
+            "total_episodes": {"type": "integer", "minimum": 0, "maximum": 2**31},
+            "fps": {"type": "number", "exclusiveMinimum": 0, "maximum": 1e6},
+            "video_path": {"enum": [VIDEO, None]},
+            "features": {
+                "type": "object",
+                "additionalProperties": {
+                    "type": "object",
+                    "required": ["dtype", "shape"],
+                    "properties": {
+                        "dtype": {"type": "string"},
+                        "shape": {"type": "array", "items": {"type": "integer", "minimum": 1, "maximum": 2**16}},
+                    },
+                },
+            },
+        },
+    },
+}
+"""Json schema of the fields that are read from meta/info.json."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """Features that number frames, episodes and tasks; every LeRobot dataset has them."""
 FILES_PER_CHUNK = 1000
@@ -64,7 +101,7 @@ def read_info(folder: Path) -> dict[str, Any]:
         DemonstrationError: The file is broken, or the dataset is of another version.
     """
     try:
-        info = read_json(Path(folder) / INFO, {"type": "object"}, "the description of a LeRobot dataset")
+        info = read_json(Path(folder) / INFO, DESCRIPTION, "the description of a LeRobot dataset")
     except InvalidFileError as error:
         raise DemonstrationError(str(error)) from error
     if not str(info.get("codebase_version")).startswith("v3."):
@@ -100,46 +137,93 @@ def read_lerobot(
     names = {key: feature_name(key) for key in keys}
     if missing := [name for name in (*names.values(), "action") if name not in info["features"]]:
         raise DemonstrationError(f"{folder} lacks {missing}; it holds {sorted(info['features'])}")
-    entries = _table(folder, "meta/episodes").sort_by("episode_index")
-    data = _table(folder, "data").sort_by("index")
+    folder, files = Path(folder), stored_bytes(folder)
     videos = {name: _Video(folder, info, name) for name in names.values() if info["features"][name]["dtype"] == "video"}
+    entries = _entries(folder, files, list(videos))
+    columns = ["index", "action", *(name for name in names.values() if name not in videos)]
+    data = _table(folder, files, "data", columns).sort_by("index")
+    count = info["total_episodes"] if num is None else num
+    if not 0 < count <= len(entries):
+        raise DemonstrationError(f"{folder} holds {len(entries)} episodes, {count} are wanted; ask for fewer")
     episodes = []
-    for i in progress(range(info["total_episodes"] if num is None else num)):
-        entry = {name: entries[name][i].as_py() for name in entries.column_names if not name.startswith("stats/")}
-        rows = data.slice(entry["dataset_from_index"], entry["length"])
+    for i in progress(range(count)):
+        first, length = entries[i]["dataset_from_index"], entries[i]["length"]
+        if not (first >= 0 and 0 < length <= data.num_rows - first):
+            raise DemonstrationError(
+                f"{folder}: episode {i} has {length} frames from {first} on, of {data.num_rows}; export it again"
+            )
+        rows = data.slice(first, length)
         episode = {}
         for key, name in names.items():
-            values = videos[name].frames(entry) if name in videos else _values(folder, info, name, rows)
+            values = videos[name].frames(entries[i]) if name in videos else _values(folder, info, name, rows)
             episode[key] = np.concatenate([values, values[-1:]])
-        episodes.append(episode | dict(actions=_numbers(rows["action"], info["features"]["action"]["shape"])))
+        episodes.append(episode | dict(actions=_numbers(folder, info, "action", rows)))
     return episodes
 
 
-def _table(folder: Path, part: str) -> Any:
+def _entries(folder: Path, files: dict[Path, int], videos: list[str]) -> list[dict[str, Any]]:
+    """The entries of meta/episodes in order, as far as they are read.
+
+    Raises:
+        DemonstrationError: They are broken.
+    """
+    parts = ["chunk_index", "file_index", "from_timestamp"]
+    numbers = ["episode_index", "dataset_from_index", "length", *(f"videos/{name}/{part}" for name in videos for part in parts)]
+    entries = _table(folder, files, "meta/episodes", numbers).sort_by("episode_index").to_pylist()
+    for entry in entries:
+        for name, value in entry.items():
+            wanted = (int, float) if name.endswith("from_timestamp") else int
+            if not isinstance(value, wanted) or not 0 <= value < math.inf:
+                raise DemonstrationError(f"{folder}/meta/episodes has {name}={value!r}, not a number; export the dataset again")
+    return entries
+
+
+def _table(folder: Path, files: dict[Path, int], part: str, columns: list[str]) -> Any:
+    """Columns of the tables in a part of the folder, one after the other.
+
+    Raises:
+        DemonstrationError: A table is broken, lacks a column, or declares more numbers than it can hold.
+    """
     pa, pq = _pyarrow()
-    files = sorted((Path(folder) / part).glob("chunk-*/file-*.parquet"))
-    try:
-        return pa.concat_tables([pq.read_table(file) for file in files])
-    except (pa.ArrowException, OSError, ValueError) as error:
-        raise DemonstrationError(f"{folder}/{part} cannot be read ({error}); the dataset is broken, export it again") from error
+    tables = []
+    with broken_if_fails(folder, part):
+        for path in sorted((folder / part).glob("chunk-*/file-*.parquet")):
+            with pq.ParquetFile(path) as file:
+                about = file.metadata
+                held = sum(
+                    about.row_group(g).column(c).num_values
+                    for g in range(about.num_row_groups)
+                    for c in range(about.num_columns)
+                )
+                if max(held, about.num_rows) * WORD > MAX_COMPRESSION * files[path]:
+                    raise DemonstrationError(f"{path} declares {held} numbers in {files[path]} bytes; get it again")
+                if missing := sorted(set(columns) - set(file.schema_arrow.names)):
+                    raise DemonstrationError(f"{path} lacks {missing}; export the dataset again")
+                tables.append(file.read(columns=columns))
+        return pa.concat_tables(tables)
 
 
 def _values(folder: Path, info: dict, name: str, rows: Any) -> np.ndarray:
     """Values (T, ...) of a feature that is not a video."""
-    feature = info["features"][name]
-    if feature["dtype"] == "image":
-        return np.stack([_decoded(image["bytes"], folder, name) for image in rows[name].to_pylist()])
-    return _numbers(rows[name], feature["shape"])
+    if info["features"][name]["dtype"] != "image":
+        return _numbers(folder, info, name, rows)
+    with broken_if_fails(folder, name):
+        return np.stack([_decoded(image["bytes"], info["features"][name]["shape"]) for image in rows[name].to_pylist()])
 
 
-def _numbers(column: Any, shape: list[int]) -> np.ndarray:
-    return np.array(column.to_pylist(), np.float32).reshape(-1, *shape)
+def _numbers(folder: Path, info: dict, name: str, rows: Any) -> np.ndarray:
+    with broken_if_fails(folder, name):
+        return np.array(rows[name].to_pylist(), np.float32).reshape(len(rows), *info["features"][name]["shape"])
 
 
-def _decoded(png: bytes, folder: Path, name: str) -> np.ndarray:
+def _decoded(png: bytes, shape: list[int]) -> np.ndarray:
+    """The image of a PNG file, once its header has been checked."""
+    size = [int.from_bytes(png[at : at + 4], "big") for at in (20, 16)]
+    if png[: len(PNG)] != PNG or size not in (shape[:2], shape[1:]) or math.prod(size) > MAX_COMPRESSION * len(png):
+        raise ValueError(f"an image is not a PNG of the size {shape}")
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
-        raise DemonstrationError(f"{folder}: an image of {name} cannot be decoded; the dataset is broken, export it again")
+        raise ValueError("an image cannot be decoded")
     return image[..., ::-1]
 
 
@@ -165,24 +249,29 @@ class _Video:
             DemonstrationError: The video is missing or broken, or ends before the episode does.
         """
         place = {part: entry[f"videos/{self._name}/{part}"] for part in ("chunk_index", "file_index")}
-        path = self._folder / self._info["video_path"].format(video_key=self._name, **place)
-        first = round(entry[f"videos/{self._name}/from_timestamp"] * self._info["fps"])
-        if path != self._path or first < self._next:
-            self._path, self._next, self._frames = path, 0, _decode(path)
-        try:
-            frames = [next(self._frames) for _ in range(first + entry["length"] - self._next)]
-        except (OSError, ValueError, StopIteration) as error:
-            reason = "it ends too early" if isinstance(error, StopIteration) else error
-            raise DemonstrationError(f"{path} cannot be read as a video ({reason}); export the dataset again") from error
-        self._next = first + entry["length"]
-        return np.stack(frames[-entry["length"] :])
+        path = self._folder / VIDEO.format(video_key=self._name, **place)
+        first, length = round(entry[f"videos/{self._name}/from_timestamp"] * self._info["fps"]), entry["length"]
+        with broken_if_fails(self._folder, f"the video {path.relative_to(self._folder)}"):
+            if path != self._path or first < self._next:
+                self._path, self._next, self._frames = path, 0, _decode(path, self._info["features"][self._name]["shape"])
+            frames = list(islice(self._frames, first - self._next, first - self._next + length))
+            if len(frames) < length:
+                raise ValueError("it ends too early")
+            self._next = first + length
+            return np.stack(frames)
 
 
-def _decode(path: Path) -> Iterator[np.ndarray]:
-    """The frames of a video file, one after the other."""
+def _decode(path: Path, shape: list[int]) -> Iterator[np.ndarray]:
+    """The frames of a video file, one after the other, once its kind and size have been checked."""
     with missing_extras_named():
         import imageio.v2 as imageio
+    with path.open("rb") as file:
+        if file.read(8)[4:] != MP4:
+            raise ValueError("it is not an mp4 file")
     with closing(imageio.get_reader(path)) as reader:
+        size = list(reader.get_meta_data()["size"][::-1])
+        if size not in (shape[:2], shape[1:]):
+            raise ValueError(f"its frames have the size {size}, the dataset says {shape}")
         yield from reader.iter_data()
 
 

@@ -12,11 +12,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
 
-from .demonstration_format import DemonstrationFormat, Progress
+from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
+from .h5_checks import check_trajectories
 
+COUNT = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
+"""Json schema of an episode's number, seed or length; numpy's and ManiSkill's seeds are 32 bits wide."""
 HEADER = {
     "type": "object",
     "required": ["env_info", "episodes"],
@@ -31,10 +34,14 @@ HEADER = {
             "items": {
                 "type": "object",
                 "required": ["episode_id", "episode_seed", "elapsed_steps", "success"],
-                "properties": {name: {"type": "integer"} for name in ("episode_id", "episode_seed", "elapsed_steps")},
+                "properties": {
+                    **dict.fromkeys(("episode_id", "episode_seed", "elapsed_steps"), COUNT),
+                    "control_mode": {"type": "string"},
+                    "peak_contact_force": {"type": "number"},
+                },
             },
         },
-        "failed_seeds": {"type": "array"},
+        "failed_seeds": {"type": "array", "items": COUNT},
         "versions": {"type": "object"},
         "revision": {"type": "integer"},
     },
@@ -42,8 +49,9 @@ HEADER = {
 """Json schema of the fields that are read from the json beside a trajectory file."""
 
 
-class DemonstrationError(InvalidFileError):
-    """A file or folder of demonstrations cannot be used as asked."""
+def episode_folder(path: Path) -> Path:
+    """Folder in which the episodes of a trajectory file are kept while it is recorded."""
+    return path.with_suffix(".episodes")
 
 
 def read_header(path: Path) -> dict[str, Any]:
@@ -68,15 +76,21 @@ def read_header(path: Path) -> dict[str, Any]:
 def open_trajectories(path: Path) -> Iterator[Any]:
     """Open a trajectory file, to read from it within the context.
 
-    The h5py.File is typed as Any, because h5py's types cannot tell groups from data sets.
+    Its structure is checked before anything is read, so that a file from anywhere can be opened (`h5_checks`). The h5py.File is
+    typed as Any, because h5py's types cannot tell groups from data sets.
 
     Raises:
-        DemonstrationError: The file is truncated, is not HDF5, or lacks what is read.
+        DemonstrationError: The file is truncated, is not HDF5, lacks what is read, names other files, or declares more numbers
+            than it holds.
     """
+    path = Path(path)
     try:
         with h5py.File(path, "r") as file:
+            check_trajectories(file, path, episode_folder(path))
             yield file
-    except (OSError, KeyError) as error:
+    except ManifeelError:
+        raise
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises all of these
         raise DemonstrationError(
             f"{path} cannot be read as a trajectory ({error}); it is truncated or of another kind: copy or record it again"
         ) from error
@@ -152,7 +166,13 @@ def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) 
             f"{path} was recorded with obs_mode={mode!r} and lacks {missing}; record it with an obs_mode, cameras and "
             "tactile_sensors that include them"
         )
-    return dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
+    episode = dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
+    steps = len(episode["actions"])
+    if wrong := [key for key in keys if episode[key].ndim < 2 or len(episode[key]) != steps + 1]:
+        raise DemonstrationError(
+            f"{path} has {steps} actions in traj_{i}, and {wrong} of another length than {steps + 1}; record it again"
+        )
+    return episode
 
 
 MANISKILL_H5 = DemonstrationFormat(

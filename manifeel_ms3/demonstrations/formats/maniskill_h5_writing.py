@@ -22,7 +22,7 @@ import h5py
 
 from manifeel_ms3.files import atomic_write, move, read_json, remove_folder, write_json
 
-from .maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .maniskill_h5 import DemonstrationError, episode_folder, open_trajectories, read_header
 
 COMPRESSION_LEVEL = 4
 """Level of gzip, which is lossless; 4 is h5py's default."""
@@ -42,11 +42,6 @@ class Episode:
     """Arrays in ManiSkill's tree: actions (T, A), obs/... and env_states/... (T + 1, ...), success (T,), and so on."""
     info: dict[str, Any] = field(default_factory=dict)
     """The episode's entry in the json."""
-
-
-def episode_folder(path: Path) -> Path:
-    """Folder in which the episodes of a trajectory file are kept while it is recorded."""
-    return path.with_suffix(".episodes")
 
 
 def episode_file(folder: Path, seed: int) -> Path:
