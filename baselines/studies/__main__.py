@@ -120,7 +120,8 @@ def _start_ray(address: str | None) -> None:
     address = address or "local"
     if address == "local":
         settings = dict(_node_ip_address=LOOPBACK)
-        os.environ.update(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN=secrets.token_hex(32))
+        os.environ.pop("RAY_AUTH_MODE", None)  # where it is not set, a Ray that is started here asks for a token
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         for name, value in RAY_SETTINGS.items():
             os.environ.setdefault(name, value)
     here = Path.cwd()
