@@ -33,7 +33,7 @@ $(DEMOS): | $(READY)
 
 $(RUN)/.trained: | $(DEMOS)
 	$(PYTHON) baselines/diffusion_policy/train.py cpu --demos $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
-		$$(test -f $(RUN)/checkpoints/last/config.json && echo --resume)
+		$$(ls $(RUN)/checkpoints/*/config.json >/dev/null 2>&1 && echo --resume)
 	touch $@
 
 $(RUN)/evaluation.json: $(RUN)/.trained

@@ -3,7 +3,7 @@
 Evaluate them with `manifeel eval`:
 
     --policy baselines.references:MeanAction --policy-kwargs '{"demos": "trajectory.h5"}'
-    --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/diffusion_policy/checkpoints/last"}'
+    --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/peg/checkpoints/last"}'
 
 and with `--env-id` and `--obs-mode`, because neither has a checkpoint that says them.
 """

@@ -13,6 +13,8 @@ import jsonschema
 
 from .errors import InvalidFileError, ManifeelError
 
+PARTIAL = ".partial"
+"""End of the name of a file or folder that is being written, or deleted."""
 SHOWN_LENGTH = 200
 """Number of characters of a schema's complaint that an error message shows; the complaint quotes the whole content."""
 
@@ -35,7 +37,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
         FileWriteError: The file cannot be written; the message has the path and the reason.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(path.name + PARTIAL)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield partial
@@ -49,6 +51,48 @@ def atomic_write(path: Path) -> Iterator[Path]:
     finally:
         if partial.is_file():
             partial.unlink()
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that appears as a whole once the context has filled the temporary folder that it is given.
+
+    Args:
+        path: Path of the folder, which must not exist, or be empty. Its parent folder is made where it does not exist.
+
+    Raises:
+        FileWriteError: The folder cannot be written; the message has the path and the reason.
+    """
+    path = Path(path)
+    partial = _hidden(path)
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        yield partial
+        for entry in (*partial.rglob("*"), partial):
+            _flush(entry)
+        partial.rename(path)
+        _flush(path.parent)
+    except OSError as error:
+        raise FileWriteError(
+            f"{path} cannot be written ({error}); make room or get the permission, or give another path"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def remove_folder(path: Path) -> None:
+    """Delete a folder; it disappears as a whole, under its own name, whenever the program is killed."""
+    hidden = _hidden(path)
+    if path != hidden:
+        shutil.rmtree(hidden, ignore_errors=True)
+        path.rename(hidden)
+    shutil.rmtree(hidden, ignore_errors=True)
+
+
+def _hidden(path: Path) -> Path:
+    """Where a folder is while it is written or deleted; such a path itself stays as it is."""
+    return path if path.name.startswith(".") and path.suffix == PARTIAL else path.with_name(f".{path.name}{PARTIAL}")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -108,7 +108,7 @@ def shelf(tmp_path_factory) -> Path:
             cv2.imwrite(str(shelf / f"real_pictures/{k}.png"), picture)
     module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
     (shelf / "my_module.py").write_text(module[1])
-    flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/diffusion_policy {SMALLER['train']}"
+    flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
     evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(
         tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
@@ -168,7 +168,8 @@ def _run(command: str, place: Path) -> None:
 
 def _prepare_submission(place: Path) -> None:
     """A policy that learnt nothing, and its 50 starts, of a few steps each."""
-    _run("python baselines/diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode tacff --run-dir runs/x", place)
+    flags = "--demos trajectory.h5 --obs-mode tacff --run-dir runs/x --overwrite"
+    _run(f"python baselines/diffusion_policy/train.py cpu {flags}", place)
     (place / "my_submission").mkdir()
     about = dict(name="Nothing learnt", authors="A page")
     (place / "my_submission/submission.json").write_text(json.dumps(about))

@@ -2,12 +2,15 @@
 
 import json
 import logging
+import os
 import subprocess
 import sys
 from collections import deque
 from pathlib import Path
 
 log = logging.getLogger(__name__)
+NOT_FROM_HERE = ["-P"] if sys.version_info >= (3, 11) else []
+"""Option of Python with which `-m` does not put the current folder, where anybody's torch.py may lie, on the path."""
 
 
 class BackgroundEvaluation:
@@ -57,10 +60,13 @@ class BackgroundEvaluation:
 
     def _start(self, checkpoint: Path) -> tuple[Path, subprocess.Popen]:
         self.folder.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--checkpoint", str(checkpoint)]
-        command += ["--out", str(self._result(checkpoint)), *self._arguments]
-        with self._result(checkpoint).with_suffix(".log").open("w") as output:
-            return checkpoint, subprocess.Popen(command, stdout=output, stderr=output)
+        result = self._result(checkpoint).absolute()
+        command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
+        command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), *self._arguments]
+        folder = None if NOT_FROM_HERE else self.folder  # without the option, one in which only we have written
+        environment = os.environ | dict(PYTHONSAFEPATH="1")  # its workers are started by Python, too
+        with result.with_suffix(".log").open("w") as output:
+            return checkpoint, subprocess.Popen(command, cwd=folder, env=environment, stdout=output, stderr=output)
 
     def _read(self, checkpoint: Path, code: int) -> list[dict[str, float]]:
         path = self._result(checkpoint)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,54 +10,83 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.files import PARTIAL, atomic_folder, atomic_write, remove_folder
 
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
 """Files of a checkpoint: the policy's weights, the state of training, the settings."""
+LAST = "last"
+"""Name of the link to the checkpoint from which training goes on; it always names a whole one."""
 
 
 def save_checkpoint(
     folder: Path, config: dict[str, Any], weights: dict[str, torch.Tensor], training: dict[str, torch.Tensor]
 ) -> None:
-    """Write a checkpoint; it appears complete or not at all.
+    """Write a checkpoint; its folder appears complete or not at all, whenever the process is killed.
 
     Args:
-        folder: Folder of the checkpoint; it is replaced if it exists.
+        folder: Folder of the checkpoint, which must not exist.
         config: Everything that is needed to build the policy, and "step", in types that json knows.
         weights: The (EMA) weights of the policy.
         training: The state of training that only resuming needs, from `pack`.
+
+    Raises:
+        FileWriteError: The checkpoint cannot be written.
     """
-    partial = folder.with_name(folder.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    save_file({name: t.contiguous() for name, t in weights.items()}, partial / WEIGHTS)
-    save_file({name: t.contiguous() for name, t in training.items()}, partial / TRAINING)
-    (partial / CONFIG).write_text(json.dumps(config, indent=2))
-    shutil.rmtree(folder, ignore_errors=True)
-    partial.replace(folder)
+    with atomic_folder(folder) as partial:
+        for name, tensors in ((WEIGHTS, weights), (TRAINING, training)):
+            try:
+                save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, partial / name)
+            except SafetensorError as error:  # its error where the disk is full
+                raise OSError(str(error)) from error
+        (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
 
 def make_last(folder: Path) -> None:
-    """Make the link `last`, beside a checkpoint, point to it."""
-    link = folder.with_name("last.partial")
-    link.unlink(missing_ok=True)
-    link.symlink_to(folder.name)
-    link.replace(folder.with_name("last"))
+    """Make the link `last`, beside a checkpoint, point to it.
+
+    Raises:
+        FileWriteError: The link cannot be written.
+    """
+    with atomic_write(folder.with_name(LAST)) as partial:
+        partial.unlink(missing_ok=True)  # of a process that was killed here
+        partial.symlink_to(folder.name)
+
+
+def saved_checkpoints(checkpoints: Path) -> list[Path]:
+    """The checkpoints in a folder, which need not exist, in the order of their steps."""
+    return sorted(path for path in checkpoints.glob("*") if path.name.isdigit())
+
+
+def newest_checkpoint(checkpoints: Path) -> Path:
+    """The checkpoint of the last step; the link `last` falls behind it where a process was killed between the two.
+
+    Where there is no checkpoint, it is the path that `last` would have.
+    """
+    return (saved_checkpoints(checkpoints) or [checkpoints / LAST])[-1]
 
 
 def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
-    """Delete old checkpoints, and the state of training of all but the newest.
+    """Delete old checkpoints, and the state of training of all but the newest. The one that `last` names always stays whole.
 
     Args:
         checkpoints: Folder of the checkpoints.
         keep: Number of the newest checkpoints that stay.
         in_use: Older checkpoints that stay, too.
     """
-    folders = sorted(path for path in checkpoints.iterdir() if path.name.isdigit())
+    folders = saved_checkpoints(checkpoints)
+    last = (checkpoints / LAST).resolve()
     for folder in folders[:-1]:
-        (folder / TRAINING).unlink(missing_ok=True)
+        if folder.resolve() != last:
+            (folder / TRAINING).unlink(missing_ok=True)
     for folder in folders[:-keep]:
-        if folder not in in_use:
-            shutil.rmtree(folder)
+        if folder not in in_use and folder.resolve() != last:
+            remove_folder(folder)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete the folders inside a folder that processes were writing or deleting when they were killed."""
+    for path in folder.glob(".*" + PARTIAL):
+        remove_folder(path)
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:

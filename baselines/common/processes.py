@@ -30,6 +30,13 @@ class Processes:
         """The model, wrapped so that its gradients are the mean over all processes."""
         return nn.parallel.DistributedDataParallel(model) if self.count > 1 else model
 
+    def of_first(self, value: str) -> str:
+        """The text that the first process has."""
+        values = [value]
+        if self.count > 1:
+            dist.broadcast_object_list(values, src=0, device=self.device)
+        return values[0]
+
     def wait(self) -> None:
         """Wait until all processes have come here."""
         if self.count > 1:

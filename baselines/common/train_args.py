@@ -2,10 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
 import torch
+
+from manifeel_ms3.tasks.registry import short_name
 
 from .policy import PolicyConfig
 
@@ -63,8 +66,9 @@ class TrainArgs:
     """Number format of activations and gradients; weights are always fp32."""
     compile: bool = ON_GPU
     """Compile the networks before training, which takes a minute or two."""
-    run_dir: Path = Path("runs/policy")
-    """Folder of log.jsonl, tensorboard events, checkpoints and evaluations."""
+    run_dir: Path | None = None
+    """Folder of log.jsonl, tensorboard events, checkpoints and evaluations; a new one if not given,
+    runs/<policy>/<task>-<obs_mode>-seed<seed>-<date>-<time>."""
     save_every: int = 5000
     """Number of gradient steps between checkpoints; the last step always has one."""
     keep: int = 10
@@ -79,16 +83,29 @@ class TrainArgs:
     """Number of gradient steps between entries of the log."""
     resume: bool = False
     """Continue from the last checkpoint in run_dir."""
+    overwrite: bool = False
+    """Delete the checkpoints, the log and the evaluations of an earlier run in run_dir, and begin anew."""
     wandb_project: str | None = None
     """Project of Weights & Biases that receives the log, too; WANDB_MODE=offline writes it to disk."""
 
 
 FREE_ON_RESUME = {
-    *("demos", "tacrgb_weights", "run_dir", "resume", "device", "compile", "log_every", "wandb_project"),
+    *("demos", "tacrgb_weights", "run_dir", "resume", "overwrite", "device", "compile", "log_every", "wandb_project"),
     *("steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
     *("eval_episodes", "eval_workers", "eval_env_kwargs"),
 }
 """Settings that may change when a run is resumed."""
+
+
+def default_run_dir(args: TrainArgs, policy: str) -> Path:
+    """Folder of a new run, named by what it trains and by the present time.
+
+    Args:
+        args: Settings of the run.
+        policy: Registered name of the policy.
+    """
+    now = datetime.now().strftime("%Y%m%d-%H%M%S")
+    return Path("runs") / policy / f"{short_name(args.env_id)}-{args.obs_mode}-seed{args.seed}-{now}"
 
 
 def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:

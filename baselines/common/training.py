@@ -1,9 +1,11 @@
 """The training loop that all policies share: set up, step, save, resume."""
 
+import logging
 import math
 import random
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,23 +15,29 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
-from manifeel_ms3.errors import WorkFailedError
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.provenance import machine
+from manifeel_ms3.files import remove_folder
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 
 from .agent import spec_of
 from .background_evaluation import BackgroundEvaluation
 from .checkpoint import (
+    LAST,
     TRAINING,
     WEIGHTS,
     as_json,
     make_last,
+    newest_checkpoint,
     pack,
     prune,
     read_tensors,
+    remove_leftovers,
     require_same_config,
     save_checkpoint,
+    saved_checkpoints,
     unpack,
 )
 from .dataset import Episode, SequenceDataset, read_episodes
@@ -39,8 +47,11 @@ from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog
-from .train_args import FREE_ON_RESUME, TrainArgs, default_steps
+from .train_args import FREE_ON_RESUME, TrainArgs, default_run_dir, default_steps
 
+log = logging.getLogger(__name__)
+CHECKPOINTS, EVALUATIONS = "checkpoints", "evaluations"
+"""Folders of the checkpoints and of their evaluations in the folder of a run."""
 RANK_SEED_STRIDE = 1_000_003
 """Distance of the noise seeds of processes: a prime that is larger than usual seeds and numbers of steps."""
 
@@ -57,29 +68,45 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         policy_class: Class of the policy.
 
     Raises:
+        InvalidArgumentError: The settings do not say which run is meant.
+        FileExistsAlreadyError: The folder of the run has checkpoints, and is neither to be resumed nor to be overwritten.
+        InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
         CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
         TrainingError: The loss is not a finite number.
     """
-    return Trainer(args, policy_class).run()
+    if args.resume and (args.run_dir is None or args.overwrite):
+        raise InvalidArgumentError("--resume needs --run-dir, the folder of the run to continue, and excludes --overwrite")
+    processes = Processes(args.device)
+    run_dir = Path(processes.of_first(str(args.run_dir or default_run_dir(args, policy_class.name))))
+    with owned(run_dir) if processes.first else nullcontext():
+        if saved_checkpoints(run_dir / CHECKPOINTS) and not (args.resume or args.overwrite):
+            raise FileExistsAlreadyError(
+                f"{run_dir} has the checkpoints of an earlier run; continue it with --resume, replace it with --overwrite, or "
+                "give another --run-dir"
+            )
+        if processes.first:
+            log.info("the run is in %s", run_dir)
+        return Trainer(replace(args, run_dir=run_dir), policy_class, processes).run()
 
 
 class Trainer:
     """A training run: the data, the policy and all that changes while it learns.
 
     Args:
-        args: Settings of the run.
+        args: Settings of the run, with its folder.
         policy_class: Class of the policy.
+        processes: The processes of the run.
 
     Raises:
         DemonstrationError: The demonstrations are not what the settings ask for.
         CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
     """
 
-    def __init__(self, args: TrainArgs, policy_class: type[VisuotactilePolicy]):
-        self.args = args
-        self.processes = Processes(args.device)
-        self.device = self.processes.device
+    def __init__(self, args: TrainArgs, policy_class: type[VisuotactilePolicy], processes: Processes):
+        assert args.run_dir is not None
+        self.args, self.run_dir, self.processes = args, args.run_dir, processes
+        self.device = processes.device
         keep_freed_memory(self.device)
         seed_everything(args.seed)
 
@@ -108,15 +135,15 @@ class Trainer:
             torch.manual_seed(args.seed + RANK_SEED_STRIDE * self.processes.rank + self.step)
 
         self.model = self.processes.with_mean_gradients(self.policy).train()
-        self.log = RunLog(args.run_dir, self.config, args.resume, args.wandb_project) if self.processes.first else None
         self.evaluation = BackgroundEvaluation(
-            args.run_dir / "evaluations", args.eval_episodes, args.eval_workers, args.eval_env_kwargs
+            self.run_dir / EVALUATIONS, args.eval_episodes, args.eval_workers, args.eval_env_kwargs
         )
+        self.log = self._open_log() if processes.first else None
 
     @property
     def checkpoints(self) -> Path:
         """Folder of the checkpoints."""
-        return self.args.run_dir / "checkpoints"
+        return self.run_dir / CHECKPOINTS
 
     def run(self) -> Path:
         """Train to the last step, and return the last checkpoint.
@@ -176,8 +203,8 @@ class Trainer:
         return policy
 
     def _resume(self) -> None:
-        """Continue from the last checkpoint, bit for bit as if the run had not stopped."""
-        last = self.checkpoints / "last"
+        """Continue from the newest checkpoint, bit for bit as if the run had not stopped."""
+        last = newest_checkpoint(self.checkpoints)
         saved = checkpoint_config(last)
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
         state = read_tensors(last / TRAINING)
@@ -189,6 +216,23 @@ class Trainer:
         fast_forward(self.schedule, self.step)
         self.begin -= saved["training_seconds"]
 
+    def _open_log(self) -> RunLog:
+        """Make the folder of the run ready: what is left of an earlier run stays only where this one continues it."""
+        for folder in (self.run_dir, self.checkpoints):
+            remove_leftovers(folder)
+        if self.args.overwrite:
+            for name in (CHECKPOINTS, EVALUATIONS):
+                if (self.run_dir / name).is_dir():
+                    remove_folder(self.run_dir / name)
+        opened = RunLog(self.run_dir, self.config, self.step, self.args.wandb_project)
+        if self.args.resume:
+            make_last(newest_checkpoint(self.checkpoints))
+            evaluated = {entry.get("evaluated_step") for entry in opened.entries}
+            for checkpoint in saved_checkpoints(self.checkpoints) if self.args.eval_episodes else []:
+                if int(checkpoint.name) not in evaluated:
+                    self.evaluation.submit(checkpoint)
+        return opened
+
     def _log_loss(self) -> float:
         """Log the mean loss since the last entry, and return it."""
         mean = self.losses.take_mean(self.step, self.dataset.names)
@@ -199,8 +243,9 @@ class Trainer:
 
     def _save_and_evaluate(self) -> None:
         """Write a checkpoint, queue its evaluation, and delete old checkpoints."""
-        if not self.processes.first:
+        if self.log is None:
             return
+        self.log.sync()
         checkpoint = self.save()
         if self.args.eval_episodes:
             self.evaluation.submit(checkpoint)
@@ -220,7 +265,7 @@ class Trainer:
             self.log.close()
         self.processes.wait()
         self.processes.close()
-        return self.checkpoints / "last"
+        return self.checkpoints / LAST
 
 
 class SampleOrder:

@@ -25,7 +25,6 @@ class Args(TrainArgs):
     inference_steps: int = 100
     """Number of denoising steps in evaluation; with as many as diffusion steps the sampler is DDPM, with fewer DDIM."""
     lr: float = 8e-5
-    run_dir: Path = Path("runs/diffusion_policy")
 
 
 PRESETS = {

@@ -25,7 +25,6 @@ class Args(TrainArgs):
     policy: EquivariantConfig = field(default_factory=lambda: EquivariantConfig(encoder=EncoderConfig(crop=230)))
     inference_steps: int = 100
     """Number of denoising steps of DDIM in evaluation."""
-    run_dir: Path = Path("runs/equivariant_diffusion_policy")
 
 
 PRESETS = {

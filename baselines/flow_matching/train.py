@@ -26,7 +26,6 @@ class Args(TrainArgs):
     policy: FlowConfig = field(default_factory=FlowConfig)
     inference_steps: int = 10
     """Number of Euler steps from noise to actions in evaluation."""
-    run_dir: Path = Path("runs/flow_matching")
 
 
 PRESETS = {

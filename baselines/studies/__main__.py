@@ -8,14 +8,17 @@ again, and a study that was stopped goes on where it stopped.
 
 import logging
 import os
+import secrets
 import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import ray
 import tyro
+from ray.exceptions import RayError, RayTaskError
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import track
@@ -26,7 +29,7 @@ from manifeel_ms3.errors import MachineError, WorkFailedError
 
 from . import cost
 from .command_lines import shell_command
-from .jobs import FAILED, STARTED, is_done, is_running, perform, read_status, restore_child_signals
+from .jobs import FAILED, STARTED, is_done, is_running, perform_in, read_status, restore_child_signals
 from .study import KINDS, Job, Kind, Study, jobs_of, read_study
 
 log = logging.getLogger(__name__)
@@ -40,7 +43,11 @@ RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
 }
-"""Environment variables of a Ray that is started here."""
+"""Environment variables of a Ray that is started here, unless they are set."""
+LOOPBACK = "127.0.0.1"
+"""Address on which a Ray that is started here listens: no other machine reaches it."""
+CODE = Path(__file__).parents[2]
+"""Folder that these packages are imported from."""
 
 
 @dataclass
@@ -68,7 +75,7 @@ def main(args: Args) -> None:
 
     Raises:
         StudyError: The study's file cannot be used.
-        MachineError: The study asks for more than the machine has.
+        MachineError: The study asks for more than the machine has, or the folder of the jobs cannot be written.
         StudyFailed: Some jobs failed; the others are done.
     """
     study = read_study(args.study)
@@ -79,39 +86,90 @@ def main(args: Args) -> None:
             line = shell_command(job, args.root, study.resources[job.kind].workers)
             console.print(f"# {job.kind}: {job.title}\n{line}", soft_wrap=True, markup=False, highlight=False)
         return
+    _require_writable(args.root)
     if args.dry_run:
         console.print(plan(study, jobs, args.root))
         return
+    errors = {}
     if not all(is_done(job, args.root) for job in jobs):
-        _run(study, jobs, args.root.absolute(), args.address, console)
+        errors = _run(study, jobs, args.root.absolute(), args.address, console)
     failed = [job for job in jobs if not is_done(job, args.root)]
     console.print(f"{len(jobs) - len(failed)} of {len(jobs)} jobs of {args.study} are done, in {args.root}")
     if failed:
-        reasons = "\n".join(f"  {job.kind}: {job.title}: {_reason(job, args.root)}" for job in failed)
+        reasons = "\n".join(f"  {job.kind}: {job.title}: {_reason(job, args.root, errors)}" for job in failed)
         raise StudyFailed(f"{len(failed)} jobs are not done; give the same command to try them again:\n{reasons}")
 
 
-def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console: Console) -> None:
-    """Give every job to Ray, and show the progress until none is left."""
-    for name, value in RAY_SETTINGS.items():
-        os.environ.setdefault(name, value)
-    ray.init(address, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING, configure_logging=False)
+def _require_writable(root: Path) -> None:
+    """Try to write into the folder of all jobs before any of them begins."""
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=root):
+            pass
+    except OSError as error:
+        raise MachineError(f"{root} cannot be written ({error.strerror}); give another --root") from error
+
+
+def _start_ray(address: str | None) -> None:
+    """Connect to a cluster, or start a Ray on this machine that only its own processes can reach and command.
+
+    Ray puts the current folder on the path of its workers, where anybody's torch.py may lie; so it is started from the
+    folder that this code is imported from.
+    """
+    settings: dict[str, Any] = {}
+    address = address or "local"
+    if address == "local":
+        settings = dict(_node_ip_address=LOOPBACK)
+        os.environ.pop("RAY_AUTH_MODE", None)  # where it is not set, a Ray that is started here asks for a token
+        os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        for name, value in RAY_SETTINGS.items():
+            os.environ.setdefault(name, value)
+    here = Path.cwd()
+    os.chdir(CODE)
+    try:
+        ray.init(
+            address,
+            include_dashboard=False,
+            log_to_driver=False,
+            logging_level=logging.WARNING,
+            configure_logging=False,
+            **settings,
+        )
+    finally:
+        os.chdir(here)
+
+
+def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console: Console) -> dict[str, str]:
+    """Give every job to Ray, show the progress until none is left, and return the errors by the jobs' keys."""
+    _start_ray(address)
     restore_child_signals()
     try:
-        worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform)  # a new process for each job
+        worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform_in)  # a new process for each job
         _require_resources(study)
         results = {}
         for job in jobs:
             needs = study.resources[job.kind]
             task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
-            results[job.key] = task.remote(job, root, needs.workers, *(results[need.key] for need in job.needs))
+            results[job.key] = task.remote(Path.cwd(), job, root, needs.workers, *(results[need.key] for need in job.needs))
         waiting = list(results.values())
         with Live(console=console, refresh_per_second=1) as live:
             while waiting:
                 _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=POLL_SECONDS, fetch_local=False)
                 live.update(progress(study, jobs, root))
+        return {key: error for key, result in results.items() if (error := _error(result))}
     finally:
         ray.shutdown()
+
+
+def _error(result: Any) -> str:
+    """What a job raised, on one line; "" where it is done."""
+    try:
+        ray.get(result)
+    except RayTaskError as error:
+        return str(error.cause).partition("\n")[0]
+    except RayError:
+        return "its worker died"
+    return ""
 
 
 def _require_resources(study: Study) -> None:
@@ -125,11 +183,19 @@ def _require_resources(study: Study) -> None:
                 )
 
 
-def _reason(job: Job, root: Path) -> str:
-    """Why a job is not done."""
-    if (path := job.folder(root) / FAILED).is_file():
-        return f"{read_status(path)['error']} ({path} has the traceback)"
-    return "its worker died" if (job.folder(root) / STARTED).is_file() else "a job that it needs is not done"
+def _reason(job: Job, root: Path, errors: dict[str, str]) -> str:
+    """Why a job is not done.
+
+    Args:
+        job: The job.
+        root: Folder of all jobs.
+        errors: What jobs raised, by their keys.
+    """
+    if not all(is_done(need, root) for need in job.needs):
+        return "a job that it needs is not done"
+    if failed := read_status(path := job.folder(root) / FAILED):
+        return f"{failed['error']} ({path} has the traceback)"
+    return errors.get(job.key) or "its worker died"
 
 
 def progress(study: Study, jobs: list[Job], root: Path) -> Group:

@@ -17,10 +17,8 @@ from baselines.common.agent import spec_of
 from baselines.common.observation import POSE, POSE_FEATURES
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import write_json
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import task_spec
 
@@ -98,7 +96,7 @@ def _done(job: Job, root: Path) -> list[dict[str, Any]]:
     """Status files of jobs that were done on a machine like this one and differ from `job` in amounts and seeds alone."""
     here = machine()
     found = [_status(path, path.stat().st_mtime) for path in root.glob(f"{job.kind}/*/{DONE}")]
-    return [status for status in found if status["machine"] == here and _work(status["settings"]) == _work(job.settings)]
+    return [status for status in found if status.get("machine") == here and _work(status["settings"]) == _work(job.settings)]
 
 
 @cache
@@ -125,13 +123,9 @@ def _units(job: Job) -> int:
     return args.steps or default_steps(demos, samples, args.batch_size)
 
 
-@cache
 def _demonstration_steps(env_id: str) -> float:
-    """Mean number of control steps of the sample demonstrations; the time limit of a task that has none."""
-    sample = data_dir() / "sample" / env_id / "states.h5"
-    if not sample.is_file():
-        return task_spec(env_id).max_episode_steps
-    return float(np.mean([episode["elapsed_steps"] for episode in read_header(sample)["episodes"]]))
+    """Mean number of control steps of a demonstration; the time limit of a task where it is not known."""
+    return task_spec(env_id).demo_steps or task_spec(env_id).max_episode_steps
 
 
 # -------------------------------------------------------------------- trials

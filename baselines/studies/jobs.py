@@ -9,6 +9,7 @@ import signal
 import socket
 import time
 import traceback
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,17 @@ from typing import Any
 import psutil
 import tyro
 
+from baselines.common.checkpoint import saved_checkpoints
+from baselines.common.training import CHECKPOINTS
 from baselines.registry import policy_spec
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.provenance import machine
-from manifeel_ms3.files import write_json
+from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
+from manifeel_ms3.files import FileWriteError, write_json
+from manifeel_ms3.ownership import owned
 
 from .command_lines import evaluate_arguments, record_arguments, training_args, trajectory_of
 from .study import Job
@@ -31,7 +37,7 @@ DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
 
 def is_done(job: Job, root: Path) -> bool:
     """Whether a job has finished its work."""
-    return (job.folder(root) / DONE).is_file()
+    return bool(read_status(job.folder(root) / DONE))
 
 
 def is_running(job: Job, root: Path) -> bool:
@@ -41,6 +47,13 @@ def is_running(job: Job, root: Path) -> bool:
     if not started or is_done(job, root) or (folder / FAILED).is_file():
         return False
     return started["host"] != socket.gethostname() or psutil.pid_exists(started["pid"])
+
+
+def perform_in(working_folder: Path, job: Job, root: Path, workers: int, *needed: None) -> None:
+    """Do what `perform` does in a working folder, to which relative paths in the study's file belong."""
+    if working_folder.is_dir():  # a machine of a cluster may lack it
+        os.chdir(working_folder)
+    perform(job, root, workers, *needed)
 
 
 def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
@@ -53,13 +66,17 @@ def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
         _needed: Return values of the jobs that this one needs; Ray waits for them.
 
     Raises:
+        InUseError: Another process, perhaps of another study, does the job at present.
         Exception: Any error of the job; it is also written to failed.json.
     """
     restore_child_signals()
-    if is_done(job, root):
-        return
+    with owned(job.folder(root) / STARTED):  # the folder itself is owned by the training that runs in it
+        if not is_done(job, root):
+            _perform(job, root, workers)
+
+
+def _perform(job: Job, root: Path, workers: int) -> None:
     folder = job.folder(root)
-    folder.mkdir(parents=True, exist_ok=True)
     attempts = read_status(folder / STARTED).get("attempts", 0) + 1
     started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=job.title, settings=job.settings)
     write_json(folder / STARTED, started)
@@ -68,7 +85,8 @@ def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
     try:
         units = WORK[job.kind](job, root, workers)
     except Exception as error:
-        write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
+        with suppress(FileWriteError):  # on a full disk the error itself is told
+            write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
     parallel = 1 if job.kind == "train" else workers
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
@@ -92,7 +110,7 @@ def _record(job: Job, root: Path, workers: int) -> int:
 
 def _train(job: Job, root: Path, _workers: int) -> int:
     """Train a policy, and return the number of its gradient steps."""
-    resume = (job.folder(root) / "checkpoints/last").exists()
+    resume = bool(saved_checkpoints(job.folder(root) / CHECKPOINTS))
     last = policy_spec(job.settings["policy"]).train(replace(training_args(job, root), resume=resume))
     return json.loads((last / "config.json").read_text())["step"]
 
@@ -100,18 +118,36 @@ def _train(job: Job, root: Path, _workers: int) -> int:
 def _evaluate(job: Job, root: Path, workers: int) -> int:
     """Write one result file for each checkpoint, and return the number of episodes."""
     settings, (train,) = job.settings, job.needs
-    checkpoints = sorted(path for path in (train.folder(root) / "checkpoints").iterdir() if path.name.isdigit())
-    chosen = checkpoints[-settings["checkpoints"] :]
+    chosen = saved_checkpoints(train.folder(root) / CHECKPOINTS)[-settings["checkpoints"] :]
     for checkpoint in chosen:
         out = job.folder(root) / f"{checkpoint.name}.json"
-        if not out.is_file():
+        if not is_result_of(checkpoint, out):
             evaluate.main(tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out))))
     return len(chosen) * settings["episodes"]
+
+
+def is_result_of(checkpoint: Path, path: Path) -> bool:
+    """Whether a file is the result of a checkpoint: it is whole, and holds the checkpoint's configuration.
+
+    Args:
+        checkpoint: Folder of the checkpoint.
+        path: Path of the file, which need not exist.
+    """
+    try:
+        evaluated = read_result(path)["config"]
+    except ResultError:
+        return False
+    config = checkpoint_config(checkpoint)
+    return all(evaluated.get(name) == value for name, value in config.items() if name not in PATHS)
 
 
 WORK = dict(record=_record, train=_train, evaluate=_evaluate)
 
 
 def read_status(path: Path) -> dict[str, Any]:
-    """The content of a status file; {} if there is none."""
-    return json.loads(path.read_text()) if path.is_file() else {}
+    """The content of a status file; {} if there is none, or if it was cut off."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}

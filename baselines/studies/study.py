@@ -108,14 +108,21 @@ class Job:
         return root / self.kind / self.key
 
 
-def read_study(path: Path) -> Study:
+def read_study(path: Path, _including: tuple[Path, ...] = ()) -> Study:
     """Read a study's file; its key `include` adds the grids of other files.
 
+    Args:
+        path: Path of the file.
+        _including: The files that include this one.
+
     Raises:
-        StudyError: The file is missing, is not yaml, or holds a key, a task or a policy that is not known.
+        StudyError: The file is missing, is not yaml, includes itself, or holds a key, a task or a policy that is not known.
     """
+    including = (*_including, path.resolve())
+    if path.resolve() in _including:
+        raise StudyError(f"{path} includes itself, by way of {[file.name for file in including]}; remove one `include`")
     content = _content(path)
-    included = [read_study(path.parent / name) for name in content.get("include", [])]
+    included = [read_study(path.parent / name, including) for name in content.get("include", [])]
     own = [_grid(entry, f"{path}: grids/{k}") for k, entry in enumerate(content.get("grids", []))]
     grids = [grid for study in included for grid in study.grids] + own
     if not grids:
@@ -131,9 +138,10 @@ def read_study(path: Path) -> Study:
 def _content(path: Path) -> dict[str, Any]:
     """The file's mapping, with keys of the right kinds."""
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise StudyError(f"{path} cannot be read as a study ({error}); see configs/ for examples") from error
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
+        reason = " ".join(str(error).split())  # yaml's own message has several lines
+        raise StudyError(f"{path} cannot be read as a study ({reason}); see configs/ for examples") from error
     if not isinstance(content, dict):
         raise StudyError(f"{path} is not a study: it must be a mapping with the key `grids`; see configs/ for examples")
     _require_known(content, {"grids", "include", "resources"}, f"{path}")

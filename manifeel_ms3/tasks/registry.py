@@ -49,6 +49,8 @@ class TaskSpec:
     """Raised by one whenever the task's outcomes change; results of different revisions cannot be compared."""
     demo_megabytes: float = 13.0
     """Size of one demonstration with every observation, in MB, rounded up; to see whether the disk has room."""
+    demo_steps: float | None = None
+    """Mean number of control steps of a demonstration, measured over seeds 0 to 99 (docs/tasks.md); None if not known."""
     demonstrator: Callable[[Any, int], Any] | None = None
     """Makes a scripted demonstrator from an environment and a seed; attached by `register_demonstrator`."""
     probes: list[Any] = field(default_factory=list)

@@ -238,7 +238,7 @@ def test_what_fails_is_told_and_tried_again(study, tmp_path):
     failed = json.loads((train.folder(root) / "failed.json").read_text())
     assert "trajectory.h5" in failed["error"]
     assert not is_done(train, root)
-    assert "trajectory.h5" in study_command._reason(train, root)
+    assert "trajectory.h5" in study_command._reason(train, root, {})
     (record.folder(root) / "done.json").unlink()
     perform(record, root)
     with pytest.raises(ValueError, match="nonsense"):

@@ -10,6 +10,7 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from baselines.common.checkpoint import TRAINING, prune
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
+from baselines.common.processes import Processes
 from baselines.common.train_args import PAPER_EPOCHS, default_steps
 from baselines.common.training import RecentLosses, SampleOrder, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
@@ -120,13 +121,13 @@ def trainer_args(demos, tmp_path):
 
 
 def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(trainer_args):
-    first = Trainer(trainer_args, diffusion.DiffusionPolicy)
+    first = Trainer(trainer_args, diffusion.DiffusionPolicy, Processes("cpu"))
     before = [parameter.clone() for parameter in first.policy.parameters()]
     for _ in range(3):
         first.take_step()
     assert any(not torch.equal(old, new) for old, new in zip(before, first.policy.parameters(), strict=True))
     assert first.save().name == "00000003"
-    second = Trainer(dataclasses.replace(trainer_args, resume=True), diffusion.DiffusionPolicy)
+    second = Trainer(dataclasses.replace(trainer_args, resume=True), diffusion.DiffusionPolicy, Processes("cpu"))
     assert second.step == 3
     own, other = first.policy.state_dict(), second.policy.state_dict()
     assert all(torch.equal(own[name], other[name]) for name in own)

@@ -53,7 +53,12 @@ class BallSortingRewardConfig:
 
 
 @register_task(
-    "ManiFeel-BallSorting-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("II", "III")
+    "ManiFeel-BallSorting-v1",
+    max_episode_steps=400,
+    category="exploration",
+    paper_demos=80,
+    paper_tables=("II", "III"),
+    demo_steps=84,
 )
 class BallSortingEnv(VisuotactileEnv):
     """Tell a golf ball from a table-tennis ball by touch, and lift it.
@@ -160,7 +165,14 @@ class BallSortingEnv(VisuotactileEnv):
         return reach + lifted + (info["tennis_away"] < IN_PLACE).float() + info["success"].float()
 
 
-@register_task("ManiFeel-BallSortingDim-v1", max_episode_steps=400, category="exploration", paper_demos=80, paper_tables=("I",))
+@register_task(
+    "ManiFeel-BallSortingDim-v1",
+    max_episode_steps=400,
+    category="exploration",
+    paper_demos=80,
+    paper_tables=("I",),
+    demo_steps=84,
+)
 class BallSortingDimEnv(BallSortingEnv):
     """BallSorting at 5 % of the light."""
 

@@ -47,7 +47,12 @@ class ObjectSearchRewardConfig:
 
 
 @register_task(
-    "ManiFeel-ObjectSearch-v1", max_episode_steps=400, category="exploration", paper_demos=50, paper_tables=("I", "II", "III")
+    "ManiFeel-ObjectSearch-v1",
+    max_episode_steps=400,
+    category="exploration",
+    paper_demos=50,
+    paper_tables=("I", "II", "III"),
+    demo_steps=110,
 )
 class ObjectSearchEnv(VisuotactileEnv):
     """Find a battery in a container that the camera cannot see into, and lift it.

@@ -8,7 +8,9 @@ from manifeel_ms3.tasks.registry import register_task
 from .base import InsertionEnv
 
 
-@register_task("ManiFeel-PegInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
+@register_task(
+    "ManiFeel-PegInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",), demo_steps=83
+)
 class PegInsertionEnv(InsertionEnv):
     """Insert a rectangular peg into a socket with little clearance.
 

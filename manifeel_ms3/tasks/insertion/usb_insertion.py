@@ -9,7 +9,9 @@ NOT_INSERTED = 0.1
 """Share of the shell that may be outside the port at success."""
 
 
-@register_task("ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",))
+@register_task(
+    "ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",), demo_steps=78
+)
 class USBInsertionEnv(InsertionEnv):
     """Insert a USB-A plug into a port that looks up.
 

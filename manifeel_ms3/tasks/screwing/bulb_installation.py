@@ -46,6 +46,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
+    demo_steps=410,
 )
 class BulbInstallationEnv(ScrewingEnv):
     """Screw a light bulb into its holder.

@@ -20,6 +20,7 @@ MAX_TILT = np.deg2rad(2.0)
     paper_demos=30,
     paper_tables=("I",),
     demo_megabytes=70.0,
+    demo_steps=400,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):
     """Screw an M16 nut onto a bolt.
