@@ -1,4 +1,4 @@
-"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome."""
+"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome, unless it cannot be asked at all."""
 
 import faulthandler
 import signal
@@ -14,7 +14,7 @@ import numpy as np
 from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
 
-from .policy import Policy
+from .policy import Policy, PolicyUnavailableError
 
 HANGS_FOR_GOOD = 10.0
 """Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
@@ -60,6 +60,9 @@ def evaluate_episode(
         on_step: Function that is called with every observation, the last one included.
         step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
             in the main thread of a process.
+
+    Raises:
+        PolicyUnavailableError: The policy cannot be asked, so that the episode has no outcome.
     """
     obs, _ = env.reset(seed=seed)
     task: Any = env.unwrapped
@@ -92,11 +95,12 @@ def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
 
     Raises:
         PolicyFault: The method raised an error, or took too long.
+        PolicyUnavailableError: The policy cannot be asked.
     """
     try:
         with _time_limit(step_timeout):
             return ask()
-    except PolicyFault:
+    except (PolicyFault, PolicyUnavailableError):
         raise
     except Exception as error:  # a policy is anybody's code
         raise PolicyFault(f"{type(error).__name__}: {error}") from error
