@@ -18,7 +18,7 @@ import logging
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -98,11 +98,6 @@ class Evaluation:
     config: dict[str, Any]
     """Configuration of the policy; the result holds it without paths, passwords and tokens."""
 
-    @cached_property
-    def fingerprint(self) -> str | None:
-        """SHA-256 of the checkpoint or of the policy's source file, as it was when it was first asked for."""
-        return self.source.fingerprint()
-
 
 def main(args: Args) -> Path:
     """Evaluate a policy, and return the path of the result file.
@@ -156,7 +151,7 @@ def _identity(evaluation: Evaluation, step_timeout: float) -> dict[str, Any]:
     return dict(
         env_id=evaluation.env_id,
         env_kwargs=evaluation.env_kwargs,
-        policy_hash=evaluation.fingerprint,
+        policy_hash=evaluation.source.fingerprint(),
         policy_kwargs=redacted(json.loads(evaluation.source.kwargs)),
         config=published_config(evaluation.config),
         step_timeout=step_timeout,
@@ -165,8 +160,7 @@ def _identity(evaluation: Evaluation, step_timeout: float) -> dict[str, Any]:
 
 
 def _result(evaluation: Evaluation, outcomes: list[EpisodeOutcome]) -> dict[str, Any]:
-    checkpoint_hash = evaluation.fingerprint if evaluation.source.checkpoint else None
-    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes, checkpoint_hash)
+    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes)
 
 
 def evaluation_from_args(args: Args) -> Evaluation:

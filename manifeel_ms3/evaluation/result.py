@@ -48,11 +48,7 @@ def provenance(env_id: str) -> dict[str, Any]:
 
 
 def result_of(
-    env_id: str,
-    env_kwargs: dict[str, Any],
-    config: dict[str, Any],
-    outcomes: list[EpisodeOutcome],
-    checkpoint_hash: str | None = None,
+    env_id: str, env_kwargs: dict[str, Any], config: dict[str, Any], outcomes: list[EpisodeOutcome]
 ) -> dict[str, Any]:
     """The content of a result file.
 
@@ -61,7 +57,6 @@ def result_of(
         env_kwargs: Arguments of `gym.make`.
         config: Configuration of the policy; `published_config` says what is left out of it, since results are published.
         outcomes: Outcomes of all episodes.
-        checkpoint_hash: SHA-256 of the checkpoint; None for a policy without one.
     """
     config = published_config(config)
     rates = {}
@@ -77,7 +72,6 @@ def result_of(
         policy=config["policy_name"],
         training_seed=config.get("seed"),
         config=config,
-        checkpoint_hash=checkpoint_hash,
         **provenance(env_id),
         **rates,
         mean_length=float(np.mean([outcome.length for outcome in outcomes])),
