@@ -9,7 +9,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -40,10 +40,12 @@ def owned(path: Path) -> Iterator[None]:
     except OSError as error:
         raise MachineError(f"{path.parent} cannot be written ({error.strerror}); give another path") from error
     try:
-        _write_holder(holder)
+        with suppress(OSError):  # the name is a courtesy: the disk may be full, or the file may be of another user
+            _write_holder(holder)
         yield
     finally:
-        holder.unlink(missing_ok=True)
+        with suppress(OSError):
+            holder.unlink(missing_ok=True)
         held.release()
 
 

@@ -136,8 +136,11 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
         ResultError: The arguments cannot be part of a result.
         MissingExtraError: Videos are asked for, and the extra `report` is not installed.
     """
-    if out.is_dir():
-        raise InvalidArgumentError(f"--out {out} is a folder; give the path of a file, such as {out / 'evaluation.json'}")
+    try:
+        if out.is_dir():
+            raise InvalidArgumentError(f"--out {out} is a folder; give the path of a file, such as {out / 'evaluation.json'}")
+    except OSError as error:
+        raise InvalidArgumentError(f"--out {out} cannot be written ({error.strerror}); give another path") from error
     if wrong := [number for number in args.videos if not 0 <= number < len(seeds)]:
         raise InvalidArgumentError(f"--videos {wrong} cannot be recorded: the episodes are 0 to {len(seeds) - 1}")
     if args.videos:

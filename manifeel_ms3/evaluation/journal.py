@@ -19,7 +19,7 @@ import jsonschema
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, write_text
 
-from .result import result_schema
+from .result import not_finite, result_schema
 from .rollout import EpisodeOutcome
 
 log = logging.getLogger(__name__)
@@ -100,6 +100,8 @@ class Journal:
             schema = result_schema()["properties"]["episodes"]["items"]
             for episode in episodes:
                 jsonschema.validate(episode, schema)
+            if place := not_finite(episodes):
+                raise ValueError(f"{place} is NaN or infinite")
         except (OSError, ValueError, RecursionError, jsonschema.ValidationError) as error:
             raise InvalidFileError(
                 f"{self.path} does not hold the episodes of an unfinished evaluation ({str(error).splitlines()[0]}); begin "

@@ -157,7 +157,7 @@ def check_result(result: Any, source: Path) -> None:
     for error in jsonschema.Draft202012Validator(result_schema()).iter_errors(result):
         place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
         raise ResultError(f"{source} is not a result: {place}: {error.message[:LONGEST_MESSAGE]}")
-    if place := _not_finite(result):
+    if place := not_finite(result):
         raise ResultError(f"{source} is not a result: {place}: it is NaN or infinite; all numbers of a result are finite")
 
 
@@ -166,7 +166,7 @@ def result_schema() -> dict[str, Any]:
     return json.loads((data_dir() / "evaluation_schema.json").read_text(encoding="utf-8"))
 
 
-def _not_finite(value: Any) -> str | None:
+def not_finite(value: Any) -> str | None:
     """The place of a NaN or an infinity in a json value; None if all numbers are finite."""
     places = [("", value)]
     while places:

@@ -1,6 +1,7 @@
 """Run a policy for one episode per seed. Whatever the policy does, there is an outcome, unless it cannot be asked at all."""
 
 import faulthandler
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -80,7 +81,7 @@ def evaluate_episode(
             length += 1
             at_end = bool(info["success"])
             once |= at_end
-            peak = max(peak, float(info["contact_force"]))
+            peak = max(peak, _finite_force(info))
             over = bool(terminated) or bool(truncated)
     except PolicyFault as error:
         once, at_end, fault = False, False, f"step {length}: {error}"
@@ -88,6 +89,18 @@ def evaluate_episode(
         on_step(obs)
     mean = 1e3 * thinking / max(length, 1)
     return EpisodeOutcome(seed, once, at_end, length, round(peak, 3), round(mean, 3), fault)
+
+
+def _finite_force(info: dict[str, Any]) -> float:
+    """The contact force of a step, in N.
+
+    Raises:
+        PolicyFault: It is NaN or infinite: the actions have made the simulation diverge.
+    """
+    force = float(info["contact_force"])
+    if not math.isfinite(force):
+        raise PolicyFault(f"the simulation has diverged: the contact force is {force}")
+    return force
 
 
 def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
