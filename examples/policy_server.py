@@ -6,15 +6,21 @@ python -m manifeel_ms3.evaluation.evaluate --policy http://localhost:8000 --env-
 
 import argparse
 import io
-from http.server import BaseHTTPRequestHandler, HTTPServer
+from collections import OrderedDict
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Lock
 
 import numpy as np
 
+MAX_EPISODES = 64  # so many processes can run episodes at the same time; older episodes are forgotten
+MAX_BODY = 2**28  # bytes of the observations of one step
+
 
 class MyPolicy:
-    """Replace this policy, which only moves downwards, by your own."""
+    """Replace this policy, which only moves downwards, by your own. There is one object for each episode; load weights once,
+    outside of the class."""
 
-    def reset(self):
+    def __init__(self):
         self.steps = 0
 
     def act(self, obs):  # obs["sensor_data/wrist/rgb"] is (256, 256, 3), obs["extra/tcp_pose"] is (7,), ...
@@ -23,20 +29,40 @@ class MyPolicy:
 
 
 class Handler(BaseHTTPRequestHandler):
-    policy = MyPolicy()
+    timeout = 60  # s that a client may keep silent
+    policies = OrderedDict()  # noqa: RUF012  (by the name of the episode, which the header X-Episode has; the latest is the last)
+    lock = Lock()  # one policy is asked at a time
 
     def do_POST(self):
-        body, answer, status = self.rfile.read(int(self.headers["Content-Length"])), io.BytesIO(), 200
         try:
-            if self.path == "/reset":
-                self.policy.reset()
-            else:
-                np.savez(answer, action=self.policy.act(dict(np.load(io.BytesIO(body), allow_pickle=False))))
+            length = int(self.headers["Content-Length"])
+            if not 0 <= length <= MAX_BODY:
+                raise ValueError(f"a body of {length} bytes is refused")
+            body = self.rfile.read(length)
+            with self.lock:
+                status, content = self.reset() if self.path == "/reset" else self.act(body)
         except Exception as error:  # the evaluation records the message, and goes on with the next episode
-            answer, status = io.BytesIO(f"{type(error).__name__}: {error}".encode()), 500
+            status, content = 500, f"{type(error).__name__}: {error}".encode()
         self.send_response(status)
+        self.send_header("X-Episode", self.headers.get("X-Episode", ""))
+        self.send_header("Content-Length", str(len(content)))
         self.end_headers()
-        self.wfile.write(answer.getvalue())
+        self.wfile.write(content)
+
+    def reset(self):
+        self.policies[self.headers["X-Episode"]] = MyPolicy()
+        while len(self.policies) > MAX_EPISODES:
+            self.policies.popitem(last=False)
+        return 200, b""
+
+    def act(self, body):
+        episode = self.headers["X-Episode"]
+        if episode not in self.policies:  # the server was started again, for example; the evaluation ends
+            return 410, b"this episode is unknown or was forgotten"
+        self.policies.move_to_end(episode)
+        answer = io.BytesIO()
+        np.savez(answer, action=self.policies[episode].act(dict(np.load(io.BytesIO(body), allow_pickle=False))))
+        return 200, answer.getvalue()
 
     def log_message(self, format, *args):
         """Keep silent about requests."""
@@ -45,4 +71,4 @@ class Handler(BaseHTTPRequestHandler):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Serve a policy over HTTP.")
     parser.add_argument("--port", type=int, default=8000, help="Port that the server listens on.")
-    HTTPServer(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()
+    ThreadingHTTPServer(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()

@@ -81,18 +81,9 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def remove_folder(path: Path) -> None:
-    """Delete a folder; it disappears as a whole, under its own name, whenever the program is killed."""
-    hidden = _hidden(path)
-    if path != hidden:
-        shutil.rmtree(hidden, ignore_errors=True)
-        path.rename(hidden)
-    shutil.rmtree(hidden, ignore_errors=True)
-
-
 def _hidden(path: Path) -> Path:
-    """Where a folder is while it is written or deleted; such a path itself stays as it is."""
-    return path if path.name.startswith(".") and path.suffix == PARTIAL else path.with_name(f".{path.name}{PARTIAL}")
+    """Path of a folder while it is written."""
+    return path.with_name(f".{path.name}{PARTIAL}")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -151,18 +142,26 @@ def move(source: Path, target: Path) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder, which need not exist, in one step: it is renamed first, and then deleted.
+    """Remove a folder, which need not exist, in one step: it is renamed to a hidden name first, and then deleted.
 
-    Where a deletion is interrupted, the next call for the same path completes it.
+    Where a deletion is interrupted, the next call for the same path completes it, and so does `remove_leftovers`.
 
     Raises:
         FileWriteError: The folder cannot be renamed.
     """
-    prefix = f".{folder.name}.removed-"
     if folder.exists():
-        move(folder, folder.with_name(prefix + uuid4().hex))
-    for removed in [path for path in folder.parent.iterdir() if path.name.startswith(prefix)]:
-        shutil.rmtree(removed, ignore_errors=True)  # what cannot be deleted now is deleted by a later call
+        move(folder, folder.with_name(f".{folder.name}.{uuid4().hex}{PARTIAL}"))
+    _delete_all(folder.parent, f".{folder.name}.*{PARTIAL}")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete the folders inside a folder that processes were writing or deleting when they were killed."""
+    _delete_all(folder, f".*{PARTIAL}")
+
+
+def _delete_all(folder: Path, pattern: str) -> None:
+    for path in folder.glob(pattern):
+        shutil.rmtree(path, ignore_errors=True)  # what cannot be deleted now is deleted by a later call
 
 
 def _not(path: Path, kind: str, reason: str) -> str:

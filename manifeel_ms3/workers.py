@@ -9,15 +9,18 @@ with WorkerPool(2, partial(gym.make, "ManiFeel-PegInsertion-v1")) as pool:
 
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from functools import cached_property
+from multiprocessing import active_children
 from typing import Any, Generic, TypeVar
 
 import torch
 from pebble import ProcessExpired, ProcessPool
+from pebble.pool.process import WORKERS_NAME
 
 from .errors import InvalidArgumentError, WorkFailedError
 
@@ -67,7 +70,8 @@ class WorkerPool(Generic[State, Task]):
 
     Processes are spawned, because a forked renderer does not work, and use one thread each for torch, because they share the
     cores and because sums then do not depend on the number of threads. They end when the process that made them is killed.
-    Where the context is left by an exception, tasks that wait are cancelled and those that run are ended.
+    Where the context is left by an exception, such as the KeyboardInterrupt of Ctrl-C, tasks that wait are cancelled and the
+    processes are killed at once. Ctrl-C reaches the main process alone.
 
     Args:
         workers: Number of worker processes.
@@ -93,6 +97,9 @@ class WorkerPool(Generic[State, Task]):
             self._pool.close()
         else:
             self._pool.stop()
+            for process in active_children():
+                if process.name == WORKERS_NAME:  # asked to end, it would first finish what its native code is computing
+                    process.kill()
         self._pool.join()
 
     @property
@@ -102,7 +109,11 @@ class WorkerPool(Generic[State, Task]):
 
     def submit(self, function: Callable[[State, Task], Any], task: Task) -> None:
         """Call `function(state, task)` in the next process that is free; both must be picklable."""
-        self._running[self._pool.schedule(_run, args=(function, task))] = task
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes and threads that start now inherit it
+        try:
+            self._running[self._pool.schedule(_run, args=(function, task))] = task
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def as_finished(self) -> Iterator[Finished[Task]]:
         """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile."""

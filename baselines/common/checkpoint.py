@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from manifeel_ms3.files import PARTIAL, atomic_folder, atomic_write, remove_folder
+from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
 """Files of a checkpoint: the policy's weights, the state of training, the settings."""
@@ -81,12 +81,6 @@ def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
     for folder in folders[:-keep]:
         if folder not in in_use and folder.resolve() != last:
             remove_folder(folder)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Delete the folders inside a folder that processes were writing or deleting when they were killed."""
-    for path in folder.glob(".*" + PARTIAL):
-        remove_folder(path)
 
 
 def read_tensors(path: Path) -> dict[str, torch.Tensor]:

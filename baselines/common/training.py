@@ -18,7 +18,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.provenance import machine
-from manifeel_ms3.files import remove_folder
+from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 
@@ -34,7 +34,6 @@ from .checkpoint import (
     pack,
     prune,
     read_tensors,
-    remove_leftovers,
     require_same_config,
     save_checkpoint,
     saved_checkpoints,

@@ -1,10 +1,16 @@
-"""The configuration that a checkpoint folder holds."""
+"""The configuration that a checkpoint folder holds, and the hash of its files."""
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError
+
+TRAINING_STATE = "training.safetensors"
+"""File that only training reads; it is deleted from older checkpoints, and is not part of their hash."""
+CHUNK = 2**20
+"""Number of bytes that are read at a time."""
 
 
 class CheckpointError(InvalidFileError):
@@ -31,3 +37,27 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
             f"{path} holds a {type(config).__name__} instead of an object; the checkpoint is broken, use another one"
         )
     return config
+
+
+def checkpoint_hash(checkpoint: Path) -> str:
+    """SHA-256 over the names and contents of all files that a policy is loaded from.
+
+    Raises:
+        CheckpointError: A file cannot be read.
+    """
+    folder, digest = Path(checkpoint), hashlib.sha256()
+    try:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file() and path.name != TRAINING_STATE):
+            digest.update(f"{file_hash(path)}  {path.relative_to(folder).as_posix()}\n".encode(errors="surrogateescape"))
+    except OSError as error:
+        raise CheckpointError(f"{checkpoint} cannot be read ({error}); use another checkpoint") from error
+    return digest.hexdigest()
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file's content."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(CHUNK):
+            digest.update(chunk)
+    return digest.hexdigest()

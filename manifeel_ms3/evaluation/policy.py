@@ -1,6 +1,7 @@
 """The interface of a policy that can be evaluated, and the places that policies come from."""
 
 import importlib
+import importlib.util
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,9 +10,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, ServerError, UnknownNameError
 
-from .checkpoint_config import CheckpointError, checkpoint_config
+from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash, file_hash
+from .redaction import redacted
 
 
 class Policy(Protocol):
@@ -28,6 +30,13 @@ class Policy(Protocol):
 
 class PolicyError(InvalidArgumentError):
     """A policy of the user's own cannot be made."""
+
+
+class PolicyUnavailableError(ServerError):
+    """The policy cannot be asked, for a reason that is not its own: its server is not running, or does not keep episodes apart.
+
+    It ends the evaluation. Any other error of a policy is its own fault and fails the episode.
+    """
 
 
 @dataclass(frozen=True)
@@ -53,17 +62,36 @@ class PolicySource:
         if self.checkpoint is not None:
             return load_policy(self.checkpoint, **kwargs)
         name = str(self.policy)
-        if name.startswith(("http://", "https://")):
-            from .remote_policy import RemotePolicy
-
-            return RemotePolicy(name, **kwargs)
         try:
+            if self.is_server:
+                from .remote_policy import RemotePolicy
+
+                return RemotePolicy(name, **kwargs)
             return import_name(name)(**kwargs)
+        except ManifeelError:
+            raise
         except Exception as error:  # the constructor is anybody's code
             raise PolicyError(
-                f"{name} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, and its "
-                "arguments as --policy-kwargs"
+                f"{redacted(name)} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, "
+                "and its arguments as --policy-kwargs"
             ) from error
+
+    @property
+    def is_server(self) -> bool:
+        """Whether the policy is the address of a server."""
+        return str(self.policy).startswith(("http://", "https://"))
+
+    def fingerprint(self) -> str | None:
+        """SHA-256 of the checkpoint, or of the file with the class; None for a server, and where no such file is found."""
+        if self.checkpoint is not None:
+            return checkpoint_hash(self.checkpoint)
+        if self.is_server:
+            return None
+        try:
+            spec = importlib.util.find_spec(str(self.policy).partition(":")[0])
+            return file_hash(Path(spec.origin)) if spec and spec.origin else None
+        except Exception:  # packages are imported on the way; `make` names what is wrong
+            return None
 
 
 def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:

@@ -19,11 +19,26 @@ def package_versions() -> dict[str, str]:
 
 
 def git_commit() -> str | None:
-    """Commit of the repository that this package runs from; None where it was installed from a wheel."""
-    answer = subprocess.run(
-        ["git", "rev-parse", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    )
-    return answer.stdout.strip() or None
+    """Commit of this package's own repository.
+
+    None where the package was installed from a wheel, even if that is inside of another repository, where git is not
+    installed, or where git refuses to read a repository of another user.
+    """
+    source = Path(__file__).resolve().parents[2]
+    project = source / "pyproject.toml"
+    if not project.is_file() or f'name = "{PACKAGES[0]}"' not in project.read_text(encoding="utf-8").splitlines():
+        return None
+    foreign = {name for name in os.environ if name.startswith("GIT_")}  # a hook of git sets GIT_DIR to its own repository
+    environment = {name: value for name, value in os.environ.items() if name not in foreign}
+    command = ["git", "rev-parse", "--show-toplevel", "HEAD"]
+    try:
+        answer = subprocess.run(
+            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=source, env=environment, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    top, commit = os.fsdecode(answer.stdout).splitlines()
+    return commit if Path(top).resolve() == source else None
 
 
 def machine() -> dict[str, Any]:

@@ -3,53 +3,148 @@
 `POST /reset` has an empty body and an empty answer. The body of `POST /act` is an npz with one array for each observation,
 named by its path ("sensor_data/wrist/rgb", uint8 (H, W, 3)); the answer is an npz with the array "action", (A,). An error is a
 status other than 200, with the message as text.
+
+Every request has the header `X-Episode`, a name of the episode that no other episode has. The server keeps the states of
+episodes apart by it, since several processes may run episodes at the same time, and repeats the header in its answer.
+
+Nothing that a server sends is trusted: an answer is read up to a limit, and the shape and the type of its array are checked
+before the array is made.
 """
 
+import base64
 import io
+import ipaddress
+import math
+import zipfile
 from collections.abc import Iterator
+from http.client import HTTPException
 from typing import Any
-from urllib.error import HTTPError, URLError
-from urllib.request import urlopen
+from urllib.error import HTTPError
+from urllib.parse import SplitResult, unquote, urlsplit
+from urllib.request import HTTPRedirectHandler, OpenerDirector, ProxyHandler, Request, build_opener
+from uuid import uuid4
 
 import numpy as np
 from mani_skill.utils import common
 
-from manifeel_ms3.errors import ServerError
+from manifeel_ms3.errors import InvalidArgumentError, ServerError
 
+from .policy import PolicyUnavailableError
+
+EPISODE = "X-Episode"
+"""Header that names the episode."""
+UNAVAILABLE = (*range(300, 400), 401, 403, 407, 410, 502, 503, 504)
+"""Statuses that are no fault of the policy: the server is elsewhere, refuses the password, or has forgotten the episode; a
+proxy misses it."""
 LONGEST_MESSAGE = 500
 """Characters of a server's error message that are shown; the rest, often a page of HTML, is cut off."""
+MAX_ANSWER = 2**20
+"""Largest number of bytes of an answer that are read; an npz with one action has some hundreds."""
+MAX_HEADER = 256
+"""Largest number of bytes of an array's header; numpy writes 118 for an action."""
+MAX_NUMBERS = 4096
+"""Largest number of elements of an action."""
+LARGEST_NUMBER = 16
+"""Largest number of bytes of an element, that of a long double."""
+ARRAY_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+"""Readers of the header by the version of the npy format; later versions differ in names of fields only."""
 
 
 class RemotePolicy:
-    """A policy that asks a server for its actions; a missing or failing server raises a `ServerError`.
+    """A policy that asks a server for its actions; a failing server raises a `ServerError`.
 
     Args:
-        address: Address of the server, such as "http://localhost:8000".
+        address: Address of the server, such as "http://localhost:8000" or "http://user:password@host:8000".
         timeout: Longest time to wait for an answer, in s.
+
+    Raises:
+        InvalidArgumentError: The address is not one.
     """
 
     def __init__(self, address: str, timeout: float = 60.0):
-        self.address, self.timeout = address.rstrip("/"), timeout
+        parts = _parts_of(address)
+        login, _, host = parts.netloc.rpartition("@")
+        self.address, self.timeout = parts._replace(netloc=host).geturl().rstrip("/"), timeout
+        self._headers = {"Content-Type": "application/octet-stream"}
+        if login:
+            self._headers["Authorization"] = "Basic " + base64.b64encode(unquote(login).encode()).decode()
+        self._opener = _opener_for(str(parts.hostname))
+        self._episode = ""
 
     def reset(self) -> None:
+        self._episode = uuid4().hex
         self._post("reset", b"")
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         buffer = io.BytesIO()
         arrays: dict[str, Any] = dict(flat_observation(obs))
         np.savez(buffer, **arrays)
-        with np.load(io.BytesIO(self._post("act", buffer.getvalue())), allow_pickle=False) as answer:
-            return answer["action"]
+        return read_action(self._post("act", buffer.getvalue()))
 
     def _post(self, endpoint: str, body: bytes) -> bytes:
+        """The answer to a request.
+
+        Raises:
+            PolicyUnavailableError: The server cannot be reached, or is no server of this kind.
+            ServerError: The server answers with an error, with too many bytes, or not in time.
+        """
+        request = Request(f"{self.address}/{endpoint}", body, {**self._headers, EPISODE: self._episode})
         try:
-            with urlopen(f"{self.address}/{endpoint}", body, self.timeout) as answer:
-                return answer.read()
+            with self._opener.open(request, timeout=self.timeout) as answer:
+                content, episode, rest = answer.read(MAX_ANSWER + 1), answer.headers.get(EPISODE), answer.length
         except HTTPError as error:
-            message = error.read().decode(errors="replace")[:LONGEST_MESSAGE]
-            raise ServerError(f"{self.address} answers {endpoint} with {error.code}: {message}") from error
-        except URLError as error:
-            raise ServerError(f"{self.address} cannot be reached ({error.reason}); start the server first") from error
+            message = f"{self.address} answers {endpoint} with {error.code}: {_message_of(error)}"
+            raise (PolicyUnavailableError if error.code in UNAVAILABLE else ServerError)(message) from error
+        except TimeoutError as error:
+            raise ServerError(f"{self.address} does not answer {endpoint} within {self.timeout:g} s") from error
+        except (OSError, HTTPException) as error:
+            reason = getattr(error, "reason", None) or str(error) or type(error).__name__
+            raise PolicyUnavailableError(f"{self.address} cannot be reached ({reason}); start the server first") from error
+        if len(content) > MAX_ANSWER:
+            raise ServerError(f"{self.address} answers {endpoint} with more than {MAX_ANSWER} bytes; an action has hundreds")
+        if rest:
+            raise PolicyUnavailableError(f"{self.address} broke off its answer to {endpoint}; start the server again")
+        if episode != self._episode:
+            raise PolicyUnavailableError(
+                f"{self.address} does not repeat the header {EPISODE} of {endpoint}, so it may mix the states of episodes; "
+                "serve the policy as examples/policy_server.py does"
+            )
+        return content
+
+
+def read_action(content: bytes) -> np.ndarray:
+    """The array "action" of an npz that a server sent.
+
+    Raises:
+        ServerError: It is not an npz with such an array of numbers, or the array is too large.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entry = archive.getinfo("action.npy")
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("the array is compressed by another method than that of np.savez_compressed")
+            with archive.open(entry) as file:  # no more is decompressed than is read
+                return _array_of(file.read(2 * MAX_HEADER + MAX_NUMBERS * LARGEST_NUMBER))
+    except Exception as error:  # zipfile and numpy raise errors of many types
+        raise ServerError(
+            f"the answer is no npz with an array 'action' of numbers ({type(error).__name__}: {error}); "
+            "write it with np.savez(file, action=action)"
+        ) from error
+
+
+def _array_of(content: bytes) -> np.ndarray:
+    """The array of an npy file, whose header is checked before memory is taken for the array."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    if version not in ARRAY_READERS:
+        raise ValueError(f"the npy format has version {version}")
+    shape, fortran_order, dtype = ARRAY_READERS[version](file, max_header_size=MAX_HEADER)
+    if dtype.kind not in "fiu":
+        raise ValueError(f"the array has the type {dtype}")
+    if min(shape, default=0) < 0 or math.prod(shape) > MAX_NUMBERS:
+        raise ValueError(f"the array has the shape {shape}")
+    flat = np.frombuffer(content, dtype, math.prod(shape), file.tell())
+    return flat.reshape(shape, order="F" if fortran_order else "C")
 
 
 def flat_observation(obs: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray]]:
@@ -64,3 +159,38 @@ def flat_observation(obs: dict[str, Any], prefix: str = "") -> Iterator[tuple[st
             yield from flat_observation(value, f"{prefix}{name}/")
         else:
             yield f"{prefix}{name}", common.to_numpy(value)[0]
+
+
+def _parts_of(address: str) -> SplitResult:
+    try:
+        parts = urlsplit(address)
+        valid = bool(parts.hostname) and not parts.query and parts.port != 0  # `port` raises where it is no number
+    except ValueError:
+        valid = False
+    if not valid:
+        raise InvalidArgumentError("the address of the policy's server is not one; give one like http://localhost:8000")
+    return parts
+
+
+def _opener_for(host: str) -> OpenerDirector:
+    """What sends requests to a host: directly to this machine itself, else through the proxy that the environment names."""
+    try:
+        loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = host == "localhost" or host.endswith(".localhost")
+    return build_opener(_NoRedirects, ProxyHandler({})) if loopback else build_opener(_NoRedirects)
+
+
+class _NoRedirects(HTTPRedirectHandler):
+    """Redirections are errors: they would carry observations and passwords to an address that nobody gave."""
+
+    def redirect_request(self, *_: Any) -> None:
+        return None
+
+
+def _message_of(error: HTTPError) -> str:
+    try:
+        with error:
+            return error.read(4 * LONGEST_MESSAGE).decode(errors="replace")[:LONGEST_MESSAGE]  # UTF-8: at most 4 bytes each
+    except (OSError, HTTPException):
+        return "(the message broke off)"

@@ -1,6 +1,7 @@
 """Result files: an evaluation writes one, the leaderboard and the pages of results read them."""
 
 import json
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
 from .provenance import git_commit, machine, package_versions
+from .redaction import redacted
 from .rollout import EpisodeOutcome
 from .statistics import wilson_interval
 
@@ -23,12 +25,26 @@ SCHEMA_BEFORE = "manifeel-evaluation-1"
 """Version that identified a task by a hash of its code, which cannot be translated into a revision of the task."""
 PATHS = ("demos", "run_dir", "tacrgb_weights")
 """Entries of a policy's configuration that are paths on the machine where it was trained."""
+PRIVATE = ("policy_name", "policy_kwargs")
+"""Entries of a policy's configuration that come from the command line, and may hold passwords and tokens."""
 LONGEST_MESSAGE = 300
 """Characters of a message of jsonschema that are shown; the rest repeats the faulty data."""
 
 
 class ResultError(InvalidFileError):
     """A file is not a result, is broken, or cannot be compared with other results."""
+
+
+def published_config(config: dict[str, Any]) -> dict[str, Any]:
+    """A policy's configuration as results hold it: with the last part of its paths only, and without passwords and tokens."""
+    config = {name: _last_part(value) if name in PATHS else value for name, value in config.items()}
+    return config | {name: redacted(config[name]) for name in PRIVATE if name in config}
+
+
+def provenance(env_id: str) -> dict[str, Any]:
+    """Versions, commit, revision of the task and machine, as results hold them."""
+    commit, revision = git_commit(), task_spec(env_id).revision
+    return dict(versions=package_versions(), git_commit=commit, revision=revision, machine=machine())
 
 
 def result_of(
@@ -39,10 +55,10 @@ def result_of(
     Args:
         env_id: Id of the task.
         env_kwargs: Arguments of `gym.make`.
-        config: Configuration of the policy. Only the last part of its paths is kept, since results are published.
+        config: Configuration of the policy; `published_config` says what is left out of it, since results are published.
         outcomes: Outcomes of all episodes.
     """
-    config = {name: _last_part(value) if name in PATHS else value for name, value in config.items()}
+    config = published_config(config)
     rates = {}
     for name in ("success_once", "success_at_end"):
         won = sum(getattr(outcome, name) for outcome in outcomes)
@@ -56,10 +72,7 @@ def result_of(
         policy=config["policy_name"],
         training_seed=config.get("seed"),
         config=config,
-        versions=package_versions(),
-        git_commit=git_commit(),
-        revision=task_spec(env_id).revision,
-        machine=machine(),
+        **provenance(env_id),
         **rates,
         mean_length=float(np.mean([outcome.length for outcome in outcomes])),
         episodes=[asdict(outcome) for outcome in outcomes],
@@ -71,10 +84,24 @@ def write_result(result: dict[str, Any], path: Path) -> None:
 
     Raises:
         ResultError: It does not have the published form.
+        FileWriteError: The file cannot be written; the old one is as it was.
+    """
+    write_json(path, as_published(result, path))
+
+
+def as_published(result: dict[str, Any], path: Path) -> dict[str, Any]:
+    """A result in types that json knows.
+
+    Args:
+        result: The content of a result file.
+        path: Path of the file, for messages.
+
+    Raises:
+        ResultError: It does not have the published form.
     """
     result = json.loads(json.dumps(result, default=str))
     check_result(result, path)
-    write_json(path, result)
+    return result
 
 
 def read_result(path: Path) -> dict[str, Any]:
@@ -84,8 +111,8 @@ def read_result(path: Path) -> dict[str, Any]:
         ResultError: The file is missing, is not json, is of another version, or does not have the published form.
     """
     try:
-        result = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        result = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
         raise ResultError(f"{path} cannot be read as a result ({error}); give a file that `manifeel eval` wrote") from error
     check_result(result, path)
     return result
@@ -107,7 +134,7 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
 
 
 def check_result(result: Any, source: Path) -> None:
-    """Check that a result has the published form.
+    """Check that a result has the published form, and that all its numbers are finite.
 
     Args:
         result: The content of a result file.
@@ -127,10 +154,28 @@ def check_result(result: Any, source: Path) -> None:
             f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate the policy again, or update "
             "manifeel-ms3"
         )
-    schema = json.loads((data_dir() / "evaluation_schema.json").read_text())
-    for error in jsonschema.Draft202012Validator(schema).iter_errors(result):
+    for error in jsonschema.Draft202012Validator(result_schema()).iter_errors(result):
         place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
         raise ResultError(f"{source} is not a result: {place}: {error.message[:LONGEST_MESSAGE]}")
+    if place := not_finite(result):
+        raise ResultError(f"{source} is not a result: {place}: it is NaN or infinite; all numbers of a result are finite")
+
+
+def result_schema() -> dict[str, Any]:
+    """The json schema of result files."""
+    return json.loads((data_dir() / "evaluation_schema.json").read_text(encoding="utf-8"))
+
+
+def not_finite(value: Any) -> str | None:
+    """The place of a NaN or an infinity in a json value; None if all numbers are finite."""
+    places = [("", value)]
+    while places:
+        place, value = places.pop()
+        if isinstance(value, float) and not math.isfinite(value):
+            return place[1:]
+        entries = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        places += [(f"{place}/{name}", entry) for name, entry in entries]
+    return None
 
 
 def _last_part(path: Any) -> Any:

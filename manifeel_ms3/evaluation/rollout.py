@@ -1,6 +1,7 @@
-"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome."""
+"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome, unless it cannot be asked at all."""
 
 import faulthandler
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import numpy as np
 from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
 
-from .policy import Policy
+from .policy import Policy, PolicyUnavailableError
 
 HANGS_FOR_GOOD = 10.0
 """Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
@@ -60,6 +61,9 @@ def evaluate_episode(
         on_step: Function that is called with every observation, the last one included.
         step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
             in the main thread of a process.
+
+    Raises:
+        PolicyUnavailableError: The policy cannot be asked, so that the episode has no outcome.
     """
     obs, _ = env.reset(seed=seed)
     task: Any = env.unwrapped
@@ -77,7 +81,7 @@ def evaluate_episode(
             length += 1
             at_end = bool(info["success"])
             once |= at_end
-            peak = max(peak, float(info["contact_force"]))
+            peak = max(peak, _finite_force(info))
             over = bool(terminated) or bool(truncated)
     except PolicyFault as error:
         once, at_end, fault = False, False, f"step {length}: {error}"
@@ -87,16 +91,29 @@ def evaluate_episode(
     return EpisodeOutcome(seed, once, at_end, length, round(peak, 3), round(mean, 3), fault)
 
 
+def _finite_force(info: dict[str, Any]) -> float:
+    """The contact force of a step, in N.
+
+    Raises:
+        PolicyFault: It is NaN or infinite: the actions have made the simulation diverge.
+    """
+    force = float(info["contact_force"])
+    if not math.isfinite(force):
+        raise PolicyFault(f"the simulation has diverged: the contact force is {force}")
+    return force
+
+
 def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
     """The return value of one of the policy's methods.
 
     Raises:
         PolicyFault: The method raised an error, or took too long.
+        PolicyUnavailableError: The policy cannot be asked.
     """
     try:
         with _time_limit(step_timeout):
             return ask()
-    except PolicyFault:
+    except (PolicyFault, PolicyUnavailableError):
         raise
     except Exception as error:  # a policy is anybody's code
         raise PolicyFault(f"{type(error).__name__}: {error}") from error

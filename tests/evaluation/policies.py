@@ -1,9 +1,14 @@
 """Policies of someone's own, good and bad; evaluation imports them by name."""
 
+import hashlib
 import os
 import time
 
 import numpy as np
+
+from manifeel_ms3.evaluation.policy import PolicyUnavailableError
+
+STUCK = "MANIFEEL_TEST_STUCK"
 
 
 class StandStill:
@@ -47,3 +52,34 @@ class Crashes(StandStill):
 class CannotBeMade(StandStill):
     def __init__(self):
         raise OSError("no weights")
+
+
+class SticksInSecondEpisode(StandStill):
+    """If the environment says so, it computes in native code for minutes, where no signal handler of Python runs."""
+
+    episodes = 0
+
+    def reset(self):
+        super().reset()
+        self.episodes += 1
+
+    def act(self, obs):
+        if os.environ.get(STUCK) and self.episodes > 1:
+            hashlib.pbkdf2_hmac("sha1", b"", b"", 2**31 - 1)
+        return super().act(obs)
+
+
+class LeaksAndGoesAway(StandStill):
+    """Its first episode fails with a message that holds its key; then it cannot be reached."""
+
+    episodes = 0
+
+    def __init__(self, api_key: str, options: dict):
+        super().__init__()
+        self.api_key = api_key
+
+    def reset(self):
+        self.episodes += 1
+        if self.episodes > 1:
+            raise PolicyUnavailableError("gone")
+        raise RuntimeError(f"{self.api_key} is refused")

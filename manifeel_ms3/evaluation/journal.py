@@ -1,0 +1,123 @@
+"""The finished episodes of an evaluation that has not ended yet, so that an interruption loses at most those that are running.
+
+The file `<name of the result>.episodes.jsonl` lies beside the result. Its first line says what is evaluated, every other line
+is the outcome of an episode and reaches the disk as soon as the episode ends. The file is deleted once the result, which holds
+all of it, is written.
+"""
+
+import json
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidFileError
+from manifeel_ms3.files import FileWriteError, write_text
+
+from .result import not_finite, result_schema
+from .rollout import EpisodeOutcome
+
+log = logging.getLogger(__name__)
+
+
+class OtherEvaluationError(FileExistsAlreadyError):
+    """The file holds episodes of another evaluation, which was not finished."""
+
+
+class Journal:
+    """The finished episodes of one evaluation.
+
+    Args:
+        result: Path of the result file.
+        evaluation: Everything that the outcomes depend on, as json. An unfinished evaluation goes on if all of it is the same.
+        seeds: Seeds of the episodes.
+        overwrite: Discard the episodes of an unfinished evaluation.
+
+    Raises:
+        OtherEvaluationError: There is an unfinished evaluation that is another one.
+        InvalidFileError: The file is broken.
+        FileWriteError: The file cannot be written.
+    """
+
+    def __init__(self, result: Path, evaluation: dict[str, Any], seeds: list[int], overwrite: bool = False):
+        self.path = result.with_name(f"{result.stem}.episodes.jsonl")
+        self.seeds = seeds
+        self._first_line = json.dumps(evaluation | dict(seeds=seeds), default=str, allow_nan=False)
+        self.outcomes = {} if overwrite or not self.path.exists() else self._read()
+        lines = [self._first_line, *map(_line_of, self.outcomes.values())]
+        write_text(self.path, "".join(f"{line}\n" for line in lines))  # without a line that broke off
+
+    @property
+    def remaining(self) -> list[int]:
+        """Seeds of the episodes that have not been run."""
+        return [seed for seed in self.seeds if seed not in self.outcomes]
+
+    @property
+    def in_order(self) -> list[EpisodeOutcome]:
+        """All outcomes in the order of the seeds."""
+        return [self.outcomes[seed] for seed in self.seeds]
+
+    def add(self, outcome: EpisodeOutcome) -> None:
+        """Write the outcome of an episode to the disk.
+
+        Raises:
+            FileWriteError: It cannot be written.
+        """
+        try:
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(_line_of(outcome) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise FileWriteError(f"{self.path} cannot be written ({error}); make room, and run the command again") from error
+        self.outcomes[outcome.seed] = outcome
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """A context that deletes the file at its end, and that says what is kept where an exception or Ctrl-C ends it."""
+        try:
+            yield
+        except BaseException:
+            if self.outcomes:
+                log.info(
+                    "%d of %d episodes are finished and kept in %s; the same command goes on with the others",
+                    *(len(self.outcomes), len(self.seeds), self.path),
+                )
+            else:
+                self.path.unlink(missing_ok=True)
+            raise
+        self.path.unlink(missing_ok=True)
+
+    def _read(self) -> dict[int, EpisodeOutcome]:
+        try:
+            whole, _, _ = self.path.read_bytes().rpartition(b"\n")  # the last line may have broken off
+            evaluation, *episodes = map(json.loads, whole.split(b"\n"))
+            schema = result_schema()["properties"]["episodes"]["items"]
+            for episode in episodes:
+                jsonschema.validate(episode, schema)
+            if place := not_finite(episodes):
+                raise ValueError(f"{place} is NaN or infinite")
+        except (OSError, ValueError, RecursionError, jsonschema.ValidationError) as error:
+            raise InvalidFileError(
+                f"{self.path} does not hold the episodes of an unfinished evaluation ({str(error).splitlines()[0]}); begin "
+                "again with --overwrite, or give another --out"
+            ) from error
+        self._check_same(evaluation, len(episodes))
+        return {episode["seed"]: EpisodeOutcome(**episode) for episode in episodes if episode["seed"] in self.seeds}
+
+    def _check_same(self, evaluation: Any, episodes: int) -> None:
+        now, before = json.loads(self._first_line), evaluation if isinstance(evaluation, dict) else {}
+        if different := [name for name in sorted(now.keys() | before.keys()) if now.get(name) != before.get(name)]:
+            raise OtherEvaluationError(
+                f"{self.path} holds {episodes} episodes of an unfinished evaluation with another {', '.join(different)}; run "
+                "the command that began it, give another --out, or discard these episodes with --overwrite"
+            )
+
+
+def _line_of(outcome: EpisodeOutcome) -> str:
+    return json.dumps(asdict(outcome), allow_nan=False)

@@ -1,0 +1,423 @@
+"""An evaluation loses no episode, publishes no secret, and ends with a result or with one line that says why not."""
+
+import importlib.util
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from manifeel_ms3.errors import InUseError, InvalidFileError, ManifeelError
+from manifeel_ms3.evaluation import provenance
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_hash
+from manifeel_ms3.evaluation.evaluate import Args, main
+from manifeel_ms3.evaluation.journal import Journal, OtherEvaluationError
+from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.evaluation.redaction import MARK, redacted
+from manifeel_ms3.evaluation.result import ResultError, read_result, result_of, write_result
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.files import FileWriteError
+from manifeel_ms3.ownership import owned
+from manifeel_ms3.tasks.registry import evaluation_seeds
+from tests.conftest import PEG
+from tests.evaluation.policies import STUCK
+
+REPOSITORY = Path(__file__).parents[2]
+TASK = json.dumps(dict(render_backend="none", max_episode_steps=3))
+IDENTITY = dict(env_id=PEG, versions=dict(torch="2"), git_commit=None)
+PATIENCE = 120  # s
+NOBODY = 65534
+
+
+def args_of(policy: str, out: Path, **changes) -> Args:
+    name = policy if "://" in policy else f"tests.evaluation.policies:{policy}"
+    return replace(Args(policy=name, env_id=PEG, obs_mode="tacff", cameras=(), episodes=2, env_kwargs=TASK, out=out), **changes)
+
+
+def command_of(args: Args) -> list[str]:
+    command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--policy", str(args.policy), "--cameras"]
+    for name in ("env_id", "obs_mode", "episodes", "env_kwargs", "out"):
+        command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
+    return command
+
+
+def outcome(seed: int) -> EpisodeOutcome:
+    return EpisodeOutcome(seed, seed % 2 == 0, False, 9, 1.5, 2.5)
+
+
+def result(**config) -> dict:
+    return result_of(PEG, dict(obs_mode="rgb"), dict(policy_name="a:B", obs_mode="rgb") | config, [outcome(100_000)])
+
+
+def journal_of(out: Path) -> Path:
+    return out.with_name(f"{out.stem}.episodes.jsonl")
+
+
+def wait_for_episodes(journal: Path, number: int) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not journal.is_file() or len(journal.read_text().splitlines()) < 1 + number:
+        assert time.monotonic() < deadline, "no episode was finished"
+        time.sleep(0.1)
+
+
+# ------------------------------------------------------------------------------- interruptions
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
+    args = args_of("SticksInSecondEpisode", tmp_path / "evaluation.json", episodes=3)
+    journal, errors = journal_of(args.out), tmp_path / "stderr"
+    with errors.open("w") as file:
+        process = subprocess.Popen(
+            command_of(args), cwd=REPOSITORY, env=os.environ | {STUCK: "1"}, stderr=file, start_new_session=True
+        )
+    try:
+        wait_for_episodes(journal, 1)
+        time.sleep(1)  # the second episode is stuck by now
+        begin = time.monotonic()
+        if how == signal.SIGINT:
+            os.killpg(process.pid, how)  # as the terminal does
+        else:
+            process.kill()
+        code = process.wait(PATIENCE)
+        seconds = time.monotonic() - begin
+        if how == signal.SIGINT:
+            figure("seconds from Ctrl-C to the end of an evaluation", seconds, at_most=2.0)
+            assert code == 130
+            assert f"1 of 3 episodes are finished and kept in {journal}; the same command goes on" in errors.read_text()
+            assert "Traceback" not in errors.read_text()
+            with pytest.raises(ProcessLookupError):
+                os.killpg(process.pid, 0)  # no process of it is left
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert not args.out.exists()
+    kept = json.loads(journal.read_text().splitlines()[1])
+    monkeypatch.delenv(STUCK, raising=False)
+    episodes = read_result(main(args))["episodes"]
+    assert [episode["seed"] for episode in episodes] == evaluation_seeds(3)
+    assert episodes[0] == kept  # with the same times: it was not run again
+    assert not journal.exists()
+
+
+def test_an_error_says_what_is_kept_and_the_journal_holds_no_secret(tmp_path, caplog):
+    """The policy's first episode fails with its key in the message, and the second ends the evaluation (B8)."""
+    kwargs = dict(api_key="correct-horse", options=dict(url="https://me:hunter22@example.org/x", hub="hf_abcdefghijkl"))
+    args = args_of("LeaksAndGoesAway", tmp_path / "evaluation.json", policy_kwargs=json.dumps(kwargs))
+    with caplog.at_level("INFO"), pytest.raises(ConnectionError, match="gone"):
+        main(args)
+    assert "1 of 2 episodes are finished and kept in" in caplog.text
+    text = journal_of(args.out).read_text()
+    assert f"RuntimeError: {MARK} is refused" in text
+    assert not any(secret in text for secret in ("correct-horse", "hunter22", "hf_abcdefghijkl"))
+    assert not args.out.exists()
+
+
+def evaluate_without_simulator(out: Path, seeds: list[int], report: int) -> None:
+    """All that an evaluation writes; each seed is reported once its outcome is said to be on the disk."""
+    journal = Journal(out, IDENTITY, seeds)
+    with journal.kept():
+        for seed in journal.remaining:
+            journal.add(outcome(seed))
+            os.write(report, f"{seed}\n".encode())
+        write_result(result_of(PEG, {}, dict(policy_name="a:B", obs_mode="rgb"), journal.in_order), out)
+
+
+def test_a_hundred_kills_lose_no_episode(tmp_path, record_property):
+    seeds, chance, interrupted = evaluation_seeds(50), random.Random(0), 0
+    undisturbed = tmp_path / "undisturbed.json"
+    evaluate_without_simulator(undisturbed, seeds, os.open(os.devnull, os.O_WRONLY))
+    for number in range(100):
+        out = tmp_path / f"{number}.json"
+        reader, writer = os.pipe()
+        child = os.fork()
+        if child == 0:
+            try:
+                evaluate_without_simulator(out, seeds, writer)
+            finally:
+                os._exit(0)
+        os.close(writer)
+        time.sleep(chance.uniform(0, 0.3))
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        reported = {int(line) for line in os.read(reader, 10**6).split()}
+        os.close(reader)
+        if not out.exists():
+            interrupted += 1
+            assert reported <= set(Journal(out, IDENTITY, seeds).outcomes)
+        evaluate_without_simulator(out, seeds, os.open(os.devnull, os.O_WRONLY))
+        assert out.read_text() == undisturbed.read_text()
+        assert not journal_of(out).exists()
+    record_property("interrupted", interrupted)
+    assert interrupted > 20
+
+
+def test_a_line_that_broke_off_is_dropped_and_what_is_broken_is_refused(tmp_path):
+    journal = Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3])
+    for seed in (1, 2):
+        journal.add(outcome(seed))
+    whole = journal.path.read_bytes()
+    for cut in range(1, len(whole.splitlines()[-1]) + 1):
+        journal.path.write_bytes(whole[:-cut])
+        assert list(Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3]).outcomes) == [1]
+    for broken in (b"", b"{\n", b"[" * 10**5 + b"\n", whole + b"{}\n", whole + b"\xff\n", whole.replace(b"1.5", b"NaN")):
+        journal.path.write_bytes(broken)
+        with pytest.raises(InvalidFileError, match=r"does not hold the episodes of an .*--overwrite"):
+            Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3])
+        assert journal.path.read_bytes() == broken
+    assert Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3], overwrite=True).remaining == [1, 2, 3]
+
+
+def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp_path):
+    args = args_of("Nobody", tmp_path / "evaluation.json")
+    journal = Journal(args.out, IDENTITY, evaluation_seeds(2))
+    journal.add(outcome(100_000))
+    before = journal.path.read_text()
+    with pytest.raises(OtherEvaluationError, match=r"holds 1 episodes of .* another config, env_kwargs.*--overwrite"):
+        main(args)
+    assert journal.path.read_text() == before
+    for changed in (dict(git_commit="0" * 40), dict(versions=dict(torch="3"))):
+        with pytest.raises(OtherEvaluationError, match=next(iter(changed))):
+            Journal(args.out, IDENTITY | changed, evaluation_seeds(2))
+    with pytest.raises(OtherEvaluationError, match="another seeds"):
+        Journal(args.out, IDENTITY, evaluation_seeds(3))
+    with pytest.raises(ManifeelError, match="Nobody cannot be made"):
+        main(replace(args, overwrite=True))
+    assert not journal.path.exists()
+
+
+def test_a_policy_is_identified_by_its_files(tmp_path, monkeypatch):
+    (tmp_path / "config.json").write_text("{}")
+    before = checkpoint_hash(tmp_path)
+    (tmp_path / "training.safetensors").write_text("deleted from older checkpoints")
+    assert checkpoint_hash(tmp_path) == before
+    (tmp_path / "model.safetensors").write_text("other weights")
+    assert checkpoint_hash(tmp_path) != before
+    monkeypatch.syspath_prepend(tmp_path)
+    hashes = set()
+    for content in ("", "# changed"):
+        (tmp_path / "policy_of_mine.py").write_text(content)
+        hashes.add(PolicySource(policy="policy_of_mine:Policy").fingerprint())
+    assert len(hashes - {None}) == 2
+    assert PolicySource(policy="no_such_module.x:Policy").fingerprint() is None
+
+
+def test_two_evaluations_cannot_write_one_result(tmp_path):
+    args = args_of("Nobody", tmp_path / "evaluation.json")
+    with owned(args.out), pytest.raises(InUseError, match="is in use by process"):
+        main(args)
+
+
+# ------------------------------------------------------------------------------- places that cannot be written
+
+
+@contextmanager
+def small_disk(kilobytes: int):
+    """A file system of its own that is soon full."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", folder]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            pytest.skip("only root can mount a small disk")
+        try:
+            yield Path(folder)
+        finally:
+            subprocess.run(["umount", folder], check=True)
+
+
+def fill(folder: Path) -> Path:
+    with suppress(OSError), (folder / "filling").open("wb", buffering=0) as file:
+        while True:
+            file.write(bytes(1024))
+    return folder / "filling"
+
+
+def add_all(journal: Journal) -> None:
+    for seed in journal.remaining:
+        journal.add(outcome(seed))
+
+
+def test_a04_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
+    with small_disk(64) as folder:
+        out, seeds = folder / "evaluation.json", list(range(2000))
+        write_result(result(), out)
+        old = out.read_text()
+        journal = Journal(out, IDENTITY, seeds)
+        filling = fill(folder)
+        with pytest.raises(FileWriteError, match=r"evaluation.episodes.jsonl cannot be written \(.*No space left"):
+            add_all(journal)
+        assert 0 < len(journal.outcomes) < len(seeds)
+        with pytest.raises(FileWriteError, match="No space left"):
+            write_result(result_of(PEG, {}, dict(policy_name="a:B", obs_mode="rgb"), [outcome(k) for k in seeds]), out)
+        assert out.read_text() == old
+        filling.unlink()
+        assert Journal(out, IDENTITY, seeds).outcomes == journal.outcomes
+        assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.episodes.jsonl"}
+
+
+def test_b05_a_full_disk_is_named_before_the_first_episode():
+    with small_disk(64) as folder:
+        fill(folder)
+        with pytest.raises(ManifeelError, match="cannot be written"):
+            main(args_of("Nobody", folder / "evaluation.json"))
+
+
+def test_b05_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder").mkdir()
+    for out, reason in (
+        (Path("/proc/none/x.json"), "cannot be written"),
+        (tmp_path / "file/x.json", "cannot be written"),
+        (tmp_path / "folder", "is a folder; give the path of a file"),
+        (tmp_path / ("x" * 300), "cannot be written"),
+    ):
+        with pytest.raises(ManifeelError, match=reason) as raised:  # and not of the policy, which cannot be made
+            main(args_of("Nobody", out))
+        assert "\n" not in str(raised.value)
+    assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
+
+
+def test_b05_a_read_only_folder_is_named_before_the_first_episode():
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o555)
+        child = os.fork()
+        if child == 0:
+            try:
+                if os.getuid() == 0:
+                    os.setuid(NOBODY)
+                main(args_of("Nobody", Path(folder) / "x.json"))
+            except ManifeelError as error:
+                os._exit(7 if "cannot be written" in str(error) else 1)
+            finally:
+                os._exit(1)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+        assert not list(Path(folder).iterdir())
+
+
+def test_a_bare_environment_gives_a_result(tmp_path):
+    """No git (A5), no HOME, an ASCII locale (A30), and a path with spaces and umlauts."""
+    folder = tmp_path / "Prüfung von Größen"
+    folder.mkdir()
+    args = args_of("StandStill", folder / "ergebnis für mich.json", episodes=1)
+    bare = dict(PATH="/nogit", LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", OMP_NUM_THREADS="1")
+    done = subprocess.run(
+        command_of(args), cwd=REPOSITORY, env=bare | dict(PYTHONPATH=str(REPOSITORY)), capture_output=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert read_result(args.out)["git_commit"] is None
+    assert {path.name for path in folder.iterdir() if not path.name.startswith(".")} == {args.out.name}
+
+
+# ------------------------------------------------------------------------------- the commit
+
+
+def git(folder: Path, *arguments: str) -> str:
+    command = ["git", "-c", "user.name=me", "-c", "user.email=me@example.org", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def commit_seen_from(package: Path) -> str | None:
+    """The commit that a copy of the package gives."""
+    file = package / "evaluation/provenance.py"
+    file.parent.mkdir(parents=True)
+    file.write_text(Path(provenance.__file__).read_text())
+    spec = importlib.util.spec_from_file_location("copied_provenance", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.git_commit()
+
+
+def test_a28_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_path, monkeypatch):
+    for name in ("foreign", "own"):
+        (tmp_path / name).mkdir()
+        git(tmp_path / name, "init", "-q")
+        (tmp_path / name / "pyproject.toml").write_text(f'[project]\nname = "{"manifeel-ms3" if name == "own" else "other"}"\n')
+        git(tmp_path / name, "add", ".")
+        git(tmp_path / name, "commit", "-qm", name)
+    assert commit_seen_from(tmp_path / "own/manifeel_ms3") == git(tmp_path / "own", "rev-parse", "HEAD")
+    assert commit_seen_from(tmp_path / "foreign/.venv/lib/site-packages/manifeel_ms3") is None
+    assert commit_seen_from(tmp_path / "foreign/manifeel_ms3") is None
+    assert commit_seen_from(tmp_path / "own/.venv/lib/site-packages/manifeel_ms3") is None
+    unpacked = tmp_path / "foreign/unpacked"  # the sources without their repository
+    unpacked.mkdir()
+    (unpacked / "pyproject.toml").write_text((tmp_path / "own/pyproject.toml").read_text())
+    assert commit_seen_from(unpacked / "manifeel_ms3") is None
+    here = provenance.git_commit()
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "foreign/.git"))
+    assert provenance.git_commit() == here
+
+
+def test_a05_without_git_the_commit_is_unknown(monkeypatch):
+    monkeypatch.setenv("PATH", "/nogit")
+    assert provenance.git_commit() is None
+    assert result()["git_commit"] is None
+
+
+# ------------------------------------------------------------------------------- what is published
+
+
+def test_a18_nan_never_gets_into_a_result(tmp_path):
+    path = tmp_path / "result.json"
+    for bad in (float("nan"), float("inf"), -float("inf")):
+        for broken in (
+            result() | dict(mean_length=bad),
+            result() | dict(success_once=dict(rate=bad, low=0, high=1)),
+            result() | dict(episodes=[result()["episodes"][0] | dict(peak_contact_force=bad)]),
+            result(lr=[bad]),
+        ):
+            with pytest.raises(ResultError, match="is not a result"):
+                write_result(broken, path)
+            assert not path.exists()
+            path.write_text(json.dumps(broken))
+            with pytest.raises(ResultError, match="is not a result"):
+                read_result(path)
+            path.unlink()
+    path.write_text(json.dumps(result()).replace("1.5", "1e999"))
+    with pytest.raises(ResultError, match="episodes/0/peak_contact_force"):
+        read_result(path)
+    for kwargs in ('{"gain": NaN}', '{"gain": 1e999}'):
+        with pytest.raises(ResultError, match="config/policy_kwargs/gain"):
+            main(args_of("Nobody", path, policy_kwargs=kwargs))
+
+
+def test_results_have_no_entries_that_nobody_knows(tmp_path):
+    for broken, place in (
+        (result() | dict(note="x"), "the whole file"),
+        (result() | dict(episodes=[result()["episodes"][0] | dict(note="x")]), "episodes/0"),
+        (result() | dict(machine=result()["machine"] | dict(note="x")), "machine"),
+        (result() | dict(success_once=dict(rate=1, low=0, high=1, note=0.5)), "success_once"),
+    ):
+        with pytest.raises(ResultError, match=f"{place}: .*'note' was unexpected"):
+            write_result(broken, tmp_path / "result.json")
+
+
+@pytest.mark.parametrize("text", ["[" * 10**5, '{"schema": ' + "9" * 5000 + "}", "\udcff"])
+def test_a_file_that_json_cannot_read_is_no_result(text, tmp_path):
+    (tmp_path / "result.json").write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(ResultError, match="cannot be read as a result"):
+        read_result(tmp_path / "result.json")
+
+
+def test_b08_passwords_and_tokens_are_not_published():
+    secret = dict(
+        token="abc1",
+        hfToken="abc2",
+        options=[dict(api_key="abc3", password=1234, login=dict(auth=["abc4"]))],
+        address="https://me:abc5@example.org/v1?access_token=abc6&x=1",
+        other="ghp_abc7abc7abc7",
+        header="Bearer abc8",
+        jwt="eyJhbGciOi.eyJzdWIi.abc9",
+    )
+    harmless = dict(gain=0.5, num_tokens=64, use_token=True, author="me", tokenizer="bpe", path="/data/x@y", key="rgb")
+    text = json.dumps(result(policy_name="http://me:abc5@localhost:8000", policy_kwargs=secret | harmless))
+    assert not any(piece in text for piece in ("abc1", "abc2", "abc3", "1234", "abc4", "abc5", "abc6", "abc7", "abc8", "abc9"))
+    assert json.loads(text)["policy"] == f"http://{MARK}@localhost:8000"
+    assert redacted(harmless) == harmless
+    assert json.loads(text)["config"]["policy_kwargs"]["options"] == [dict(api_key=MARK, password=MARK, login=dict(auth=MARK))]
