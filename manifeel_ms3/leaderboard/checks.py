@@ -60,7 +60,7 @@ def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
         (condition_of(result), result["training_seed"], result["config"].get("step", 0)) for result in results.values()
     )
     faults = [
-        f"{count} results of {one.env_id}, {one.sensing} and {one.policy} are of training seed {seed} and step {step}; leave one"
+        f"{count} results of {one.env_id}, {one.sensing} and {one.policy} are of training seed {seed}, step {step}; leave one"
         for (one, seed, step), count in places.items()
         if count > 1
     ]

@@ -334,16 +334,16 @@ def test_a16_copies_with_small_changes_are_refused(folder, jitter, changed, is_c
 def test_a16_a_checkpoint_counts_once(folder):
     change(folder / FIRST, lambda result: result["config"].update(step=200))
     submission = read_submission(folder)
-    with pytest.raises(SubmissionError, match=r"2 results of .* are of training seed 0 and step 200"):
+    with pytest.raises(SubmissionError, match=r"2 results of .* are of training seed 0, step 200"):
         check(submission)
     with pytest.raises(ResultError, match="training seed 0 and step 200; leave one of them out"):
         collect(submission.results.values())
 
 
-@pytest.mark.parametrize(("total", "drawn"), [(1, 1), (20, 19), (50, 30), (150, 39), (500, 43), (1500, 45)])
+@pytest.mark.parametrize(("total", "drawn"), [(1, 1), (20, 20), (50, 33), (150, 43), (500, 47), (1500, 49)])
 def test_a16_so_many_episodes_are_run_again(total, drawn):
     assert episodes_to_run_again(total) == drawn
-    if total > 1:
+    if total > 20:
         assert chance_to_pass(total, -(-total // 10), episodes_to_run_again(total)) < 0.01
 
 
