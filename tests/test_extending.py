@@ -110,6 +110,7 @@ def test_a_policy_is_trained_and_evaluated_and_its_result_is_taken(site, checkpo
     assert (result["env_id"], result["policy"], result["revision"]) == (TASK, "regression", 1)
     assert [episode["error"] for episode in result["episodes"]] == [None] * 50
     (folder / "submission.json").write_text(json.dumps(dict(name="Regression", authors="A page")))
+    done(site, "leaderboard", "hash", folder, "--checkpoint", checkpoint)
     done(site, "leaderboard", "submit", folder, "--checkpoint", checkpoint, "--rerun", 1, "--check-only")
 
 

@@ -97,16 +97,26 @@ class ConditionResults:
 
 
 def condition_of(result: dict[str, Any]) -> Condition:
-    """The condition that a result belongs to."""
+    """The condition that a result belongs to.
+
+    Entries of the policy's configuration that are of another type than the baselines' count as absent.
+    """
     config = result["config"]
-    encoders = config.get("policy", {}).get("encoder", {})
-    encoder = encoders.get("tacrgb", "") if "tacrgb" in result["obs_mode"] else ""
-    cameras = tuple(result["env_kwargs"].get("cameras", ())) if "rgb" in result["obs_mode"].split("+") else ()
+    encoders = _object(_object(config.get("policy")).get("encoder"))
+    encoder = str(encoders.get("tacrgb", "")) if "tacrgb" in result["obs_mode"] else ""
+    given = result["env_kwargs"].get("cameras")
+    cameras = tuple(map(str, given)) if isinstance(given, (list, tuple)) and "rgb" in result["obs_mode"].split("+") else ()
+    num_demos = config.get("num_demos")
     policy = result["policy"].rpartition(":")[2]
     other = {name: value for name, value in result["env_kwargs"].items() if name not in SENSING}
     variant = json.dumps(other, sort_keys=True) if other else ""
-    network = encoders.get("image", "")
-    return Condition(result["env_id"], result["obs_mode"], policy, encoder, cameras, config.get("num_demos"), variant, network)
+    network = str(encoders.get("image", ""))
+    num_demos = num_demos if isinstance(num_demos, int) else None
+    return Condition(result["env_id"], result["obs_mode"], policy, encoder, cameras, num_demos, variant, network)
+
+
+def _object(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
 
 
 def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Condition, ConditionResults]:
@@ -117,13 +127,16 @@ def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Conditi
         last: Largest number of checkpoints at the end of training that count.
 
     Raises:
-        ResultError: The results of a condition are of different episodes.
+        ResultError: The results of a condition are of different episodes, or two of them are of the same checkpoint.
     """
     found: dict[Condition, dict[int | None, dict[int, dict[int, bool]]]] = {}
     for result in results:
         outcomes = {episode["seed"]: episode["success_once"] for episode in result["episodes"]}
-        by_seed = found.setdefault(condition_of(result), {})
-        by_seed.setdefault(result["training_seed"], {})[result["config"].get("step", 0)] = outcomes
+        condition, seed, step = condition_of(result), result["training_seed"], result["config"].get("step", 0)
+        steps = found.setdefault(condition, {}).setdefault(seed, {})
+        if step in steps:
+            raise ResultError(f"two results of {condition} are of training seed {seed} and step {step}; leave one of them out")
+        steps[step] = outcomes
     return {condition: _stacked(condition, by_seed, last) for condition, by_seed in found.items()}
 
 

@@ -1,11 +1,13 @@
 """The leaderboard.
 
-    python -m manifeel_ms3.leaderboard submit my_submission --checkpoint runs/x/checkpoints/last
+    python -m manifeel_ms3.leaderboard hash my_submission --checkpoint runs/x/checkpoints
+    python -m manifeel_ms3.leaderboard submit my_submission --checkpoint runs/x/checkpoints
     python -m manifeel_ms3.leaderboard build
 
 A submission is a folder with submission.json ({"name", "authors", "link"}), with the result files of a policy in any
-subfolders, one for each checkpoint and training seed, and optionally with `videos/*.mp4`. `submit` checks a submission and
-copies it into the leaderboard's folder; `build` makes index.html and README.md from all submissions there.
+subfolders, one for each checkpoint and training seed, and optionally with `videos/*.mp4`. `hash` writes into submission.json
+which checkpoint each result is of. `submit` checks a submission, runs episodes of all its results again, and copies it into the
+leaderboard's folder; `build` makes index.html and README.md from all submissions there.
 """
 
 import logging
@@ -19,11 +21,25 @@ import tyro
 from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.files import write_json
 
-from .page import write_page
-from .submission import ABOUT, check, read_submission, run_again, take
+from .checks import check
+from .page import rows_on, write_page
+from .rerun import about_with_checkpoints, checkpoint_sources, name_checkpoints, policy_sources, run_again
+from .submission import ABOUT, Submission, read_submission
+from .taking import take
 
 log = logging.getLogger(__name__)
+
+
+@dataclass
+class Hash:
+    """Write the hashes of the results' checkpoints into submission.json."""
+
+    folder: tyro.conf.Positional[Path]
+    """Folder of the submission."""
+    checkpoint: tuple[Path, ...]
+    """Checkpoint folders of all results, or folders that hold them."""
 
 
 @dataclass
@@ -32,15 +48,21 @@ class Submit:
 
     folder: tyro.conf.Positional[Path]
     """Folder of the submission."""
-    checkpoint: Path | None = None
-    """Checkpoint folder of one of the results; some of its episodes are run again."""
+    checkpoint: tuple[Path, ...] = ()
+    """Checkpoint folders of all results, or folders that hold them; submission.json must name their hashes."""
     policy: str | None = None
     """Policy of the results, if it has no checkpoint: a class that can be imported ("module:Class"), or the address of a
     server."""
     policy_kwargs: str = "{}"
     """Keyword arguments of the policy, as json."""
-    rerun: int = 3
-    """Number of episodes that are run again."""
+    rerun: int | None = None
+    """Largest number of episodes that are run again for each row of the page. If not given, as many as find out a row with a
+    tenth of invented outcomes in 99 of 100 cases; a smaller number proves less, and the page says so. With 0 no policy is
+    needed."""
+    seed: int | None = None
+    """Seed of the draw of these episodes, to repeat an earlier draw; a new one if not given."""
+    workers: int = 1
+    """Number of processes that run episodes side by side."""
     board: Path = Path("leaderboard")
     """Folder of the leaderboard."""
     check_only: bool = False
@@ -55,32 +77,55 @@ class Build:
     """Folder of the leaderboard."""
 
 
-Args = Annotated[Submit, tyro.conf.subcommand("submit")] | Annotated[Build, tyro.conf.subcommand("build")]
+Args = (
+    Annotated[Hash, tyro.conf.subcommand("hash")]
+    | Annotated[Submit, tyro.conf.subcommand("submit")]
+    | Annotated[Build, tyro.conf.subcommand("build")]
+)
 
 
-def main(args: Submit | Build) -> Path:
-    """Run one of the two commands, and return the page, or the folder of the submission.
+def main(args: Hash | Submit | Build) -> Path:
+    """Run one of the commands, and return the path that it made: submission.json, the folder of the submission, or the page.
 
     Raises:
-        SubmissionError: The submission cannot be accepted; the message lists everything that is wrong with it.
+        SubmissionError: The submission cannot be accepted; the message lists what is wrong with it.
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
-        InvalidArgumentError: No policy is given to run episodes with.
+        InvalidArgumentError: No policy is given to run episodes with, or a --checkpoint is none.
     """
     if isinstance(args, Build):
-        submissions = [read_submission(path.parent) for path in sorted(args.board.glob(f"*/{ABOUT}"))]
-        path = write_page(submissions, args.board)
-        log.info("%s, of %d submissions", path, len(submissions))
-        return path
+        return _build(args)
     submission = read_submission(args.folder)
+    if isinstance(args, Hash):
+        named = name_checkpoints(submission, args.checkpoint)
+        write_json(args.folder / ABOUT, about_with_checkpoints(submission, named))
+        log.info("%s names the checkpoints of %d results", args.folder / ABOUT, len(named))
+        return args.folder / ABOUT
     check(submission)
-    if (args.checkpoint is None) == (args.policy is None):
-        raise InvalidArgumentError(
-            "give either --checkpoint or --policy: some episodes are run again before a submission is accepted"
-        )
+    rerun = None
+    if args.rerun != 0:
+        rerun = run_again(submission, _sources(submission, args), args.rerun, args.seed, args.workers)
+    count = sum(len(file.episodes) for file in rerun.files.values()) if rerun else 0
+    log.info("%s is accepted: %d results, %d episodes run again", args.folder, len(submission.results), count)
+    return args.folder if args.check_only else take(submission, args.board, rerun)
+
+
+def _build(args: Build) -> Path:
+    rows = rows_on(args.board)
+    path = write_page(rows, args.board)
+    log.info("%s, of %d submissions", path, len({row.submission.folder for row in rows}))
+    return path
+
+
+def _sources(submission: Submission, args: Submit) -> dict[Path, PolicySource]:
     json_object("--policy-kwargs", args.policy_kwargs)
-    run_again(submission, PolicySource(args.checkpoint, args.policy, args.policy_kwargs), args.rerun)
-    log.info("%s is accepted: %d results, %d episodes run again", args.folder, len(submission.results), args.rerun)
-    return args.folder if args.check_only else take(submission, args.board)
+    if args.policy is not None and not args.checkpoint:
+        return policy_sources(submission, args.policy, args.policy_kwargs)
+    if args.policy is None and args.checkpoint:
+        return checkpoint_sources(submission, args.checkpoint, args.policy_kwargs)
+    raise InvalidArgumentError(
+        "give either --checkpoint or --policy: some episodes are run again before a submission is accepted; with --rerun 0 "
+        "none are, and the page says so"
+    )
 
 
 if __name__ == "__main__":

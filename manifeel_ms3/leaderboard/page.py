@@ -5,6 +5,7 @@ The page has plotly's figures, which a reader can zoom and hover over in a brows
 
 import base64
 import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,15 +23,20 @@ from manifeel_ms3.analysis.protocol import (
     mean_success,
 )
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import write_text
 
-from .submission import EPISODES, Submission
+from .checks import EPISODES, check
+from .rerun import episodes_to_run_again, rerun_of
+from .submission import Submission, read_submission
+from .text import markdown_text, one_line
 
 with missing_extras_named():
     import jinja2
     import plotly.offline
     from markupsafe import Markup
 
+log = logging.getLogger(__name__)
 PAGE, TABLE = "index.html", "README.md"
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 FULL = (3, LAST, EPISODES)
@@ -49,6 +55,20 @@ class Row:
     """Median over episodes of the mean time of an inference, in ms."""
     force: float
     """Median over episodes of the largest contact force, in N."""
+    rerun: tuple[int, int]
+    """Numbers of episodes that the leaderboard ran again, and of all episodes."""
+
+    @property
+    def rerun_text(self) -> str:
+        """How many of the episodes were run again, such as "43 of 1500"."""
+        run, total = self.rerun
+        return f"{run} of {total}" if run else "no"
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether as many episodes were run again as invented outcomes need to be found."""
+        run, total = self.rerun
+        return run >= episodes_to_run_again(total)
 
     @property
     def is_full(self) -> bool:
@@ -60,20 +80,34 @@ def rows_of(submission: Submission) -> list[Row]:
     """The success of each condition of a submission, by the paper's protocol."""
     rows = []
     for condition, results in collect(submission.results.values()).items():
-        episodes = [episode for result in _results(submission, condition) for episode in result["episodes"]]
+        paths = _paths(submission, condition)
+        episodes = [episode for path in paths for episode in submission.results[path]["episodes"]]
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
-        rows.append(Row(submission, condition, mean_success(results), results, latency, force))
+        rerun = rerun_of(submission, paths)
+        rows.append(Row(submission, condition, mean_success(results), results, latency, force, rerun))
     return rows
 
 
-def _results(submission: Submission, condition: Condition) -> list[dict[str, Any]]:
-    return [result for result in submission.results.values() if condition_of(result) == condition]
+def _paths(submission: Submission, condition: Condition) -> list[Path]:
+    return [path for path, result in submission.results.items() if condition_of(result) == condition]
 
 
-def ranked(submissions: list[Submission]) -> list[Row]:
-    """The rows of all submissions, sorted by task, and by success within a task, the highest first."""
-    rows = [row for submission in submissions for row in rows_of(submission)]
+def rows_on(board: Path) -> list[Row]:
+    """The rows of all submissions in a leaderboard's folder; a broken submission is named in the log, and left out."""
+    rows = []
+    for folder in sorted(path for path in board.glob("*") if path.is_dir() and not path.name.startswith(".")):
+        try:
+            submission = read_submission(folder)
+            check(submission, to_take=False)
+            rows += rows_of(submission)
+        except InvalidFileError as error:
+            log.warning("left out: %s", " ".join(str(error).split()))
+    return ranked(rows)
+
+
+def ranked(rows: list[Row]) -> list[Row]:
+    """The rows sorted by task, and by success within a task, the highest first."""
     return sorted(rows, key=lambda row: (row.condition.task, row.condition.variant, -row.success.value))
 
 
@@ -82,24 +116,25 @@ def leaderboard_table(rows: list[Row]) -> str:
     head = (
         f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
         f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
-        '95 %; where there are fewer, "of" says how many.\n\n'
+        '95 %; where there are fewer, "of" says how many. "Run again" is the number of episodes that the leaderboard ran again '
+        "with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
     )
     cells = []
     for row in rows:
         about, condition = row.submission.about, row.condition
-        name = f"[{about.name}]({about.link})" if about.link else about.name
+        name = markdown_text(about.name)
         task = f"{condition.task} {condition.variant}".strip()
-        what = (condition.sensing, condition.policy, condition.network, condition.encoder, condition.num_demos)
-        cells.append((task, *what, row.success, row.results.size, name))
-    names = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations", "success", "of", "submission")
-    return head + markdown_table(names, cells)
+        what = (task, condition.sensing, condition.policy, condition.network, condition.encoder)
+        numbers = (condition.num_demos, row.success, row.results.size, row.rerun_text)
+        cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
+    what = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations")
+    return head + markdown_table((*what, "success", "of", "run again", "submission"), cells)
 
 
-def write_page(submissions: list[Submission], board: Path) -> Path:
+def write_page(rows: list[Row], board: Path) -> Path:
     """Write the page and the table into the leaderboard's folder, and return the path of the page."""
-    rows = ranked(submissions)
     write_text(board / TABLE, leaderboard_table(rows))
-    page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
+    page = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True).render(
         rows=[_for_page(row) for row in rows], full=FULL, plotly=Markup(plotly.offline.get_plotlyjs())
     )
     write_text(board / PAGE, page)
@@ -107,33 +142,36 @@ def write_page(submissions: list[Submission], board: Path) -> Path:
 
 
 def _for_page(row: Row) -> dict[str, Any]:
-    results = _results(row.submission, row.condition)
-    config = dict(sorted(results[-1]["config"].items()))
-    link = row.submission.about.link
-    return dict(
-        task=row.condition.task,
-        variant=row.condition.variant,
-        sensing=row.condition.obs_mode,
-        cameras=", ".join(row.condition.cameras),
-        policy=row.condition.policy,
-        network=row.condition.network,
-        encoder=row.condition.encoder,
-        demos=row.condition.num_demos or "",
+    about, condition = row.submission.about, row.condition
+    results = [row.submission.results[path] for path in _paths(row.submission, condition)]
+    texts = dict(
+        task=condition.task,
+        variant=condition.variant,
+        sensing=condition.obs_mode,
+        cameras=", ".join(condition.cameras),
+        policy=condition.policy,
+        network=condition.network,
+        encoder=condition.encoder,
+        name=about.name,
+        authors=about.authors,
+    )
+    return {name: one_line(text) for name, text in texts.items()} | dict(
+        demos=condition.num_demos or "",
         success=row.success,
         size=row.results.size,
         full=row.is_full,
+        rerun=row.rerun_text,
+        confirmed=row.is_confirmed,
         latency=row.inference_ms,
         force=row.force,
-        name=row.submission.about.name,
-        authors=row.submission.about.authors,
-        link=link if link.startswith(("https://", "http://")) else "",
-        config=json.dumps(config, indent=1),
-        curves=json.dumps(_curves(row, results)),
-        videos=[base64.b64encode(path.read_bytes()).decode() for path in sorted(row.submission.folder.glob("videos/*.mp4"))],
+        link=about.link,
+        config=json.dumps(dict(sorted(results[-1]["config"].items())), indent=1),
+        curves=json.dumps(_curves(results)),
+        videos=[base64.b64encode(video).decode() for video in row.submission.videos],
     )
 
 
-def _curves(row: Row, results: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _curves(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Success over gradient steps as plotly's traces, one line for each training seed."""
     traces = []
     for seed in sorted({result["training_seed"] for result in results}, key=str):

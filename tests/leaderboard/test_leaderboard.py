@@ -12,13 +12,14 @@ import pytest
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.evaluation.result import read_result, result_of, write_result
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
-from manifeel_ms3.leaderboard.submission import SubmissionError, check, read_submission
-from manifeel_ms3.tasks.registry import evaluation_seeds
+from manifeel_ms3.leaderboard.checks import check
+from manifeel_ms3.leaderboard.page import rows_on
+from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from tests.browser import browser_program
 from tests.conftest import PEG
+from tests.leaderboard.made_up import made_up
 
 BROWSER = browser_program()
 POLICY = "tests.evaluation.policies:StandStill"
@@ -49,6 +50,8 @@ def test_a_submission_is_run_again_and_accepted(submission, tmp_path):
     board = tmp_path / "board"
     taken = submit(submission, board, rerun=2)
     assert read_result(taken / "00000000.json")["policy"] == POLICY
+    main(Build(board))
+    assert "| 2 of 50 | [Still](https://example.org) |" in (board / "README.md").read_text()
     with pytest.raises(FileExistsAlreadyError, match="rename"):
         submit(submission, board, rerun=1)
 
@@ -94,6 +97,19 @@ def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
     assert not (tmp_path / "board").exists()
 
 
+def test_a16_what_was_run_again_is_shown_and_counts_only_for_the_file_that_was_checked(submission, tmp_path, caplog):
+    caplog.set_level("INFO")
+    board = tmp_path / "board"
+    taken = submit(submission, board, rerun=2)
+    assert re.search(r"2 episodes of 1 results are run again, drawn with --seed \d{5,}", caplog.text)
+    (row,) = rows_on(board)
+    assert (row.rerun_text, row.is_confirmed) == ("2 of 50", False)
+    assert len(json.loads((taken / "rerun.json").read_text())["files"]["00000000.json"]["episodes"]) == 2
+    change(taken, lambda result: result.update(git_commit=None))  # edited by hand later
+    (row,) = rows_on(board)
+    assert row.rerun_text == "no"
+
+
 def test_foreign_and_broken_files_are_all_named(submission, tmp_path):
     (submission / "other.json").write_text("{}")
     (submission / "broken.json").write_text("{")
@@ -105,7 +121,7 @@ def test_foreign_and_broken_files_are_all_named(submission, tmp_path):
 
 
 def test_a_result_of_another_policy_is_not_run_for_this_one(submission, tmp_path):
-    with pytest.raises(SubmissionError, match=r"no result is of tests\.evaluation\.policies:Raises"):
+    with pytest.raises(SubmissionError, match=r"is not of tests\.evaluation\.policies:Raises, but of '.*StandStill'"):
         main(Submit(submission, policy="tests.evaluation.policies:Raises", board=tmp_path / "board"))
 
 
@@ -117,7 +133,7 @@ def test_a_submission_needs_a_policy_from_the_command_line(submission, tmp_path)
 def test_the_policy_that_a_result_names_is_never_imported(submission, tmp_path):
     change(submission, lambda result: result.update(policy="this:Policy"))
     check(read_submission(submission))
-    with pytest.raises(SubmissionError, match=r"no result is of tests\.evaluation\.policies:StandStill"):
+    with pytest.raises(SubmissionError, match=r"is not of tests\.evaluation\.policies:StandStill, but of 'this:Policy'"):
         submit(submission, tmp_path / "board")
     assert "this" not in sys.modules
 
@@ -129,20 +145,6 @@ def test_a_result_of_version_1_is_refused_with_what_to_do(submission):
 
 
 # -------------------------------------------------------------------- the page
-
-
-def made_up(folder: Path, name: str, task: str, mode: str, won: int) -> None:
-    """Two checkpoints of two training seeds."""
-    folder.mkdir(parents=True)
-    (folder / "submission.json").write_text(json.dumps(dict(name=name, authors="Us")))
-    env_id = f"ManiFeel-{task}-v1"
-    for seed in (0, 1):
-        for step in (100, 200):
-            config = dict(policy_name="diffusion_policy", obs_mode=mode, seed=seed, step=step, num_demos=50)
-            outcomes = [EpisodeOutcome(start, k < won, k < won, 9, 1.0, 1.0) for k, start in enumerate(evaluation_seeds(50))]
-            write_result(
-                result_of(env_id, dict(cameras=["wrist"]), config, outcomes), folder / f"results/{seed}/{step:08d}.json"
-            )
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,148 @@
+"""Checks of a submission that need no simulator: its episodes, its numbers, and copies among its results."""
+
+from collections import Counter
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from manifeel_ms3.analysis.protocol import condition_of
+from manifeel_ms3.evaluation.statistics import wilson_interval
+from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds, task_spec
+
+from .rerun import FORCE_TOLERANCE, INVENTED
+from .submission import Submission, SubmissionError
+from .untrusted import quoted
+
+EPISODES = 50
+"""Number of evaluation episodes of a result, as in the paper."""
+SIMULATOR = ("mani-skill", "sapien")
+"""Packages whose minor version must be the one that is installed here."""
+MOST_FORCE = 500.0
+"""Contact force in N, more than the arm can press with; demonstrations stay below 60 N."""
+RATE_TOLERANCE = 1e-3
+"""Difference between numbers that count as the same, where a result rounds them to four digits."""
+SHOWN = 5
+"""Number of wrong seeds that a message lists."""
+SAME_OUTCOME = np.array([0, 0, 0, 2 * FORCE_TOLERANCE])
+"""Differences of success at any step, success at the end, length and force (N) up to which two episodes are the same: running
+one of them again would confirm the other."""
+
+
+def check(submission: Submission, to_take: bool = True) -> None:
+    """Check that results are of the tasks as they are now, on the evaluation seeds, of possible numbers, and no copies.
+
+    Args:
+        submission: The submission.
+        to_take: Whether it is to be taken into the leaderboard; its simulator must then be the one that is installed here.
+
+    Raises:
+        SubmissionError: Some results are not.
+    """
+    faults = [
+        f"{quoted(path)}: {fault}"
+        for path, result in submission.results.items()
+        for fault in _faults(result) + (_faults_of_the_simulator(result) if to_take else [])
+    ]
+    faults = faults or _faults_of_repetition(submission.results)
+    if faults:
+        raise SubmissionError(submission.folder, faults)
+
+
+def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
+    """Results that stand for the same checkpoint twice, or have the outcomes of another result of their task.
+
+    Two results are copies where more than a share of 1 - `INVENTED` of their episodes are the same. A copy with more changes
+    has so many invented episodes that running some of them again finds one.
+    """
+    places = Counter(
+        (condition_of(result), result["training_seed"], result["config"].get("step", 0)) for result in results.values()
+    )
+    faults = [
+        f"{count} results of {one.env_id}, {one.sensing} and {one.policy} are of training seed {seed}, step {step}; leave one"
+        for (one, seed, step), count in places.items()
+        if count > 1
+    ]
+    for env_id in sorted({result["env_id"] for result in results.values()}):
+        paths = [path for path, result in results.items() if result["env_id"] == env_id]
+        outcomes = np.array([_outcomes(results[path]) for path in paths])
+        for k, path in enumerate(paths):
+            same = (np.abs(outcomes[:k] - outcomes[k]) <= SAME_OUTCOME).all(-1).mean(-1)
+            if (same > 1 - INVENTED).any():
+                original = paths[int(same.argmax())]
+                faults.append(
+                    f"{quoted(path)} has the outcomes of {quoted(original)} in {same.max():.0%} of its episodes; different "
+                    "training seeds and checkpoints never have, so leave one"
+                )
+    return faults
+
+
+def _outcomes(result: dict[str, Any]) -> list[list[float]]:
+    names = ("success_once", "success_at_end", "length", "peak_contact_force")
+    return [[episode[name] for name in names] for episode in result["episodes"]]
+
+
+def _faults(result: dict[str, Any]) -> list[str]:
+    if result["env_id"] not in all_tasks():
+        return [f"{result['env_id']} is no task of this leaderboard; its tasks are {list(all_tasks())}"]
+    return _faults_of_the_task(result) + _faults_of_the_numbers(result)
+
+
+def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
+    """What is wrong with the episodes and the revision of the task of a result."""
+    env_id, faults = result["env_id"], []
+    seeds, here = evaluation_seeds(EPISODES), task_spec(env_id).revision
+    given = [episode["seed"] for episode in result["episodes"]]
+    if given != seeds:
+        missing, foreign = sorted(set(seeds) - set(given)), sorted(set(given) - set(seeds))
+        faults.append(
+            f"its {len(given)} episodes are not those of the {EPISODES} evaluation seeds from {seeds[0]} on (missing "
+            f"{missing[:SHOWN]}, foreign {foreign[:SHOWN]}, or in another order); evaluate with --episodes {EPISODES}"
+        )
+    if result["revision"] != here:
+        faults.append(
+            f"it is of revision {result['revision']} of {env_id}, but the task has revision {here} here; evaluate again with "
+            f"manifeel-ms3 {version('manifeel-ms3')}"
+        )
+    return faults
+
+
+def _faults_of_the_simulator(result: dict[str, Any]) -> list[str]:
+    faults = []
+    for name in SIMULATOR:
+        theirs, ours = result["versions"][name], version(name)
+        if theirs.split(".")[:2] != ours.split(".")[:2]:
+            faults.append(
+                f"it was run with {name} {theirs}, the leaderboard takes {'.'.join(ours.split('.')[:2])}; install that"
+            )
+    return faults
+
+
+def _faults_of_the_numbers(result: dict[str, Any]) -> list[str]:
+    """Numbers of a result that contradict each other, or are not possible."""
+    faults, episodes = [], result["episodes"]
+    for name in ("success_once", "success_at_end"):
+        succeeded = sum(episode[name] for episode in episodes)
+        expected = (succeeded / len(episodes), *wilson_interval(succeeded, len(episodes)))
+        given = tuple(result[name][key] for key in ("rate", "low", "high"))
+        if not np.allclose(given, expected, atol=RATE_TOLERANCE):
+            faults.append(f"{name} says {given}, its episodes come to {tuple(round(x, 4) for x in expected)}")
+    mean = float(np.mean([episode["length"] for episode in episodes]))
+    if abs(mean - result["mean_length"]) > RATE_TOLERANCE:
+        faults.append(f"mean_length says {result['mean_length']}, its episodes come to {mean:.3f}")
+    limit = task_spec(result["env_id"]).max_episode_steps
+    return faults + [fault for episode in episodes for fault in _faults_of_an_episode(episode, limit)]
+
+
+def _faults_of_an_episode(episode: dict[str, Any], limit: int) -> list[str]:
+    faults, place = [], f"episode of seed {episode['seed']}"
+    if episode["length"] > limit:
+        faults.append(f"{place}: {episode['length']} steps, the task ends after {limit}")
+    if episode["success_at_end"] and not episode["success_once"]:
+        faults.append(f"{place}: succeeds at the end, but never")
+    if episode["success_once"] and (episode["error"] or episode["length"] == 0):
+        faults.append(f"{place}: succeeds after {episode['length']} steps, with the error {episode['error']}")
+    if episode["peak_contact_force"] > MOST_FORCE:
+        faults.append(f"{place}: {episode['peak_contact_force']} N, more than the arm can press with")
+    return faults

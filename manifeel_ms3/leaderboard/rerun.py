@@ -1,0 +1,292 @@
+"""Running episodes of a submission again, drawn at random from all of its results, with the checkpoints that it names.
+
+What this proves, and what not, stands in `docs/evaluation.md`.
+"""
+
+import hashlib
+import json
+import logging
+import math
+import random
+import secrets
+from collections.abc import Iterable
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import hypergeom
+
+from manifeel_ms3.analysis.protocol import Condition, condition_of
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.evaluate import Evaluation, run_episodes
+from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.evaluation.provenance import package_versions
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+
+from .submission import ABOUT, Rerun, RerunFile, Submission, SubmissionError
+from .untrusted import quoted
+
+log = logging.getLogger(__name__)
+INVENTED = 0.1
+"""Share of invented episodes in a row of the page from which on the row must be found out."""
+CHANCE = 0.01
+"""Largest chance of such a row not to be found out."""
+COINCIDENCE = 0.1
+"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success, length, and
+force within 0.01 N: of the 50 episodes of either result in this repository, at most 3 have forces so near to any one value. A
+success that the policy does not have never agrees."""
+FORCE_TOLERANCE = 0.01
+"""Difference in N between forces that count as the same; a result rounds them to 0.001 N."""
+NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num_demos", "policy")
+"""Entries of a policy's configuration that a result must share with its checkpoint."""
+HASHED = ("model.safetensors", "config.json")
+"""Files of a checkpoint whose contents, one after the other, its hash is of."""
+CHUNK = 2**20
+STEP_TIMEOUT = 60.0
+"""Longest time that a policy may take for one action, in s; the default of an evaluation."""
+
+
+@cache
+def episodes_to_run_again(total: int) -> int:
+    r"""Number of episodes of a row of the page that must be run again.
+
+    Let m = ceil(`INVENTED` N) of the N episodes of a row be invented, at any places, before the draw. Of k episodes that are
+    drawn without replacement, j are invented with the hypergeometric probability C(m, j) C(N - m, k - j) / C(N, k), and each of
+    those j agrees with its repetition with the probability c = `COINCIDENCE`, independently. The row passes with probability
+
+        P(k) = sum over j of  C(m, j) C(N - m, k - j) / C(N, k)  c^j,
+
+    at most (1 - m / N (1 - c))^k. The smallest k with P(k) < `CHANCE` is returned: 33 of 50 episodes, 49 of the 1500 of the
+    full protocol. More invented episodes make P smaller.
+
+    Args:
+        total: Number of episodes N of the row.
+    """
+    invented = math.ceil(INVENTED * total)
+    fewest = (k for k in range(1, total + 1) if chance_to_pass(total, invented, k) < CHANCE)
+    return next(fewest, total)
+
+
+def chance_to_pass(total: int, invented: int, drawn: int) -> float:
+    """Chance that no drawn episode differs from its repetition; see `episodes_to_run_again`.
+
+    Args:
+        total: Number of episodes.
+        invented: Number of those that are invented.
+        drawn: Number of those that are run again.
+    """
+    found = np.arange(invented + 1)
+    return float(hypergeom.pmf(found, total, invented, drawn) @ COINCIDENCE**found)
+
+
+def checkpoint_sha256(checkpoint: Path) -> str:
+    """The hash of a checkpoint, which `cat model.safetensors config.json | sha256sum` prints, too.
+
+    Raises:
+        CheckpointError: One of the two files is missing, or cannot be read.
+    """
+    digest = hashlib.sha256()
+    try:
+        for name in HASHED:
+            with (checkpoint / name).open("rb") as file:
+                while chunk := file.read(CHUNK):
+                    digest.update(chunk)
+    except OSError as error:
+        raise CheckpointError(f"{checkpoint} cannot be hashed ({error}); give a folder with {' and '.join(HASHED)}") from error
+    return digest.hexdigest()
+
+
+def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
+    """Checkpoints by their hashes: the given folders themselves, or all that are inside of them.
+
+    Raises:
+        InvalidArgumentError: A folder is no checkpoint and holds none.
+    """
+    found = {}
+    for folder in folders:
+        here = [folder] if (folder / HASHED[1]).is_file() else sorted(path.parent for path in folder.rglob(HASHED[0]))
+        if not here:
+            raise InvalidArgumentError(f"--checkpoint {folder} is no checkpoint and holds none; give runs/x/checkpoints")
+        found.update({checkpoint_sha256(checkpoint): checkpoint for checkpoint in here})
+    return found
+
+
+def name_checkpoints(submission: Submission, folders: Iterable[Path]) -> dict[str, str]:
+    """The hash of the checkpoint of each result, found by the configuration that both hold.
+
+    Raises:
+        SubmissionError: A result fits none of the checkpoints, or several.
+    """
+    configs = {sha256: checkpoint_config(folder) for sha256, folder in checkpoints_in(folders).items()}
+    named, faults = {}, []
+    for path, result in submission.results.items():
+        fitting = [sha256 for sha256, config in configs.items() if not _differing_settings(result, config)]
+        if len(fitting) == 1:
+            named[path.as_posix()] = fitting[0]
+        else:
+            faults.append(f"{quoted(path)} fits {len(fitting)} of the {len(configs)} checkpoints; give the one that it is of")
+    if faults:
+        raise SubmissionError(submission.folder, faults)
+    return named
+
+
+def checkpoint_sources(submission: Submission, folders: Iterable[Path], kwargs: str) -> dict[Path, PolicySource]:
+    """The checkpoint of each result, by the hash that the submission names.
+
+    Args:
+        submission: The submission.
+        folders: Checkpoints, or folders of checkpoints.
+        kwargs: Keyword arguments of the policy, as json.
+
+    Raises:
+        SubmissionError: A result names no checkpoint, or one that was not given or was trained otherwise, or two results of a
+            task name the same one.
+    """
+    found = checkpoints_in(folders)
+    sources: dict[Path, PolicySource] = {}
+    users: dict[tuple[str, Condition], Path] = {}
+    faults = []
+    for path, result in submission.results.items():
+        sha256 = submission.about.checkpoints.get(path.as_posix())
+        if sha256 is None:
+            faults.append(f"{quoted(path)}: {ABOUT} names no checkpoint for it; add its hash with the command `hash`")
+        elif sha256 not in found:
+            faults.append(f"{quoted(path)}: no given checkpoint has the hash {sha256}; give it with --checkpoint")
+        elif differing := _differing_settings(result, checkpoint_config(found[sha256])):
+            faults.append(f"{quoted(path)} and {found[sha256]} differ in {differing}; evaluate the checkpoint again")
+        elif (user := users.setdefault((sha256, condition_of(result)), path)) != path:
+            faults.append(f"{quoted(path)} is of the checkpoint of {quoted(user)}; leave one of the two")
+        else:
+            sources[path] = PolicySource(found[sha256], kwargs=kwargs)
+    if faults:
+        raise SubmissionError(submission.folder, faults)
+    return sources
+
+
+def policy_sources(submission: Submission, policy: str, kwargs: str) -> dict[Path, PolicySource]:
+    """A class or server of the user's own as the policy of all results.
+
+    Args:
+        submission: The submission.
+        policy: The policy as the command line names it: nothing that a result names is imported.
+        kwargs: Keyword arguments of the policy, as json.
+
+    Raises:
+        SubmissionError: A result is of another policy.
+    """
+    faults = [
+        f"{quoted(path)} is not of {policy}, but of {result['policy']!r}; submit it with that policy"
+        for path, result in submission.results.items()
+        if result["policy"] != policy
+    ]
+    if faults:
+        raise SubmissionError(submission.folder, faults)
+    return dict.fromkeys(submission.results, PolicySource(policy=policy, kwargs=kwargs))
+
+
+def _differing_settings(result: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    return [name for name in NAMED_BY if result["config"].get(name) != config.get(name)]
+
+
+def draw(submission: Submission, most: int | None, seed: int) -> dict[Path, list[int]]:
+    """Numbers of the episodes to run again, by result file: from each row of the page as many as it needs, of all its files.
+
+    Args:
+        submission: The submission.
+        most: Largest number of episodes of a row; as many as `episodes_to_run_again` says if not given.
+        seed: Seed of the draw.
+    """
+    generator = random.Random(seed)
+    rows: dict[Condition, list[tuple[Path, int]]] = {}
+    for path, result in sorted(submission.results.items()):
+        rows.setdefault(condition_of(result), []).extend((path, k) for k in range(len(result["episodes"])))
+    drawn: dict[Path, list[int]] = {}
+    for episodes in rows.values():
+        count = episodes_to_run_again(len(episodes)) if most is None else min(most, len(episodes))
+        for path, k in sorted(generator.sample(episodes, count)):
+            drawn.setdefault(path, []).append(k)
+    return drawn
+
+
+def run_again(
+    submission: Submission,
+    sources: dict[Path, PolicySource],
+    most: int | None = None,
+    seed: int | None = None,
+    workers: int = 1,
+) -> Rerun:
+    """Run episodes again, check that they have the same outcomes, and return which they were.
+
+    Args:
+        submission: The submission.
+        sources: The policy of each result.
+        most: Largest number of episodes of a row of the page; as many as are needed if not given.
+        seed: Seed of the draw, to repeat an earlier one; a new one from the system's random numbers if not given.
+        workers: Number of processes that run episodes side by side.
+
+    Raises:
+        SubmissionError: An outcome differs.
+    """
+    seed = secrets.randbits(63) if seed is None else seed
+    drawn = draw(submission, most, seed)
+    log.info("%d episodes of %d results are run again, drawn with --seed %d", sum(map(len, drawn.values())), len(drawn), seed)
+    faults, files = [], {}
+    for path, numbers in drawn.items():
+        result = submission.results[path]
+        submitted = [result["episodes"][k] for k in numbers]
+        evaluation = Evaluation(sources[path], result["env_id"], result["env_kwargs"], result["config"])
+        seeds = [episode["seed"] for episode in submitted]
+        outcomes = run_episodes(evaluation, seeds, workers, step_timeout=STEP_TIMEOUT)
+        faults += _faults_of_a_result(path, result, submitted, outcomes)
+        files[path.as_posix()] = RerunFile(hashlib.sha256(submission.files[path]).hexdigest(), seeds)
+    if faults:
+        raise SubmissionError(submission.folder, faults)
+    return Rerun(seed, package_versions(), files)
+
+
+def _faults_of_a_result(
+    path: Path, result: dict[str, Any], submitted: list[dict[str, Any]], outcomes: list[EpisodeOutcome]
+) -> list[str]:
+    faults = [
+        f"{quoted(path)}: seed {episode['seed']}: {difference}"
+        for episode, outcome in zip(submitted, outcomes, strict=True)
+        for difference in _differences(episode, outcome)
+    ]
+    theirs, ours = result["versions"]["torch"], version("torch")
+    if faults and theirs != ours:
+        faults.append(
+            f"{quoted(path)} was made with torch {theirs}, here it is {ours}, which may round differently: install {theirs}"
+        )
+    return faults
+
+
+def _differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
+    found = []
+    for name in ("success_once", "success_at_end", "length", "peak_contact_force"):
+        tolerance = FORCE_TOLERANCE if name == "peak_contact_force" else 0
+        before, now = episode[name], getattr(outcome, name)
+        if abs(before - now) > tolerance:
+            found.append(f"{name} says {before}, run again it is {now}")
+    return found
+
+
+def rerun_of(submission: Submission, paths: Iterable[Path]) -> tuple[int, int]:
+    """Numbers of episodes that were run again, and of all episodes, in some results of the leaderboard.
+
+    An entry of rerun.json counts only for the very file that was checked.
+    """
+    run, total = 0, 0
+    for path in paths:
+        total += len(submission.results[path]["episodes"])
+        entry = submission.rerun.files.get(path.as_posix()) if submission.rerun else None
+        if entry and entry.sha256 == hashlib.sha256(submission.files[path]).hexdigest():
+            run += len(set(entry.episodes))
+    return run, total
+
+
+def about_with_checkpoints(submission: Submission, named: dict[str, str]) -> dict[str, Any]:
+    """The content of submission.json with the hashes of checkpoints."""
+    return json.loads(submission.files[ABOUT]) | dict(checkpoints=named)

@@ -1,0 +1,31 @@
+"""Texts and links of strangers as the page and the table may show them."""
+
+import re
+from urllib.parse import urlsplit
+
+LONGEST_SHOWN = 200
+"""Largest number of characters of a text that is shown."""
+LINK = re.compile(r"https?://[A-Za-z0-9\-._~:/?#!$&'*+,;=%]+")
+"""A web address without a user name, and without the characters that end a link in Markdown; the rest is percent-encoded."""
+ENTITIES = {character: f"&#{ord(character)};" for character in "&<>\"'|~$@^"}
+ESCAPES = {character: f"\\{character}" for character in "\\`*_{}[]#!"}
+
+
+def one_line(text: str) -> str:
+    """The text in one line, without control characters and those that turn the direction of writing, at most so long."""
+    kept = " ".join("".join(letter if letter.isprintable() else " " for letter in text[: 2 * LONGEST_SHOWN]).split())
+    return kept if len(kept) <= LONGEST_SHOWN else kept[: LONGEST_SHOWN - 3] + "..."
+
+
+def markdown_text(text: str) -> str:
+    """The text in one line of Markdown that shows every character of it as it is: no markup, no HTML, no cell of a table."""
+    return "".join(ENTITIES.get(letter) or ESCAPES.get(letter, letter) for letter in one_line(text))
+
+
+def is_safe_link(link: str) -> bool:
+    """Whether the text is an address of the web, with a host and without a user name."""
+    try:
+        parts = urlsplit(link)
+        return bool(LINK.fullmatch(link) and parts.hostname and parts.username is None) and (parts.port or 0) >= 0
+    except ValueError:  # the port is not a number
+        return False
