@@ -1,10 +1,16 @@
 """Folders of the data that ships with the package, and of derived assets."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import platformdirs
 
+from .errors import MachineError
+
+CACHE_DIR = "MANIFEEL_CACHE_DIR"
+"""Environment variable that names the folder of derived assets."""
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -21,5 +27,29 @@ def troubleshooting() -> Path:
 
 
 def cache_dir() -> Path:
-    """Folder of derived assets: the user's cache, unless the environment variable `MANIFEEL_CACHE_DIR` names another."""
-    return Path(os.environ.get("MANIFEEL_CACHE_DIR") or platformdirs.user_cache_dir("manifeel_ms3"))
+    """Folder of derived assets: the user's cache, unless the environment variable `MANIFEEL_CACHE_DIR` names another.
+
+    Raises:
+        MachineError: The user has no home folder, and the variable is not set.
+    """
+    folder = Path(os.environ.get(CACHE_DIR) or platformdirs.user_cache_dir("manifeel_ms3"))
+    if folder.parts[0] == "~":  # what is left of a home folder that nobody knows
+        raise MachineError(f"there is no home folder to keep derived files in; set {CACHE_DIR} to a folder that can be written")
+    return folder
+
+
+@contextmanager
+def writable_cache() -> Iterator[Path]:
+    """Context manager that makes the folder of derived assets, gives its path, and names the remedy where writing fails.
+
+    Raises:
+        MachineError: The folder cannot be made, or the code in the context cannot write into it.
+    """
+    folder = cache_dir()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except OSError as error:
+        raise MachineError(
+            f"derived files cannot be kept in {folder} ({error}); set {CACHE_DIR} to a folder that can be written"
+        ) from error
