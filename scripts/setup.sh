@@ -14,6 +14,7 @@ DEBIAN_MIRROR=http://deb.debian.org/debian/ # where the machine's sources name n
 DEBIAN_KEYRING=/usr/share/keyrings/debian-archive-keyring.gpg
 BACKPORTS=/etc/apt/sources.list.d/manifeel-backports.list
 
+OS_RELEASE=/etc/os-release
 LAVAPIPE=/usr/local/lib/mesa-lavapipe
 LAVAPIPE_ICD=/usr/local/share/vulkan/icd.d/lvp_icd.json # the file through which Vulkan finds it
 LAVAPIPE_SHA256=3899f1800424c60a05df5d6913076a526ca8fdbabec43672cd397563d1ca3263
@@ -26,8 +27,9 @@ say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
 # Asks for the library, since the package that holds it has another name from release to release. The list is read as a whole:
 # a pipe into `grep -q` ends early, so that under pipefail a library that is there would count as missing.
+LIBRARIES=
 has_library() {
-  LIBRARIES=${LIBRARIES-$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p)}
+  LIBRARIES=${LIBRARIES:-$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p)}
   [[ $LIBRARIES == *"$1"* ]]
 }
 
@@ -48,6 +50,7 @@ new_enough_mesa() {
 # sources, in all of their formats, and knows from the lists that it has fetched which of them are Debian's.
 debians_mirror() {
   local created_by release component origin uri
+  # shellcheck disable=SC2016 # it is apt that fills in what is in $()
   while IFS='|' read -r created_by release component origin uri; do
     if [ "$created_by|$release|$component" = "Packages|$1|main" ] && [[ $origin == Debian* ]]; then
       echo "$uri"
@@ -57,7 +60,8 @@ debians_mirror() {
 }
 
 add_mesa_source() { # a release of Mesa that is new enough, where the system's own is not
-  . /etc/os-release
+  # shellcheck source=/dev/null
+  . "$OS_RELEASE"
   [ "$ID-$VERSION_ID" = debian-12 ] || return 0
   as_root rm -f "$BACKPORTS" # of an earlier run
   if [ -z "$(debians_mirror bookworm-backports)" ]; then
@@ -65,7 +69,9 @@ add_mesa_source() { # a release of Mesa that is new enough, where the system's o
     uri=$(debians_mirror bookworm)
     # what it offers counts only if Debian has signed it, whoever serves it
     echo "deb [signed-by=$DEBIAN_KEYRING] ${uri:-$DEBIAN_MIRROR} bookworm-backports main" | as_root tee "$BACKPORTS" >/dev/null
-    if ! as_root apt-get update -q -o APT::Update::Error-Mode=any; then
+    # this source alone: whether one of the others fails says nothing about it
+    if ! as_root apt-get update -q -o APT::Update::Error-Mode=any -o Dir::Etc::sourcelist="$BACKPORTS" \
+      -o Dir::Etc::sourceparts=- -o APT::Get::List-Cleanup=0; then
       say "Debian's backports cannot be had from ${uri:-$DEBIAN_MIRROR}"
       as_root rm -f "$BACKPORTS"
       return 1
@@ -75,7 +81,8 @@ add_mesa_source() { # a release of Mesa that is new enough, where the system's o
 }
 
 install_debians_lavapipe() { # Ubuntu 22.04 has no Mesa that is new enough; Debian's is built for its LLVM 15 and glibc
-  . /etc/os-release
+  # shellcheck source=/dev/null
+  . "$OS_RELEASE"
   [ "$ID-$VERSION_ID" = ubuntu-22.04 ] && [ "$(dpkg --print-architecture)" = amd64 ] || return 1
   local unpacked url
   unpacked=$(mktemp -d)
@@ -97,7 +104,7 @@ install_system_packages() {
   done
   python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
   # the leaderboard's page is tried in a browser; Ubuntu's package is a snap, which containers do not run
-  has_browser || ! grep -q '^ID=debian' /etc/os-release || missing+=(chromium)
+  has_browser || ! grep -q '^ID=debian' "$OS_RELEASE" || missing+=(chromium)
   local mesa=true
   has_gpu || new_enough_mesa || mesa=false
   [ ${#missing[@]} = 0 ] && $mesa && return

@@ -121,7 +121,8 @@ def _show(command: list[str]) -> None:
                     f"Rerun's viewer ended with exit code {viewer.returncode}; use --web or --save without a screen"
                 )
         finally:
-            viewer.terminate()
+            viewer.kill()  # it has nothing to save
+            viewer.wait()
 
 
 def rerun_recording(file: Path, episode: int) -> Any:
