@@ -1,10 +1,12 @@
 # For machines with an NVIDIA GPU and the NVIDIA container toolkit:
 #   docker build -t manifeel . && docker run --rm --gpus all manifeel manifeel doctor
-FROM python:3.11-slim-bookworm
+# The digest names the image's content, which a tag does not. For another version: `docker buildx imagetools inspect
+# python:3.11.13-slim-bookworm` prints the digest of a tag.
+FROM python:3.11.13-slim-bookworm@sha256:86adf8dbadc3d6e82ee5dd2c74bec2e1c2467cdad47886280501df722372d2e1
 
-# libraries that opencv and SAPIEN load; the driver's own come from the host, through the toolkit
+# libraries that opencv and SAPIEN load; the driver's own come from the host, through the toolkit. git: results name the commit
 RUN apt-get update \
- && apt-get install -y --no-install-recommends libvulkan1 libegl1 libgl1 libglib2.0-0 libxext6 \
+ && apt-get install -y --no-install-recommends git libvulkan1 libegl1 libgl1 libglib2.0-0 libxext6 \
  && rm -rf /var/lib/apt/lists/*
 ENV NVIDIA_VISIBLE_DEVICES=all NVIDIA_DRIVER_CAPABILITIES=compute,utility,graphics
 # the toolkit mounts the libraries, but not always the files through which Vulkan and EGL find them

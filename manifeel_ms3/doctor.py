@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from .command_line import PACKAGE, run
-from .paths import cache_dir
+from .errors import MachineError
+from .paths import CACHE_DIR, writable_cache
 
 PYTHONS = ((3, 10), (3, 12))
 """First and last version of Python that the tests run on."""
@@ -110,15 +111,14 @@ def _disk() -> Finding:
 
 
 def _cache() -> Finding:
-    folder = cache_dir()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / ".probe"
-        probe.write_text("")
-        probe.unlink()
-    except OSError as error:
-        remedy = "Set the environment variable MANIFEEL_CACHE_DIR to a folder that can be written."
-        return Finding("cache", False, f"{folder}: {error}", remedy)
+        with writable_cache() as folder:
+            probe = folder / ".probe"
+            probe.write_text("")
+            probe.unlink()
+    except MachineError as error:
+        remedy = f"Set the environment variable {CACHE_DIR} to a folder that can be written."
+        return Finding("cache", False, str(error.__cause__ or error), remedy)
     return Finding("cache", True, str(folder))
 
 
@@ -138,8 +138,10 @@ class _Ran:
 
 
 def _run(code: str) -> _Ran:
-    """Run a program in a process of its own."""
-    program = f"try: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
+    """Run a program in a process of its own, which imports nothing from the current folder: a file there may be of anybody."""
+    # the empty entry is the current folder; `python -P`, which leaves it out, needs Python 3.11
+    alone = "import sys; sys.path[:] = [folder for folder in sys.path if folder]"
+    program = f"{alone}\ntry: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
     try:
         done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=TIMEOUT, check=False)
     except subprocess.TimeoutExpired:

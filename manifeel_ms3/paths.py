@@ -9,6 +9,8 @@ import platformdirs
 
 from .errors import MachineError
 
+CACHE_DIR = "MANIFEEL_CACHE_DIR"
+"""Environment variable that names the folder of derived assets."""
 _PACKAGE = Path(__file__).resolve().parent
 
 
@@ -25,21 +27,29 @@ def troubleshooting() -> Path:
 
 
 def cache_dir() -> Path:
-    """Folder of derived assets: the user's cache, unless the environment variable `MANIFEEL_CACHE_DIR` names another."""
-    return Path(os.environ.get("MANIFEEL_CACHE_DIR") or platformdirs.user_cache_dir("manifeel_ms3"))
+    """Folder of derived assets: the user's cache, unless the environment variable `MANIFEEL_CACHE_DIR` names another.
+
+    Raises:
+        MachineError: The user has no home folder, and the variable is not set.
+    """
+    folder = Path(os.environ.get(CACHE_DIR) or platformdirs.user_cache_dir("manifeel_ms3"))
+    if folder.parts[0] == "~":  # what is left of a home folder that nobody knows
+        raise MachineError(f"there is no home folder to keep derived files in; set {CACHE_DIR} to a folder that can be written")
+    return folder
 
 
 @contextmanager
-def writing_to_cache() -> Iterator[None]:
-    """Context in which files are written to `cache_dir()`.
+def writable_cache() -> Iterator[Path]:
+    """Context manager that makes the folder of derived assets, gives its path, and names the remedy where writing fails.
 
     Raises:
-        MachineError: The folder cannot be written, as where the home folder does not exist.
+        MachineError: The folder cannot be made, or the code in the context cannot write into it.
     """
+    folder = cache_dir()
     try:
-        yield
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder
     except OSError as error:
         raise MachineError(
-            f"the folder of derived assets, {cache_dir()}, cannot be written ({error}); set the environment variable "
-            "MANIFEEL_CACHE_DIR to a folder that can"
+            f"derived files cannot be kept in {folder} ({error}); set {CACHE_DIR} to a folder that can be written"
         ) from error

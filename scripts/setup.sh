@@ -1,16 +1,22 @@
 #!/usr/bin/env bash
 # Installs what the project needs on Debian 12 or Ubuntu 22.04/24.04: Vulkan libraries, a virtual environment in .venv
 # with the versions of requirements.lock, and the package itself. It can be run again at any time. Without root it says what
-# is missing and goes on: whatever needs no rendered image works.
+# is missing and goes on: whatever needs no rendered image works. `scripts/setup.sh --undo` takes back what it added outside
+# of this folder, and says what it leaves. Tests source this file, which then only defines its functions.
 set -euo pipefail
-cd "$(dirname "$0")/.."
 
 TORCH_VERSION=2.13.0
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
 MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
 WITHOUT_PICTURES="only what needs no rendered image works: obs_mode='state' or 'tacff' with render_backend='none'."
 
+DEBIAN_MIRROR=http://deb.debian.org/debian/ # where the machine's sources name no mirror
+DEBIAN_KEYRING=/usr/share/keyrings/debian-archive-keyring.gpg
+BACKPORTS=/etc/apt/sources.list.d/manifeel-backports.list
+
+OS_RELEASE=/etc/os-release
 LAVAPIPE=/usr/local/lib/mesa-lavapipe
+LAVAPIPE_ICD=/usr/local/share/vulkan/icd.d/lvp_icd.json # the file through which Vulkan finds it
 LAVAPIPE_SHA256=3899f1800424c60a05df5d6913076a526ca8fdbabec43672cd397563d1ca3263
 LAVAPIPE_URLS=(
   "http://deb.debian.org/debian/pool/main/m/mesa/mesa-vulkan-drivers_25.0.7-2~bpo12+1_amd64.deb"
@@ -19,9 +25,13 @@ LAVAPIPE_URLS=(
 
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
-# asks for the library, since the package that holds it has another name from release to release; no pipe into `grep -q`,
-# which ends early and so makes `ldconfig` fail, and with it, under pipefail, the question
-has_library() { [[ $(ldconfig -p) == *"$1"* ]]; }
+# Asks for the library, since the package that holds it has another name from release to release. The list is read as a whole:
+# a pipe into `grep -q` ends early, so that under pipefail a library that is there would count as missing.
+LIBRARIES=
+has_library() {
+  LIBRARIES=${LIBRARIES:-$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p)}
+  [[ $LIBRARIES == *"$1"* ]]
+}
 
 has_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
@@ -36,24 +46,43 @@ new_enough_mesa() {
   dpkg --compare-versions "$version" ge "$MIN_MESA"
 }
 
+# Address of the first of the machine's sources that holds a suite of Debian's; nothing where there is none. apt itself reads the
+# sources, in all of their formats, and knows from the lists that it has fetched which of them are Debian's.
+debians_mirror() {
+  local created_by release component origin uri
+  # shellcheck disable=SC2016 # it is apt that fills in what is in $()
+  while IFS='|' read -r created_by release component origin uri; do
+    if [ "$created_by|$release|$component" = "Packages|$1|main" ] && [[ $origin == Debian* ]]; then
+      echo "$uri"
+      return
+    fi
+  done <<<"$(apt-get indextargets --format '$(CREATED_BY)|$(RELEASE)|$(COMPONENT)|$(ORIGIN)|$(REPO_URI)')"
+}
+
 add_mesa_source() { # a release of Mesa that is new enough, where the system's own is not
-  . /etc/os-release
-  case "$ID-$VERSION_ID" in
-  debian-12)
-    # the suite's address is that of the machine's own sources
+  # shellcheck source=/dev/null
+  . "$OS_RELEASE"
+  [ "$ID-$VERSION_ID" = debian-12 ] || return 0
+  as_root rm -f "$BACKPORTS" # of an earlier run
+  if [ -z "$(debians_mirror bookworm-backports)" ]; then
     local uri
-    uri=$({ cat /etc/apt/sources.list /etc/apt/sources.list.d/* 2>/dev/null || true; } |
-      awk '/^URIs:/ && /debian/ && !/security/ {print $2; exit} /^deb / && !/security/ {for (i = 2; i <= NF; i++) if ($i ~ /^https?:/) {print $i; exit}}')
-    echo "deb ${uri:-http://deb.debian.org/debian} bookworm-backports main" |
-      as_root tee /etc/apt/sources.list.d/manifeel-backports.list >/dev/null
-    as_root apt-get update -q
-    MESA_RELEASE=(-t bookworm-backports)
-    ;;
-  esac
+    uri=$(debians_mirror bookworm)
+    # what it offers counts only if Debian has signed it, whoever serves it
+    echo "deb [signed-by=$DEBIAN_KEYRING] ${uri:-$DEBIAN_MIRROR} bookworm-backports main" | as_root tee "$BACKPORTS" >/dev/null
+    # this source alone: whether one of the others fails says nothing about it
+    if ! as_root apt-get update -q -o APT::Update::Error-Mode=any -o Dir::Etc::sourcelist="$BACKPORTS" \
+      -o Dir::Etc::sourceparts=- -o APT::Get::List-Cleanup=0; then
+      say "Debian's backports cannot be had from ${uri:-$DEBIAN_MIRROR}"
+      as_root rm -f "$BACKPORTS"
+      return 1
+    fi
+  fi
+  MESA_RELEASE=(-t bookworm-backports)
 }
 
 install_debians_lavapipe() { # Ubuntu 22.04 has no Mesa that is new enough; Debian's is built for its LLVM 15 and glibc
-  . /etc/os-release
+  # shellcheck source=/dev/null
+  . "$OS_RELEASE"
   [ "$ID-$VERSION_ID" = ubuntu-22.04 ] && [ "$(dpkg --print-architecture)" = amd64 ] || return 1
   local unpacked url
   unpacked=$(mktemp -d)
@@ -62,7 +91,7 @@ install_debians_lavapipe() { # Ubuntu 22.04 has no Mesa that is new enough; Debi
   done
   dpkg-deb -x "$unpacked/mesa.deb" "$unpacked" &&
     sed "s#\"libvulkan_lvp.so\"#\"$LAVAPIPE/libvulkan_lvp.so\"#" "$unpacked/usr/share/vulkan/icd.d/lvp_icd.json" >"$unpacked/lvp_icd.json" &&
-    as_root install -D -m 644 "$unpacked/lvp_icd.json" /usr/local/share/vulkan/icd.d/lvp_icd.json &&
+    as_root install -D -m 644 "$unpacked/lvp_icd.json" "$LAVAPIPE_ICD" &&
     as_root install -D -m 644 "$unpacked/usr/lib/x86_64-linux-gnu/libvulkan_lvp.so" "$LAVAPIPE/libvulkan_lvp.so"
   rm -r "$unpacked"
   new_enough_mesa
@@ -75,7 +104,7 @@ install_system_packages() {
   done
   python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
   # the leaderboard's page is tried in a browser; Ubuntu's package is a snap, which containers do not run
-  has_browser || ! grep -q '^ID=debian' /etc/os-release || missing+=(chromium)
+  has_browser || ! grep -q '^ID=debian' "$OS_RELEASE" || missing+=(chromium)
   local mesa=true
   has_gpu || new_enough_mesa || mesa=false
   [ ${#missing[@]} = 0 ] && $mesa && return
@@ -123,6 +152,38 @@ locked() { # the lines of requirements.lock that pin a package
   awk -v name="$1" '/^[^ ]/ {found = index($0, name "==") == 1} found' requirements.lock
 }
 
-install_system_packages
-install_python_packages
-say "Ready. Renderer: $(.venv/bin/python -c 'from manifeel_ms3.tasks.rendering import available_render_backend as b; print(b())' 2>/dev/null)"
+undo() {
+  local removed=()
+  if [ -e "$BACKPORTS" ]; then
+    as_root rm -f "$BACKPORTS" || { say "No root: $BACKPORTS cannot be removed" && return 1; }
+    as_root apt-get update -q || true
+    removed+=("$BACKPORTS")
+  fi
+  if [ -e "$LAVAPIPE" ]; then
+    as_root rm -rf "$LAVAPIPE" "$LAVAPIPE_ICD" || { say "No root: $LAVAPIPE cannot be removed" && return 1; }
+    removed+=("$LAVAPIPE" "$LAVAPIPE_ICD")
+  fi
+  say "Removed: ${removed[*]:-nothing; no source of packages and no copy of lavapipe had been added}"
+  say "Left: the Debian or Ubuntu packages (libvulkan1, libegl1, libgl1, libglib2.0-0, python3-venv, chromium, mesa-vulkan-drivers)," \
+    "which other programs may need; \`apt-get remove\` removes them. Left, too: .venv in this folder, and ~/.cache/manifeel_ms3."
+}
+
+main() {
+  cd "$(dirname "${BASH_SOURCE[0]}")/.."
+  case "$*" in
+  "") ;;
+  --undo)
+    undo
+    return
+    ;;
+  *)
+    say "usage: scripts/setup.sh [--undo]" >&2
+    return 2
+    ;;
+  esac
+  install_system_packages
+  install_python_packages
+  say "Ready. Renderer: $(.venv/bin/python -c 'from manifeel_ms3.tasks.rendering import available_render_backend as b; print(b())' 2>/dev/null)"
+}
+
+if [ "${BASH_SOURCE[0]}" = "$0" ]; then main "$@"; fi

@@ -21,7 +21,7 @@ import numpy as np
 import trimesh
 from mani_skill import PACKAGE_ASSET_DIR
 
-from manifeel_ms3.paths import cache_dir, writing_to_cache
+from manifeel_ms3.paths import cache_dir, writable_cache
 
 FINGER_SIZE = (0.030, 0.023, 0.100)  # m: across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
 GEL_SIZE = (0.024, 0.032, 0.003)  # m: across, along the finger, thick
@@ -52,11 +52,9 @@ def panda_gelsight_urdf(visuals: bool = True) -> str:
     return str(folder / ("panda.urdf" if visuals else "panda_bare.urdf"))
 
 
-@writing_to_cache()
 def _build_into(folder: Path) -> None:
     """Build in a temporary folder and move it in place, so that processes that start together do not disturb each other."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
+    with writable_cache(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
         work = Path(scratch) / "new"
         work.mkdir()
         tree = ET.parse(_SOURCE / "panda_v2.urdf")

@@ -4,13 +4,16 @@ Cameras, touch, forces, actions and success are shown over one time axis. Needs 
 """
 
 import logging
+import shutil
+import signal
+import socket
+import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 import torch
@@ -18,6 +21,7 @@ import tyro
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, PandaGelSight
 from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.errors import MachineError
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
@@ -25,8 +29,8 @@ from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_he
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-PORT = 9090
-"""Port of the viewer in the browser, Rerun's default."""
+LOOPBACK = "127.0.0.1"
+"""Address that only this machine reaches; Rerun's own default is every address of the machine, without a password."""
 FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
 """Names of the components of the force on a whole pad, in the order of the force field's channels."""
 JOINT_AXES = {"pd_joint_pos": (*(f"{name}, rad" for name in PandaGelSight.arm_joint_names), "gripper")}
@@ -44,7 +48,9 @@ class Args:
     save: Path | None = None
     """Path of a .rrd file to write, which `rerun` opens; the viewer is opened if not given."""
     web: bool = False
-    """Serve the viewer for a browser at port 9090 of this machine."""
+    """Serve the viewer for a browser, to this machine only."""
+    port: int = 9090
+    """Port of the viewer in the browser."""
 
 
 @dataclass(frozen=True)
@@ -64,22 +70,59 @@ def main(args: Args) -> None:
 
     Raises:
         DemonstrationError: The file is missing or broken, or has no such episode.
+        MachineError: The viewer does not start, because there is no screen, say.
         MissingExtraError: Rerun is not installed.
     """
     recording = rerun_recording(args.file, args.episode)
     if args.save:
         recording.save(args.save)
         log.info("%s; `rerun %s` opens it", args.save, args.save)
-    elif args.web:
-        import rerun as rr
+        return
+    with TemporaryDirectory(prefix="manifeel-view-") as folder:
+        file = Path(folder) / "episode.rrd"
+        recording.save(file)
+        recording.disconnect()
+        _show(viewer_command(file, args.port if args.web else None))
 
-        stream = recording.serve_grpc()
-        rr.serve_web_viewer(web_port=PORT, connect_to=stream)
-        log.info("http://localhost:%d/?url=%s\nCtrl-C ends it", PORT, quote(stream, safe=""))
-        while True:
-            time.sleep(1)
-    else:
-        recording.spawn()
+
+def viewer_command(file: Path, web_port: int | None) -> list[str]:
+    """Command that shows a .rrd file in Rerun's viewer and listens on the loopback address only.
+
+    Args:
+        file: Path of the .rrd file.
+        web_port: Port at which the viewer is served for a browser; None for the viewer in a window of its own.
+
+    Raises:
+        MachineError: The installed Rerun has no viewer.
+    """
+    import rerun_cli
+
+    program = shutil.which("rerun", path=Path(rerun_cli.__file__).parent)
+    if program is None:
+        raise MachineError("the installed rerun-sdk has no viewer; use --save, and open the file elsewhere")
+    command = [program, str(file), "--bind", LOOPBACK, "--port", str(_free_port())]
+    return command if web_port is None else [*command, "--serve-web", "--web-viewer-port", str(web_port)]
+
+
+def _free_port() -> int:
+    """A free port: at Rerun's usual one another user's viewer could listen, and be given the episode."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
+
+
+def _show(command: list[str]) -> None:
+    """Run the viewer until it is closed or this process is interrupted; it never outlives an orderly end of this process."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with subprocess.Popen(command) as viewer:
+        try:
+            if viewer.wait() != 0:
+                raise MachineError(
+                    f"Rerun's viewer ended with exit code {viewer.returncode}; use --web or --save without a screen"
+                )
+        finally:
+            viewer.kill()  # it has nothing to save
+            viewer.wait()
 
 
 def rerun_recording(file: Path, episode: int) -> Any:

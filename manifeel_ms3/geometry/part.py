@@ -15,7 +15,7 @@ from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
-from manifeel_ms3.paths import cache_dir, writing_to_cache
+from manifeel_ms3.paths import cache_dir, writable_cache
 from manifeel_ms3.sensors.depth.surfaces import give_relief
 
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
@@ -117,8 +117,8 @@ def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
     text = "\n".join(lines)
     path = cache_dir() / "parts" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.obj"
     if not path.is_file():
-        with writing_to_cache():
-            path.parent.mkdir(parents=True, exist_ok=True)
+        with writable_cache():
+            path.parent.mkdir(exist_ok=True)
             draft = path.with_suffix(f".{os.getpid()}.obj")
             draft.write_text(text, encoding="utf-8")
             draft.replace(path)

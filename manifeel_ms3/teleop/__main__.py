@@ -42,7 +42,7 @@ class Args:
     device: Literal["spacemouse", "gamepad"] | None = None
     """Device to steer with, besides the page; none if not given."""
     host: str = "localhost"
-    """Address to listen on. Whoever reaches it can watch, and the first to open the page steers."""
+    """Address to listen on. Whoever has the page's address, which holds a token, can watch, and the first to open it steers."""
     port: int = 8080
     """Port to listen on; the next free one if it is taken."""
 
@@ -58,6 +58,7 @@ def main(args: Args) -> Path:
         MissingExtraError: viser, which serves the page, is not installed.
     """
     with missing_extras_named():
+        from .local_server import LOOPBACK_NAMES
         from .page import Page
     task_spec(args.env_id)
     kwargs: dict[str, Any] = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))
@@ -72,6 +73,12 @@ def main(args: Args) -> Path:
     out = args.out or Path("data/demos") / args.env_id / "human.h5"
     session = Session(env, args.env_id, kwargs, out, args.seed, operator)
     page = Page(operator, args.env_id, args.host, args.port)
+    if args.host not in LOOPBACK_NAMES:
+        log.warning(
+            "--host %s: other machines reach the page. Whoever has the address below can watch and steer the robot, and "
+            "whoever listens on the network can read it, because the connection is not encrypted",
+            args.host,
+        )
     log.info("%s shows the robot; Ctrl-C ends it. Episodes go to %s", page.address, out)
     try:
         session.run(page)

@@ -1,6 +1,5 @@
 """The page in a browser (viser): it shows the observations, and has the keys and buttons to steer with."""
 
-import logging
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import viser.uplot
 
 from manifeel_ms3.sensors.visualisation import observation_images
 
+from .local_server import LocalServer
 from .operator import EpisodeCommand, Mode, Operator
 
 TILE_HEIGHT = 360
@@ -61,12 +61,11 @@ class Page:
 
     def __init__(self, operator: Operator, title: str, host: str, port: int):
         self.operator = operator
-        logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs every page that opens or closes
-        self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        self._server = LocalServer(host, port, title)
         self._pilot: int | None = None
         self._rights = threading.Lock()
         self._forces: deque[float] = deque([0.0] * NUM_PLOTTED, NUM_PLOTTED)
-        self.address = f"http://{host}:{self._server.get_port()}"
+        self.address = self._server.address
         self._server.on_client_connect(lambda client: self._claim(client.client_id))
         self._server.on_client_disconnect(self._left)
         self._build(title)

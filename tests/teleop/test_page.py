@@ -5,6 +5,7 @@ import socket
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -21,14 +22,16 @@ SPACE, ENTER, DOWN, AHEAD = (" ", "Space", 32), ("Enter", "Enter", 13), ("f", "K
 
 @pytest.fixture
 def address(tmp_path):
-    """Of a page that `python -m manifeel_ms3.teleop` serves."""
+    """Of a page that `python -m manifeel_ms3.teleop` serves, with the token, as the command prints it."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, "--out", str(tmp_path / "human.h5"), "--port", str(port)]
     heeding = ["env", "--default-signal=INT", *command]  # ignored by what a background job starts
     process = subprocess.Popen(heeding, stderr=subprocess.PIPE, text=True)
-    yield f"http://localhost:{port}"
+    address = next(line for line in process.stderr if "shows the robot" in line).split()[0]
+    assert address.startswith(f"http://localhost:{port}/")
+    yield address
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60)[1]
     assert process.returncode == 0, said
@@ -43,7 +46,7 @@ def listening_addresses(port: int) -> set[str]:
 
 
 def test_a_person_records_an_episode(address, tmp_path):
-    path, port = tmp_path / "human.h5", int(address.rpartition(":")[2])
+    path, port = tmp_path / "human.h5", urlsplit(address).port
     wait_until(lambda: listening_addresses(port), 120)
     assert listening_addresses(port) <= {"0100007F", "00000000000000000000000001000000"}  # localhost, of IPv4 and IPv6
 

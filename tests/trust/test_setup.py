@@ -1,0 +1,168 @@
+"""scripts/setup.sh: whose address it takes for Debian's mirror, what it takes back, and what it asks the linker."""
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+SETUP = Path(__file__).parents[2] / "scripts/setup.sh"
+RELEASE = """Origin: {origin}
+Codename: bookworm
+Suite: {suite}
+Components: main
+Architectures: amd64 arm64
+Date: Sat, 01 Jan 2022 00:00:00 UTC
+"""
+needs_apt = pytest.mark.skipif(shutil.which("apt-get") is None, reason="no apt on this machine")
+
+
+def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Bash that has sourced the script, with all places of the system under a folder; `as_root` needs no root there."""
+    places = {
+        "BACKPORTS": folder / "sources.list.d/manifeel-backports.list",
+        "LAVAPIPE": folder / "lavapipe",
+        "LAVAPIPE_ICD": folder / "icd.d/lvp_icd.json",
+    }
+    lines = [f"{name}='{place}'" for name, place in places.items()]
+    lines = [f"source '{SETUP}'", *lines, 'as_root() { "$@"; }', program]
+    environment = os.environ | {"APT_CONFIG": str(folder / "apt.conf")}
+    return subprocess.run(["bash", "-c", "\n".join(lines)], env=environment, capture_output=True, text=True, check=False)
+
+
+def repository(folder: Path, origin: str, suite: str = "bookworm") -> str:
+    """A repository on the disk with an empty list of packages; its address."""
+    lists = folder / "dists" / suite / "main"
+    for machine in ("amd64", "arm64"):
+        (lists / f"binary-{machine}").mkdir(parents=True)
+        (lists / f"binary-{machine}/Packages").write_text("")
+    (lists.parent / "Release").write_text(RELEASE.format(origin=origin, suite=suite))
+    return f"file:{folder}/"
+
+
+@pytest.fixture
+def apt(tmp_path):
+    """A folder in the place of /etc/apt, and apt's lists beside it."""
+    for name in ("sources.list.d", "lists/partial", "cache/archives/partial", "icd.d"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "apt.conf").write_text(
+        f'Dir::Etc "{tmp_path}"; Dir::Etc::sourcelist "{tmp_path}/sources.list";\n'
+        f'Dir::Etc::sourceparts "{tmp_path}/sources.list.d";\n'
+        f'Dir::State::Lists "{tmp_path}/lists"; Dir::Cache "{tmp_path}/cache"; APT::Sandbox::User "root";\n'
+        'Acquire::Retries "0"; Acquire::Check-Valid-Until "false";\n'
+    )
+    return tmp_path
+
+
+def one_line(uri: str, suite: str = "bookworm") -> str:
+    return f"deb [trusted=yes] {uri} {suite} main\n"
+
+
+def deb822(uri: str, suite: str = "bookworm") -> str:
+    return f"Types: deb\n# a comment\nURIs: {uri}\nSuites: {suite}\nComponents: main\nTrusted: yes\n"
+
+
+@needs_apt
+@pytest.mark.parametrize("form", [one_line, deb822])
+def test_a26_the_mirror_is_debians_and_not_that_of_the_first_source(form, apt):
+    """Of the repositories that call themselves bookworm, with a component main; the first one is Google's."""
+    ending = "list" if form is one_line else "sources"
+    google = repository(apt / "packages.cloud.google.com/debian", "Google")
+    debian = repository(apt / "mirror", "Debian")
+    (apt / f"sources.list.d/cloudsdk.{ending}").write_text(form(google))
+    (apt / f"sources.list.d/debian.{ending}").write_text(form(debian))
+    done = run("apt-get update -q >/dev/null; debians_mirror bookworm", apt)
+    assert done.stdout.strip() == debian, done.stderr
+
+
+@needs_apt
+def test_a26_without_a_source_of_debian_there_is_no_mirror(apt):
+    (apt / "sources.list.d/cloudsdk.list").write_text(one_line(repository(apt / "google", "Google")))
+    (apt / "sources.list.d/never-fetched.list").write_text(one_line("file:/nowhere/debian"))
+    done = run("apt-get update -q >/dev/null 2>&1 || true; debians_mirror bookworm", apt)
+    assert (done.returncode, done.stdout) == (0, "")
+
+
+@needs_apt
+def test_a26_what_debian_has_not_signed_is_not_added(apt):
+    """A mirror whose list of packages nobody signed, though it claims to be Debian's."""
+    (apt / "os-release").write_text("ID=debian\nVERSION_ID=12\n")
+    forged = repository(apt / "forged", "Debian")
+    repository(apt / "forged", "Debian Backports", "bookworm-backports")
+    (apt / "sources.list.d/debian.list").write_text(one_line(forged))
+    done = run(
+        "OS_RELEASE=$1; apt-get update -q >/dev/null; add_mesa_source || echo refused".replace("$1", f"{apt}/os-release"), apt
+    )
+    assert "refused" in done.stdout, done.stdout + done.stderr
+    assert not (apt / "sources.list.d/manifeel-backports.list").exists()
+    assert subprocess.run(["apt-get", "update", "-q"], env=os.environ | {"APT_CONFIG": str(apt / "apt.conf")}).returncode == 0
+
+
+@needs_apt
+def test_a26_backports_that_are_there_are_not_added_again(apt):
+    """Two sources of one suite with different keys would stop apt altogether."""
+    (apt / "os-release").write_text("ID=debian\nVERSION_ID=12\n")
+    there = repository(apt / "mirror", "Debian Backports", "bookworm-backports")
+    (apt / "sources.list.d/debian.list").write_text(one_line(there, "bookworm-backports"))
+    program = f"OS_RELEASE={apt}/os-release; apt-get update -q >/dev/null; add_mesa_source; echo ${{MESA_RELEASE[*]}}"
+    done = run(program, apt)
+    assert done.stdout.strip() == "-t bookworm-backports", done.stderr
+    assert not (apt / "sources.list.d/manifeel-backports.list").exists()
+
+
+@needs_apt
+def test_a26_undo_takes_back_what_was_added_and_nothing_else(apt):
+    other, added = apt / "sources.list.d/debian.list", apt / "sources.list.d/manifeel-backports.list"
+    other.write_text("")
+    added.write_text(one_line("file:/nowhere", "bookworm-backports"))
+    (apt / "lavapipe").mkdir()
+    (apt / "lavapipe/libvulkan_lvp.so").write_text("")
+    for name in ("lvp_icd.json", "nvidia_icd.json"):
+        (apt / "icd.d" / name).write_text("{}")
+    done = run("undo", apt)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in (apt / "icd.d").iterdir()) == ["nvidia_icd.json"]
+    assert not added.exists()
+    assert not (apt / "lavapipe").exists()
+    assert other.exists()
+    assert "Left:" in done.stdout
+    assert "Removed: nothing" in run("undo", apt).stdout
+
+
+def test_a26_without_root_undo_says_what_it_cannot_remove(apt):
+    (apt / "sources.list.d/manifeel-backports.list").write_text("")
+    done = run("as_root() { return 1; }; undo", apt)
+    assert done.returncode == 1
+    assert "cannot be removed" in done.stdout
+
+
+def test_a26_an_unknown_flag_installs_nothing():
+    done = subprocess.run([SETUP, "--undoo"], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "usage" in done.stderr
+
+
+def test_a27_a_long_list_of_libraries_is_read_as_a_whole(apt, tmp_path):
+    """`ldconfig` that says more than a pipe holds, and dies of a reader that has left."""
+    program = tmp_path / "bin/ldconfig"
+    program.parent.mkdir()
+    program.write_text(
+        f"#!/bin/bash\necho call >>'{tmp_path}/calls'\n"
+        'for k in {1..4000}; do echo "libvulkan.so.1 of line $k" || exit 1; done\n'
+    )
+    program.chmod(0o755)
+    ask = "for k in {1..20}; do has_library libvulkan.so.1 || echo missing; done; has_library libnone.so || echo none"
+    done = run(f"PATH={program.parent}:$PATH\n{ask}", apt)
+    assert done.stdout.split() == ["none"]
+    assert (tmp_path / "calls").read_text().split() == ["call"]
+
+
+def test_b10_the_image_is_named_by_its_content_and_has_git():
+    lines = (SETUP.parents[1] / "Dockerfile").read_text().splitlines()
+    (base,) = [line for line in lines if line.startswith("FROM ")]
+    name, _, digest = base.partition("@sha256:")
+    assert name.startswith("FROM python:3.")
+    assert len(digest) == 64
+    assert int(digest, 16)
+    assert any("apt-get install" in line and " git " in line for line in lines)
