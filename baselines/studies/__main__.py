@@ -18,6 +18,7 @@ from typing import Any
 
 import ray
 import tyro
+from ray._private import ray_constants
 from ray.exceptions import RayError, RayTaskError
 from rich.console import Console, Group
 from rich.live import Live
@@ -120,6 +121,8 @@ def _start_ray(address: str | None) -> None:
     address = address or "local"
     if address == "local":
         settings = dict(_node_ip_address=LOOPBACK)
+        os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"  # for the processes that Ray starts
+        ray_constants.ENABLE_RAY_CLUSTER = False  # else it takes this machine's outer address for 127.0.0.1, but on macOS
         os.environ.pop("RAY_AUTH_MODE", None)  # where it is not set, a Ray that is started here asks for a token
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         for name, value in RAY_SETTINGS.items():
