@@ -116,9 +116,13 @@ class WorkerPool(Generic[State, Task]):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def as_finished(self) -> Iterator[Finished[Task]]:
-        """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile."""
+        """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile.
+
+        Of tasks that finish at the same time, those that went well come first: an error of another may end the caller.
+        """
         while self._running:
-            for future in wait(self._running, return_when=FIRST_COMPLETED).done:
+            finished = wait(self._running, return_when=FIRST_COMPLETED).done
+            for future in sorted(finished, key=lambda future: future.exception() is not None):
                 yield Finished(self._running.pop(future), future)
 
 

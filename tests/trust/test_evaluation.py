@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 from manifeel_ms3.errors import InUseError, InvalidFileError, ManifeelError
@@ -68,6 +69,16 @@ def wait_for_episodes(journal: Path, number: int) -> None:
         time.sleep(0.1)
 
 
+def alive(group: int) -> list[int]:
+    """The processes of a group that have not ended."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
+    return found
+
+
 # ------------------------------------------------------------------------------- interruptions
 
 
@@ -94,8 +105,9 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
             assert code == 130
             assert f"1 of 3 episodes are finished and kept in {journal}; the same command goes on" in errors.read_text()
             assert "Traceback" not in errors.read_text()
-            with pytest.raises(ProcessLookupError):
-                os.killpg(process.pid, 0)  # no process of it is left
+            while alive(process.pid):  # the resource tracker of multiprocessing ends a moment after its parent
+                assert time.monotonic() < begin + PATIENCE, "a process is left"
+                time.sleep(0.1)
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
@@ -131,11 +143,12 @@ def evaluate_without_simulator(out: Path, seeds: list[int], report: int) -> None
         write_result(result_of(PEG, {}, dict(policy_name="a:B", obs_mode="rgb"), journal.in_order), out)
 
 
-def test_a_hundred_kills_lose_no_episode(tmp_path, record_property):
+@pytest.mark.parametrize("kills", [10, pytest.param(100, marks=pytest.mark.slow)])
+def test_kills_at_random_moments_lose_no_episode(kills, tmp_path, figure):
     seeds, chance, interrupted = evaluation_seeds(50), random.Random(0), 0
     undisturbed = tmp_path / "undisturbed.json"
     evaluate_without_simulator(undisturbed, seeds, os.open(os.devnull, os.O_WRONLY))
-    for number in range(100):
+    for number in range(kills):
         out = tmp_path / f"{number}.json"
         reader, writer = os.pipe()
         child = os.fork()
@@ -156,8 +169,7 @@ def test_a_hundred_kills_lose_no_episode(tmp_path, record_property):
         evaluate_without_simulator(out, seeds, os.open(os.devnull, os.O_WRONLY))
         assert out.read_text() == undisturbed.read_text()
         assert not journal_of(out).exists()
-    record_property("interrupted", interrupted)
-    assert interrupted > 20
+    figure("share of the kills that interrupted an evaluation", interrupted / kills, at_least=0.1)
 
 
 def test_a_line_that_broke_off_is_dropped_and_what_is_broken_is_refused(tmp_path):
