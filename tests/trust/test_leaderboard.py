@@ -64,7 +64,7 @@ def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> b
         finally:
             os._exit(0)
     ended = (0, 0)
-    while not ended[0] and len(list((board / ".incoming").rglob("*.json"))) < files:
+    while not ended[0] and sum(len(names) for _, _, names in os.walk(board / ".incoming")) < files:
         ended = os.waitpid(child, os.WNOHANG)
     time.sleep(delay)
     if not ended[0]:
@@ -91,7 +91,7 @@ def test_a10_a_submission_that_is_killed_while_it_is_taken_is_whole_or_absent(tm
         assert len(rows_on(board)) == 1
         assert not (board / ".incoming").exists()
     figure(f"of {kills} processes killed while they take a submission, number hit at work", killed, at_least=kills // 3)
-    figure(f"of {kills} processes killed while they take a submission, number that left it whole", whole)
+    figure(f"of {kills} processes killed while they take a submission, number that left it whole", whole, at_least=0)
 
 
 def test_a10_a_copy_that_fails_leaves_nothing(folder, tmp_path):
