@@ -88,9 +88,10 @@ class PolicyAgent:
         self.policy = build_policy(self.config, policy_class).to(device).eval()
         load_weights(self.policy, weights, checkpoint)
         self.device, self.seed = torch.device(device), seed
-        self.inference_steps = inference_steps or self.config.get("inference_steps")
-        if not isinstance(self.inference_steps, int) or self.inference_steps < 1:
-            raise CheckpointError(f"{checkpoint}: inference_steps={self.inference_steps!r} must be a positive whole number")
+        steps = inference_steps or self.config.get("inference_steps")
+        if not isinstance(steps, int) or steps < 1:
+            raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a positive whole number")
+        self.inference_steps = steps
         self.reset()
 
     def reset(self) -> None:

@@ -4,6 +4,8 @@ HDF5 lets a file name other files (external storage, virtual data sets, links) a
 trajectory file needs neither: the only links allowed are those of an index to the episodes beside it.
 """
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalIterable=false, reportOptionalMemberAccess=false
+# (h5py annotates whatever a group can hold, and leaves its low-level modules out)
 import math
 from pathlib import Path
 from typing import Any
@@ -59,7 +61,7 @@ def _linked_episode(link: Any, path: Path, episodes: Path) -> Path:
     return target
 
 
-def _check_tree(file: h5py.File, path: Path, skip: set[str] = frozenset()) -> None:  # pyright: ignore[reportArgumentType]
+def _check_tree(file: h5py.File, path: Path, skip: set[str] = frozenset()) -> None:
     """Check every link and every array of a file."""
     todo: list[Any] = [file]
     seen, stored = {h5py.h5o.get_info(file["/"].id).addr}, 0
