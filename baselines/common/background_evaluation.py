@@ -62,7 +62,8 @@ class BackgroundEvaluation:
         self.folder.mkdir(parents=True, exist_ok=True)
         result = self._result(checkpoint).absolute()
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
-        command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), *self._arguments]
+        # --overwrite: what an interrupted run evaluated of another checkpoint of this step is of no use
+        command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite", *self._arguments]
         folder = None if NOT_FROM_HERE else self.folder  # without the option, one in which only we have written
         environment = os.environ | dict(PYTHONSAFEPATH="1")  # its workers are started by Python, too
         with result.with_suffix(".log").open("w") as output:

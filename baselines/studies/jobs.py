@@ -24,6 +24,7 @@ from manifeel_ms3.demonstrations import record
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.journal import OtherEvaluationError
 from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
@@ -122,7 +123,11 @@ def _evaluate(job: Job, root: Path, workers: int) -> int:
     for checkpoint in chosen:
         out = job.folder(root) / f"{checkpoint.name}.json"
         if not is_result_of(checkpoint, out):
-            evaluate.main(tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out))))
+            args = tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out)))
+            try:
+                evaluate.main(args)
+            except OtherEvaluationError:  # begun on another machine or with other versions: not to be mixed with these
+                evaluate.main(replace(args, overwrite=True))
     return len(chosen) * settings["episodes"]
 
 
