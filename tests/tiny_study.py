@@ -9,7 +9,7 @@ grids:
     demos: 1
     preset: cpu
     task_args: {fit: loose, max_episode_steps: 110, randomization: {socket_xy: 0.0, start_xy: 0.0, start_z: 0.0}}
-    train: {steps: 12, save-every: 6, warmup-steps: 2, batch-size: 4, policy.channels: [8, 16]}
+    train: {steps: 12, save-every: 6, warmup-steps: 2, batch-size: 4, policy.down-dims: [8, 16]}
     episodes: 1
     checkpoints: 2
 """
