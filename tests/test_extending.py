@@ -217,5 +217,5 @@ def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
     config = dict(policy_name="knitting", env_id=PEG, obs_mode="tacff", cameras=[], tactile_sensors=["right"])
     (tmp_path / "config.json").write_text(json.dumps(config))
     said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER)
-    assert "its policy is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
+    assert "is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
     assert "['diffusion_policy', 'equivariant_diffusion_policy', 'flow_matching']" in said
