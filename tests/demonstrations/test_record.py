@@ -63,6 +63,15 @@ def contents(path: Path) -> dict[str, bytes]:
     return out
 
 
+def wait_for_an_episode(path: Path) -> None:
+    """Wait until a recording, which begins with an empty file, holds an episode."""
+    for _ in range(600):
+        if path.is_file() and read_header(path)["episodes"]:
+            return
+        time.sleep(0.1)
+    raise AssertionError(f"{path} holds no episode after a minute")
+
+
 def test_any_number_of_workers_gives_the_same_episodes(recorded, tmp_path):
     two = run(tmp_path / "trajectory.h5", num=3, workers=2)
     assert contents(two) == contents(recorded)
@@ -97,10 +106,7 @@ def test_killed_run_keeps_every_finished_episode_and_goes_on(recorded, tmp_path)
     ]
     command += ["--cameras", "--tactile-sensors", "right", "--env-kwargs", json.dumps(EASY)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    for _ in range(600):
-        if path.is_file():
-            break
-        time.sleep(0.1)
+    wait_for_an_episode(path)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     finished = read_demonstrations(path, KEYS, PEG)
@@ -200,7 +206,7 @@ def test_the_header_names_the_module_that_registers_the_task(monkeypatch):
     env_class = type("TheirEnv", (), dict(__module__="their_package.tasks"))
     their = TaskSpec("Their-v1", env_class, "insertion", max_episode_steps=7, paper_demos=1)
     monkeypatch.setitem(registry._SPECS, "Their-v1", their)
-    assert make_header("Their-v1", {})["env_info"]["env_id"] == "their_package:Their-v1"
+    assert make_header("Their-v1", {})["env_info"]["env_id"] == "their_package.tasks:Their-v1"
     assert make_header(PEG, {})["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
 
 
