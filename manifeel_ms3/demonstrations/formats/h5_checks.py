@@ -4,7 +4,7 @@ HDF5 lets a file name other files (external storage, virtual data sets, links) a
 trajectory file needs neither: the only links allowed are those of an index to the episodes beside it.
 """
 
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalIterable=false, reportOptionalMemberAccess=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (h5py annotates whatever a group can hold, and leaves its low-level modules out)
 import math
 from pathlib import Path
@@ -110,7 +110,8 @@ def _check_episode(episode: Any, path: Path) -> None:
         if name in episode:
             _require(isinstance(episode[name], h5py.Group), path, episode, name)
     arrays = dict(actions=2) | dict.fromkeys(PER_STEP, 1)
-    for sensor in episode.get("obs/sensor_data", {}):
+    sensors: Any = episode.get("obs/sensor_data", {})
+    for sensor in sensors:
         place = f"obs/sensor_data/{sensor}"
         _require(isinstance(episode[place], h5py.Group), path, episode, place)
         arrays |= {f"{place}/rgb": 4, f"{place}/force_field": 4}
@@ -119,7 +120,8 @@ def _check_episode(episode: Any, path: Path) -> None:
             item = episode[name]
             right = isinstance(item, h5py.Dataset) and item.ndim == axes and len(item) > 0
             _require(right and (axes < 4 or item.shape[-1] == 3), path, episode, name)  # images and forces have 3 channels
-    for name, item in episode.get("env_states/actors", {}).items():
+    actors: Any = episode.get("env_states/actors", {})
+    for name, item in actors.items():
         right = isinstance(item, h5py.Dataset) and item.ndim == 2 and len(item) > 0 and item.shape[1] >= POSE_SIZE
         _require(right, path, episode, f"env_states/actors/{name}")
 
