@@ -540,11 +540,15 @@ edits = st.sampled_from([(file, place) for file, places in PLACES.items() for pl
 
 
 def put(content, place: tuple, value) -> None:
+    """Put a value into a place of a tree, unless an earlier change has removed the place."""
     for name in place[:-1]:
-        content = content[name] if isinstance(content, list) else content.setdefault(name, {})
-        if not isinstance(content, (dict, list)):
+        if isinstance(content, dict):
+            content = content.setdefault(name, {})
+        elif isinstance(content, list) and name in range(len(content)):
+            content = content[name]
+        else:
             return
-    if isinstance(content, dict) or place[-1] in range(len(content)):
+    if isinstance(content, dict) or (isinstance(content, list) and place[-1] in range(len(content))):
         content[place[-1]] = value
 
 
