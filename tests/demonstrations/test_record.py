@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -215,8 +216,9 @@ def test_a_worker_that_is_killed_loses_no_finished_episode(recorded, tmp_path):
 
     def kill_workers() -> None:
         for process in psutil.Process().children():
-            if "spawn_main" in " ".join(process.cmdline()):
-                process.kill()
+            with suppress(psutil.NoSuchProcess):  # an earlier test's process that has ended, but was not waited for
+                if "spawn_main" in " ".join(process.cmdline()):
+                    process.kill()
 
     args = record.Args(PEG, 3, 1, 0, path, "tacff", cameras=(), tactile_sensors=("right",), env_kwargs=json.dumps(EASY))
     with pytest.raises(WorkFailedError, match="ended with exit code -9"):
