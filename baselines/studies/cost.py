@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from baselines.common.agent import spec_of
+from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE, POSE_FEATURES
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
@@ -214,8 +215,8 @@ def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, t
     preset, *rest = flags
     args = preset_cli(policy_spec(policy), [preset, "--demos", "-", *rest])
     spec, horizon, batch = spec_of(vars(args)), args.policy.obs_horizon, args.batch_size
-    network: Any = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE)
-    network.to(args.device, memory_format=torch.channels_last)  # as in training; torch's stubs do not know the argument
+    network = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE).to(args.device)
+    lay_out_channels_last(network)  # as in training
     images = torch.rand(batch, horizon, spec.image_size, spec.image_size, 3, device=args.device)
     obs = {key: (255 * images).to(torch.uint8) for key in spec.images}
     field = (*TactileSensorConfig.taxel_shape, 3)
