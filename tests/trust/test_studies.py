@@ -114,6 +114,7 @@ def listening(process: psutil.Process) -> dict[tuple[str, int], str]:
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
+@pytest.mark.slow  # a whole Ray and a second one that is refused: minutes
 def test_b03_and_a13_ray_is_reached_from_here_alone_and_imports_nothing_from_the_current_folder(study, tmp_path):
     for name in ("torch.py", "json.py"):
         (tmp_path / name).write_text(f"import pathlib\npathlib.Path({str(tmp_path / 'executed')!r}).write_text({name!r})\n")
