@@ -24,6 +24,17 @@ class FileWriteError(ManifeelError, OSError):
 
 
 @contextmanager
+def _failures_named(path: Path) -> Iterator[None]:
+    """Turn a failure of the file system into an error that names the path which is written."""
+    try:
+        yield
+    except OSError as error:
+        raise FileWriteError(
+            f"{path} cannot be written ({error}); make room or get the permission, or give another path"
+        ) from error
+
+
+@contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
     """Replace a file as a whole once the context has written the temporary path that it is given.
 
@@ -39,15 +50,12 @@ def atomic_write(path: Path) -> Iterator[Path]:
     path = Path(path)
     partial = path.with_name(path.name + PARTIAL)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        _flush(partial)
-        partial.replace(path)
-        _flush(path.parent)
-    except OSError as error:
-        raise FileWriteError(
-            f"{path} cannot be written ({error}); make room or get the permission, or give another path"
-        ) from error
+        with _failures_named(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            yield partial
+            _flush(partial)
+            partial.replace(path)
+            _flush(path.parent)
     finally:
         if partial.is_file():
             partial.unlink()
@@ -66,17 +74,14 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     path = Path(path)
     partial = _hidden(path)
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-        yield partial
-        for entry in (*partial.rglob("*"), partial):
-            _flush(entry)
-        partial.rename(path)
-        _flush(path.parent)
-    except OSError as error:
-        raise FileWriteError(
-            f"{path} cannot be written ({error}); make room or get the permission, or give another path"
-        ) from error
+        with _failures_named(path):
+            shutil.rmtree(partial, ignore_errors=True)
+            partial.mkdir(parents=True)
+            yield partial
+            for entry in (*partial.rglob("*"), partial):
+                _flush(entry)
+            partial.rename(path)
+            _flush(path.parent)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
 
