@@ -151,6 +151,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_pat
     assert all(torch.isfinite(tensor).all() for path in weights for tensor in read_tensors(path).values())
 
 
+@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
 def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
     run.again(run_dir=tmp_path, precision="bf16")
     for half, full in zip(log_of(tmp_path), log_of(run.args.run_dir), strict=True):
