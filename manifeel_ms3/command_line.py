@@ -94,7 +94,7 @@ def json_object(flag: str, given: str) -> dict[str, Any]:
     try:
         value = json.loads(given)
     except json.JSONDecodeError as error:
-        raise InvalidArgumentError(f'{flag} {given!r} is not json ({error}); quote it like \'{{"fit": "loose"}}\'') from None
+        raise InvalidArgumentError(f'{flag} {given!r} is not json ({error}); quote it like \'{{"fit": "tight"}}\'') from None
     if not isinstance(value, dict):
-        raise InvalidArgumentError(f'{flag} {given!r} is not a json object like \'{{"fit": "loose"}}\'')
+        raise InvalidArgumentError(f'{flag} {given!r} is not a json object like \'{{"fit": "tight"}}\'')
     return value

@@ -44,7 +44,7 @@ def test_a_command_runs(capsys):
 
 def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, capsys):
     def refuse(_):
-        one_of("fit", "huge", ("tight", "loose"))
+        one_of("fit", "huge", ("paper", "tight"))
 
     assert run(refuse, None) == 1
     assert "fit='huge' is unknown" in capsys.readouterr().err
@@ -106,7 +106,7 @@ def test_a_command_without_its_extra_is_one_line(monkeypatch, capsys):
 def test_what_a_worker_refuses_is_a_message_too(tmp_path, capsys):
     arguments = ["record", PEG, "-n", "4", "--obs-mode", "none", "--out", str(tmp_path / "peg.h5"), "--env-kwargs"]
     assert cli.main([*arguments, '{"fit": "huge"}']) == 1
-    assert "error: fit='huge' is unknown; choose from ['tight', 'loose']" in capsys.readouterr().err
+    assert "error: fit='huge' is unknown; choose from ['paper', 'tight']" in capsys.readouterr().err
     assert cli.main([*arguments, "{fit: huge}"]) == 1
     assert "--env-kwargs '{fit: huge}' is not json" in capsys.readouterr().err
 

@@ -8,7 +8,7 @@ grids:
     seeds: [0]
     demos: 1
     preset: cpu
-    task_args: {fit: loose, max_episode_steps: 110, randomization: {socket_xy: 0.0, start_xy: 0.0, start_z: 0.0}}
+    task_args: {fit: paper, max_episode_steps: 110, randomization: {socket_xy: 0.0, start_xy: 0.0, start_z: 0.0}}
     train: {steps: 12, save-every: 6, warmup-steps: 2, batch-size: 4, policy.down-dims: [8, 16]}
     episodes: 1
     checkpoints: 2

@@ -69,6 +69,7 @@ class LimitedLeadEEPoseController(PDEEPoseController):
         delta = self._preprocess_action(action)
         turn = delta.new_zeros(len(delta), 3)
         turn[:, list(self.config.rotation_axes)] = delta[:, 3:]
+        turn[:, list(self.config.locked_axes)] = 0.0
         base = self.commanded_pose
         self._target_pose = Pose.create_from_pq(
             base.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), base.q)
@@ -129,6 +130,8 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     """Rotation of an action of 1, in rad (public code of the paper)."""
     rotation_axes: Sequence[int] = (0, 1, 2)
     """Axes of the base frame that have a rotation action; (2,) is yaw alone."""
+    locked_axes: Sequence[int] = ()
+    """Axes of the base frame whose rotation action is ignored, as the paper's public code sets it to zero."""
     target_lead_limit_pos: float = 0.006
     """Largest lead of the target over the tool before a command is added, in m. The arm's lag at full speed is 5.8 mm (joint
     time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds the force near 16 N."""

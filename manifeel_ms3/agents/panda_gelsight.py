@@ -49,6 +49,8 @@ _TURNS = ("roll", "pitch", "yaw")
 ACTION_AXES = {
     "pd_ee_delta_pose": ("x", "y", "z", *_TURNS, "gripper"),
     "pd_ee_delta_pose_fixed_gripper": ("x", "y", "z", *_TURNS),
+    "pd_ee_delta_pose_fixed_roll_pitch": ("x", "y", "z", *_TURNS, "gripper"),
+    "pd_ee_delta_pose_fixed_rotation": ("x", "y", "z", *_TURNS, "gripper"),
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
 """Meaning of the components of an action by controller, in their order; rotations are about the base's axes."""
@@ -106,6 +108,8 @@ class PandaGelSight(BaseAgent):
             urdf_path=self.urdf_path,
         )
         delta_pose = LimitedLeadEEPoseControllerConfig(**pose)
+        level = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1))
+        unturned = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1, 2))
         delta_yaw = LimitedLeadEEPoseControllerConfig(**pose, rotation_axes=(2,))
         gripper = PDJointPosMimicControllerConfig(
             self.gripper_joint_names,
@@ -137,6 +141,8 @@ class PandaGelSight(BaseAgent):
             dict(
                 pd_ee_delta_pose=dict(arm=delta_pose, gripper=gripper),  # 7-D
                 pd_ee_delta_pose_fixed_gripper=dict(arm=delta_pose, gripper=hold),  # 6-D
+                pd_ee_delta_pose_fixed_roll_pitch=dict(arm=level, gripper=gripper),  # 7-D, of which two do nothing
+                pd_ee_delta_pose_fixed_rotation=dict(arm=unturned, gripper=gripper),  # 7-D, of which three do nothing
                 pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper),  # 5-D
                 pd_joint_pos=dict(arm=joints, gripper=gripper),
             )

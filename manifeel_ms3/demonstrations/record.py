@@ -49,7 +49,7 @@ class Args:
     tactile_sensors: tuple[str, ...] = SIDES
     """Sides of the tactile sensors to record."""
     env_kwargs: str = "{}"
-    """Further arguments of the task as json, such as '{"fit": "loose", "randomization": {"socket_xy": 0.01}}'."""
+    """Further arguments of the task as json, such as '{"fit": "tight", "randomization": {"socket_xy": 0.01}}'."""
     max_tries: int = 10
     """Number of seeds to try before giving up, as a multiple of `num`."""
 

@@ -79,7 +79,7 @@ class Args:
     step_timeout: float = 60.0
     """Longest time that the policy may take for one action, in s."""
     env_kwargs: str = "{}"
-    """Arguments of the task as json, such as '{"fit": "loose"}'."""
+    """Arguments of the task as json, such as '{"fit": "tight"}'."""
     videos: tuple[int, ...] = ()
     """Numbers of the episodes, counted from 0, that are recorded as videos with all cameras and touch; the videos go into the
     folder videos beside the result."""

@@ -10,11 +10,11 @@ from manifeel_ms3.tasks import VisuotactileEnv
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
 from .ball_sorting import BallSortingExpert as BallSortingExpert
-from .insertion import GearExpert as GearExpert
-from .insertion import InsertionExpert as InsertionExpert
+from .leaning_insertion import LeaningInsertionExpert as LeaningInsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
 from .screwing import BulbExpert as BulbExpert
 from .screwing import ScrewingExpert as ScrewingExpert
+from .upright_insertion import UprightInsertionExpert as UprightInsertionExpert
 
 
 class Expert(Protocol):

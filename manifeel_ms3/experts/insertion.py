@@ -1,4 +1,4 @@
-"""Demonstrator of the insertion tasks: approach, touch, feel for the hole with a tilted plug, align, press."""
+"""What the demonstrators of the insertion tasks share: seeing the socket, the plug in the hand, and pressing the plug in."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
-from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
@@ -29,40 +28,23 @@ class InsertionExpertConfig:
     return_tolerance: float = 2e-3
     """The same for the way back before a new attempt, in m. Tuned."""
 
-    search_radius: float = 0.0012
-    """Distance of the second and later landing places from the first, in m. Tuned."""
-    search_places: int = 6
-    """Number of landing places on the circle of that radius. Tuned."""
-    landing_height: float = 0.003
-    """Height over the rim from which the leading corner is lowered, in m. Tuned."""
-    landing_depth: float = 0.006
-    """Largest distance by which it is lowered, in m. Tuned."""
-    landed_in_hole: float = 0.0004
-    """Depth of the leading corner below the rim, in m, beyond which it is in the hole. Tuned."""
-
-    feel_force: float = 2.5
-    """Force on the plug, in N, that is a wall if the plug no longer moves: friction pushes back, too. Tuned."""
-    wall_force: float = 7.0
-    """Force on the plug, in N, that is a wall in any case. Tuned."""
-    feel_step: float = 6e-4
-    """Step towards the walls, in m per step. Tuned."""
-    stalled: float = 2e-4
-    """Motion in one step, in m, below which the plug no longer moves. Tuned."""
-    feel_steps: int = 60
-    """Number of steps after which the search for the walls ends. Tuned."""
     feel_press: float = 4.5
-    """Downward force while the plug is pushed to the walls or leans, in N. Tuned."""
-
+    """Downward force while the plug leans, is led to a corner or slides about on top, in N. Tuned."""
     upright: float = float(np.deg2rad(0.7))
     """Angle, in rad, below which the plug counts as upright. Tuned."""
     leaning: float = 3.0
     """Multiple of `upright` beyond which the plug is pressed with `feel_press` only. Tuned."""
-    stand_up_turn: float = 0.012
-    """Rotation while the plug is stood up, in rad per step. Tuned."""
-    stand_up_steps: int = 30
-    """Number of steps for each of the two rotations that stand the plug up. Tuned."""
-    stand_up_push: tuple[float, float, float] = (4e-4, 4e-4, -5e-4)
-    """Offset of the command into the hole's corner while the plug is stood up, in m. Tuned."""
+    turn_rate: float = 0.012
+    """Rotation of the plug towards upright while it is in contact, in rad per step. Tuned."""
+
+    disturbance_rate: float = 0.04
+    """Chance, in each step, of a push of the hand while the plug is free: one or two in an episode."""
+    disturbance: float = 0.5
+    """Largest addition of a push to each axis of the action, as a share of the action's range."""
+    disturbance_steps: int = 3
+    """Number of steps that a push lasts."""
+    free_height: float = 0.005
+    """Height of the plug's end over the rim, in m, above which the hand is disturbed."""
 
     press_force: float = 10.0
     """Downward force that presses the plug in, in N. Tuned."""
@@ -95,17 +77,13 @@ class InsertionExpertConfig:
     """Number of steps without progress after which the amplitude has doubled, its limit. Tuned."""
 
 
-@register_demonstrator(
-    "ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1", "ManiFeel-PegReorientation-v1"
-)
 class InsertionExpert:
-    """Knows the parts, sees roughly where the socket is, and finds the hole by touch.
-
-    It leans the plug, so that one corner goes ahead into the hole, pushes it into the hole's own corner until both walls are
-    felt, stands the plug up in it, and presses it down: what people do with a tight fit.
+    """Knows the parts, sees roughly where the socket is, and goes by what it feels.
 
     Two things are read from the simulator instead of from images: the socket's position, with an error of up to
     `SkillConfig.sight_error`, and the plug's pose in the hand, with an error of its pitch of up to `grasp_error`.
+
+    While the plug is free, the hand is disturbed at random, so that the demonstrations show corrections.
     """
 
     config = InsertionExpertConfig()
@@ -116,13 +94,9 @@ class InsertionExpert:
         self.skills = Skills(env)
         self._pitch_error = Rotation.from_euler("y", self._rng.uniform(-1, 1) * self.config.grasp_error)
         self._see_socket()
-        fit = env.fit
-        self._corner = np.array([fit.corner[0], -fit.corner[1], fit.reach])  # plug frame: z ahead, y turned over
-        self._end = np.array([0.0, 0.0, fit.reach])
-        self._rim = self.socket[2] + fit.rim
-        down_x, down_y = np.sign(fit.corner) * fit.lean
-        self._lean = Rotation.from_euler("xy", [-down_y, down_x])
-        self._lean_on_edge = Rotation.from_euler("x", -down_y)
+        self._end = np.array([0.0, 0.0, env.fit.reach])
+        self._rim = self.socket[2] + env.fit.rim
+        self._disturbance, self._disturbed_steps = np.zeros(6), 0
 
     def _see_socket(self) -> None:
         """Perceive the socket's position, with a new error."""
@@ -162,66 +136,34 @@ class InsertionExpert:
 
     def actions(self) -> Actions:
         """Actions of one episode, without end: once the plug sits, the demonstrator goes on holding it down."""
-        skills, config = self.skills, self.config
+        for action in self._undisturbed():
+            yield np.clip(action + self._disturb(), -1.0, 1.0)
+
+    def _undisturbed(self) -> Actions:
         yield np.zeros(6)
-        skills.tare()
-        lean = self._lean
+        self.skills.tare()
         while True:
-            over = np.array([*(self.socket[:2] + self.fit.aim), self._rim])
-            start = self._tool_for(self._corner, above(over, config.hover_height), lean)
-            yield from skills.reach(*start, tolerance=config.approach_tolerance)
-            yield from self._touch_down(over, lean)
-            yield from self._feel_corner(lean)
-            yield from self._stand_up()
+            yield from self._enter()
             yield from self._press()
-            here, facing = skills.commanded
-            yield from skills.reach(above(here, config.hover_height), facing, tolerance=config.return_tolerance)
+            here, facing = self.skills.commanded
+            yield from self.skills.reach(above(here, self.config.hover_height), facing, tolerance=self.config.return_tolerance)
             self._see_socket()
 
-    def _touch_down(self, over: np.ndarray, lean: Rotation) -> Actions:
-        """Lower the leading corner; where it lands on the rim instead of in the hole, try the next place of a circle."""
-        skills, config = self.skills, self.config
-        angles = np.arange(config.search_places) * np.pi / (config.search_places / 2)
-        circle = [(config.search_radius, angle) for angle in angles]
-        for radius, angle in [(0.0, 0.0), *circle]:
-            shift = radius * np.array([np.cos(angle), np.sin(angle), 0.0])
-            start, facing = self._tool_for(self._corner, above(over + shift, config.landing_height), lean)
-            yield from skills.reach(start, facing, tolerance=config.approach_tolerance)
-            yield from skills.lower_until_contact(facing, lowest=start[2] - config.landing_depth)
-            if self._place(self._corner)[2] < self._rim - config.landed_in_hole:
-                return
+    def _enter(self) -> Actions:
+        """Bring the plug's end into the hole, or onto its rim."""
+        raise NotImplementedError
 
-    def _feel_corner(self, lean: Rotation) -> Actions:
-        """Push the leading corner towards +x and +y, lightly pressed down, until both walls push back."""
-        skills, config = self.skills, self.config
-        last = self._place(self._corner)
-        for _ in range(config.feel_steps):
-            command, _ = skills.commanded
-            load, place = skills.load, self._place(self._corner)
-            stalled = (place - last < config.stalled)[:2]
-            felt = (load[:2] < -config.wall_force) | ((load[:2] < -config.feel_force) & stalled)
-            if felt.all():
-                return
-            last = place
-            down = np.clip(config.compliance * (load[2] - config.feel_press), -config.feel_step, config.feel_step)
-            move = np.array([*np.where(felt, 0.0, config.feel_step), down])
-            yield skills.command(command + move, self._facing(lean))
-
-    def _stand_up(self) -> Actions:
-        """Turn the plug upright about its leading corner, which stays lightly pushed down into the hole's corner.
-
-        It turns first until the long edge lies in the hole, then all the way.
-        """
-        skills, config = self.skills, self.config
-        place = self._place(self._corner)
-        for upright in (self._lean_on_edge, STRAIGHT):
-            for _ in range(config.stand_up_steps):
-                if self._tilt(upright) < config.upright:
-                    break
-                facing = skills.towards(self._facing(upright), config.stand_up_turn)
-                position, rotation = self._plug_in_tool()
-                target = place - facing.apply(position + rotation.apply(self._corner))
-                yield skills.command(target + np.array(config.stand_up_push), facing)
+    def _disturb(self) -> np.ndarray:
+        """Addition (6,) to the action: now and then, while the plug is free, a push of the hand in a random direction."""
+        config = self.config
+        if self._disturbed_steps == 0:
+            free = self._place(self._end)[2] > self._rim + config.free_height
+            if not free or self._rng.uniform() > config.disturbance_rate:
+                return np.zeros(6)
+            self._disturbance = self._rng.uniform(-config.disturbance, config.disturbance, 6)
+            self._disturbed_steps = config.disturbance_steps
+        self._disturbed_steps -= 1
+        return self._disturbance
 
     def _press(self) -> Actions:
         """Press down and comply with sideways forces and tilts; where the plug sticks, wriggle.
@@ -237,30 +179,34 @@ class InsertionExpert:
             best = min(best, here[2])
             if self._is_outside(stuck):
                 return
-            leaning = self._tilt() > config.leaning * config.upright
-            wanted = [0, 0, config.feel_press if leaning else config.press_force]
+            aside = self._aside(load)
+            gently = self._tilt() > config.leaning * config.upright or self._is_on_top() or aside.any()
+            wanted = [0, 0, config.feel_press if gently else config.press_force]
             move = np.clip(config.compliance * (load - wanted), -config.force_step, config.force_step)
+            if aside.any():
+                move[:2] = aside  # against the friction of what it stands on
             if stuck > config.wriggle_after:
                 angle = config.wriggle_rate * step
                 move[:2] += config.wriggle * np.array([np.cos(angle), np.sin(angle)])
             command, _ = skills.commanded
             facing = self._twisted(stuck) * self._facing(STRAIGHT)
-            yield skills.command(command + move, skills.towards(facing, config.stand_up_turn))
+            yield skills.command(command + move, skills.towards(facing, config.turn_rate))
+
+    def _is_on_top(self) -> bool:
+        """Whether the plug's end has not entered the hole."""
+        return bool(self._place(self._end)[2] > self._rim - self.config.entered)
+
+    def _aside(self, load: np.ndarray) -> np.ndarray:
+        """Sideways motion (2,), in m per step, of a plug that is pressed."""
+        return np.zeros(2)
 
     def _is_outside(self, stuck: int) -> bool:
         """Whether the plug's end has slid away from the socket, or has been on the rim for too long."""
         end = self._place(self._end)
         astray = np.linalg.norm((end - self.socket)[:2]) > self.config.astray
-        return bool(astray or (stuck > self.config.patience and end[2] > self._rim - self.config.entered))
+        return bool(astray or (stuck > self.config.patience and self._is_on_top()))
 
     def _twisted(self, stuck: int) -> Rotation:
         """Rotation about the vertical of a plug that has been stuck for so many steps."""
         swing = self.config.twist * min(1 + stuck / self.config.twist_growth, 2.0)
         return Rotation.from_euler("z", swing * np.sin(self.config.twist_rate * stuck))
-
-
-@register_demonstrator("ManiFeel-GearAssembly-v1")
-class GearExpert(InsertionExpert):
-    """Puts the bore over the shaft like a plug into a socket, with its rim against the shaft's side."""
-
-    config = InsertionExpertConfig(twist=0.10)  # tuned

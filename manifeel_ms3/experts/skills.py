@@ -58,7 +58,7 @@ class Skills:
         self.arm = env.agent.controller.controllers["arm"]
         self._scale = np.r_[np.full(3, self.arm.config.pos_upper), np.full(3, self.arm.config.rot_upper)]
         self._speed = 0.0
-        self._no_load = np.zeros(3)
+        self._no_load, self._no_moment = np.zeros(3), np.zeros(3)
         self.gripper: float | None = None
         """Gripper command of every action, from 1 (open) to -1 (closed); None where the controller holds the gripper fixed."""
 
@@ -79,9 +79,15 @@ class Skills:
         """Force (3,), N, of the world on the held object, sensed by both pads, relative to the last `tare`."""
         return self._raw_load() - self._no_load
 
+    def load_moment(self, point: np.ndarray) -> np.ndarray:
+        """Moment (3,), N m, of the load about a point (3,), in m, in the base frame."""
+        about_tool = self._raw_moment() - self._no_moment
+        tool, _ = self.tool
+        return about_tool + np.cross(tool - point, self.load)
+
     def tare(self) -> None:
         """Take the present load, which is the weight of the held object, as zero."""
-        self._no_load = self._raw_load()
+        self._no_load, self._no_moment = self._raw_load(), self._raw_moment()
 
     def _raw_load(self) -> np.ndarray:
         total = np.zeros(3)
@@ -90,6 +96,16 @@ class Skills:
             _, pad = position_rotation(gel.pose.raw_pose)
             total += pad.apply(force)
         return total  # the held object transmits the world's force to the pads
+
+    def _raw_moment(self) -> np.ndarray:
+        """Moment (3,), N m, of both pads' forces about the tool centre point, base frame."""
+        tool, _ = self.tool
+        total = np.zeros(3)
+        for side, gel in self.agent.gels.items():
+            wrench = self.agent.pad_wrench(side)[0].cpu().numpy()
+            place, pad = position_rotation(gel.pose.raw_pose)
+            total += pad.apply(wrench[3:]) + np.cross(place - tool, pad.apply(wrench[:3]))
+        return total
 
     @property
     def squeeze(self) -> np.ndarray:
@@ -105,6 +121,7 @@ class Skills:
         """
         here, facing = self.commanded
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
+        twist[[3 + axis for axis in self.arm.config.locked_axes]] = 0.0
         action = np.clip(twist / self._scale, -1.0, 1.0)[[0, 1, 2, *(3 + axis for axis in self.arm.config.rotation_axes)]]
         return action if self.gripper is None else np.r_[action, self.gripper]
 

@@ -10,10 +10,28 @@ from .part import Part
 CORNER_AIM = 0.75
 """Distance of the first landing place from a hole's (+x, +y) corner, as a share of its half size: near the hole's middle, which
 allows for the error of sight. Tuned."""
+FITS = ("paper", "tight")
+"""Names of the fits of the insertion tasks: the sizes of the paper's public parts, and a harder one with less play."""
 LEAD = 0.0007
 """Depth, in m, that a leaning plug's corner can reach before its other side meets the hole's. Tuned."""
+LEAD_SPAN = 0.003
+"""Depth, in m, over which the contact of a pair that meets tells a direction; beyond it the one is in the other."""
 LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
 """Smallest and largest lean, in rad. Tuned."""
+
+
+@dataclass(frozen=True)
+class Lead:
+    """What of a plug meets what of the socket first, from one depth on."""
+
+    depth: float
+    """Depth of the foremost face below the rim, in m, from which on this pair meets."""
+    middle: tuple[float, float] = (0.0, 0.0)
+    """Middle of the pair in the plug's frame, (x, y) in m: a contact beside it tells to which side the plug is off."""
+    tells: tuple[float, float] = (1.0, 1.0)
+    """1 for each of x and y along which the contact's place tells this, 0 for one along which it does not."""
+    is_pin_below: bool = False
+    """Whether the plug has the hole and the socket the pin."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +63,18 @@ class Fit:
     """Lean of the plug along x and along y, in rad, with which this point goes ahead."""
     clearance: float = 1e-3
     """Largest distance from the socket's axis of a plug that is in."""
+    max_gap: float = 1e-3
+    """Largest distance of the foremost face from its place over the socket's floor, of a plug that is in."""
+    goes_in_upright: bool = False
+    """Whether the play is so wide that the plug can be lowered in upright; where it is not, its corner must be led in."""
+
+    leads: tuple[Lead, ...] = ()
+    """Pairs that meet as a plug goes in upright, by rising depth."""
+
+    def lead_at(self, depth: float) -> Lead | None:
+        """The pair that meets when the foremost face is `depth`, in m, below the rim; None where none does."""
+        meeting = [lead for lead in self.leads if lead.depth <= depth < lead.depth + LEAD_SPAN]
+        return meeting[-1] if meeting else None
 
     @staticmethod
     def into_hole(

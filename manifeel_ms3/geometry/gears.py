@@ -1,18 +1,19 @@
 """Spur gears that mesh: involute teeth on a ring of wedges around the bore, and the base whose shafts they turn on."""
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 
-from .fits import Fit
-from .part import Box, Cylinder, Hulls, Part, extruded, ring_of_wedges
+from .fits import Fit, Lead
+from .part import Box, Cylinder, Hulls, Part, Piece, extruded, ring_of_wedges
 
 MODULE = 0.002  # m: pitch diameter per tooth
 PRESSURE_ANGLE = np.deg2rad(20.0)
 BACKLASH = 4e-4  # m along the pitch circle, by which each gear's teeth are thinner than half the pitch
 TEETH = {"small": 9, "medium": 19, "large": 29}  # 22, 42 and 62 mm across
 THICKNESS = {"small": 0.014, "medium": 0.020, "large": 0.014}  # m
-SHAFT_RADIUS, SHAFT_HEIGHT, BORE_GAP = 0.005, 0.018, 1.5e-4  # m; the gap is the bore's, on each side
+SHAFT_HEIGHT = 0.018  # m
 RING_HEIGHT = 0.005  # m, between the medium gear and its handle
 BASE_SIZE = (0.15, 0.075, 0.025)  # m
 HANDLE_SIZE = (0.020, 0.030, 0.040)  # m; narrower than a pad, so that touch sees its edges
@@ -23,7 +24,8 @@ NECK_RADIUS = 0.010  # m, of the ring between the gear and its handle
 LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))  # along x and y, with which the bore's rim goes ahead; tuned
 GEAR_FRICTION = 0.15  # greased
 ALUMINIUM = 2700.0  # kg/m^3
-BESIDE = 0.0022  # m from the shaft's side to where the bore's rim is set down
+BESIDE = 0.0022  # m from the shaft's side to where the bore's rim is set down; tuned
+TIP_POINTS = 24  # number of corners of a shaft's chamfer; 0.04 mm inside its circle at most
 FLANK_POINTS = 5
 # along the base: neighbours at the distance of their pitch circles
 SHAFT_X = {
@@ -33,6 +35,24 @@ SHAFT_X = {
 }
 BASE_SHIFT = -0.010  # m: the base's middle, seen from the medium shaft
 COLOURS = {"small": (0.75, 0.35, 0.25), "medium": (0.80, 0.62, 0.20), "large": (0.30, 0.50, 0.35)}
+
+
+@dataclass(frozen=True)
+class ShaftSizes:
+    """Radii of the shafts and of the gears' bores, in m."""
+
+    shaft: float
+    """Radius of a shaft."""
+    tip: float
+    """Radius of a shaft's end, to which it narrows at 45 degrees."""
+    bore: float
+    """Radius of a gear's bore."""
+
+
+SHAFTS = {
+    "paper": ShaftSizes(0.0045, 0.0038, 0.0050),  # measured in the meshes of the public code
+    "tight": ShaftSizes(0.0050, 0.0050, 0.00515),
+}
 
 
 def tooth_polygon(teeth: int) -> np.ndarray:
@@ -49,10 +69,9 @@ def tooth_polygon(teeth: int) -> np.ndarray:
     return np.concatenate([np.stack([radius * np.cos(s * half), radius * np.sin(s * half)], axis=1) for s in (1, -1)])
 
 
-def gear_hulls(teeth: int, bottom: float, top: float) -> Hulls:
-    """Gear about z between two heights, in the phase that has a tooth at +x."""
+def gear_hulls(teeth: int, bore: float, bottom: float, top: float) -> Hulls:
+    """Gear about z with a bore of this radius, in m, between two heights, in the phase that has a tooth at +x."""
     root = MODULE * teeth / 2 - DEDENDUM * MODULE
-    bore = SHAFT_RADIUS + BORE_GAP
     pieces = []
     for k in range(teeth):
         turn = 2 * np.pi * k / teeth
@@ -63,22 +82,27 @@ def gear_hulls(teeth: int, bottom: float, top: float) -> Hulls:
 
 
 @functools.cache
-def neighbour_gear(name: str) -> Part:
+def neighbour_gear(name: str, fit: str = "paper") -> Part:
     """The "small" or the "large" gear, which turns on its shaft; its frame on the axis, in the underside."""
     return Part(
         f"{name}_gear",
-        (gear_hulls(TEETH[name], 0.0, THICKNESS[name]),),
+        (gear_hulls(TEETH[name], SHAFTS[fit].bore, 0.0, THICKNESS[name]),),
         COLOURS[name],
         density=ALUMINIUM,
         friction=GEAR_FRICTION,
     )
 
 
-def gear_fit() -> Fit:
-    """The medium gear on its handle, and the base; the gear is held by its handle, and the bore's rim finds the shaft."""
+def gear_fit(fit: str = "paper") -> Fit:
+    """The medium gear on its handle, and the base; the gear is held by its handle, and the bore's rim finds the shaft.
+
+    Args:
+        fit: "paper" for bores with 0.5 mm of play on each side and chamfered shafts; "tight" for 0.15 mm and blunt ones.
+    """
+    sizes = SHAFTS[fit]
     top = HANDLE_SIZE[2] / 2 + RING_HEIGHT
     reach = top + THICKNESS["medium"]
-    body = gear_hulls(TEETH["medium"], top, reach)
+    body = gear_hulls(TEETH["medium"], sizes.bore, top, reach)
     ring = Cylinder(NECK_RADIUS, RING_HEIGHT, (0.0, 0.0, top - RING_HEIGHT / 2))
     diagonal = np.sqrt(0.5)
     return Fit(
@@ -89,27 +113,43 @@ def gear_fit() -> Fit:
             friction=GEAR_FRICTION,
             other_colours={2: (0.14, 0.14, 0.16)},
         ),
-        socket=gear_base(),
+        socket=gear_base(fit),
         reach=reach,
         grip=-0.004,
         grip_width=HANDLE_SIZE[1],
         rim=BASE_SIZE[2] + SHAFT_HEIGHT,
         floor=BASE_SIZE[2],
-        corner=(-diagonal * (SHAFT_RADIUS + BORE_GAP),) * 2,
-        aim=(-diagonal * (SHAFT_RADIUS + BESIDE),) * 2,
+        corner=(-diagonal * sizes.bore,) * 2,
+        aim=(-diagonal * (sizes.shaft + BESIDE),) * 2,
         lean=LEAN,
-        clearance=5e-4,
+        clearance=5e-4 if fit == "tight" else 1e-3,
+        goes_in_upright=fit == "paper",
+        leads=(Lead(-0.002, is_pin_below=True),),
     )
 
 
-def gear_base() -> Part:
+def gear_base(fit: str = "paper") -> Part:
     """Plate with three shafts; its frame below the middle shaft, in the plate's underside."""
+    sizes = SHAFTS[fit]
     plate = Box(BASE_SIZE, (-BASE_SHIFT, 0.0, BASE_SIZE[2] / 2))
-    shafts = [Cylinder(SHAFT_RADIUS, SHAFT_HEIGHT, (x, 0.0, BASE_SIZE[2] + SHAFT_HEIGHT / 2)) for x in SHAFT_X.values()]
+    shafts = [piece for x in SHAFT_X.values() for piece in _shaft(sizes, x)]
     return Part(
         "gear_base",
         (plate, *shafts),
         (0.25, 0.35, 0.55),
         friction=GEAR_FRICTION,
-        other_colours=dict.fromkeys((1, 2, 3), (0.7, 0.7, 0.72)),
+        other_colours=dict.fromkeys(range(1, 1 + len(shafts)), (0.7, 0.7, 0.72)),
     )
+
+
+def _shaft(sizes: ShaftSizes, x: float) -> list[Piece]:
+    """A shaft on the plate, and its chamfered end."""
+    cut = sizes.shaft - sizes.tip
+    height = SHAFT_HEIGHT - cut
+    cylinder = Cylinder(sizes.shaft, height, (x, 0.0, BASE_SIZE[2] + height / 2))
+    if not cut:
+        return [cylinder]
+    angles = 2 * np.pi * np.arange(TIP_POINTS) / TIP_POINTS
+    circle, top = np.c_[np.cos(angles), np.sin(angles)], BASE_SIZE[2] + SHAFT_HEIGHT
+    rings = [(sizes.shaft, top - cut), (sizes.tip, top)]
+    return [cylinder, Hulls((np.concatenate([np.c_[r * circle + (x, 0.0), np.full(TIP_POINTS, z)] for r, z in rings]),))]

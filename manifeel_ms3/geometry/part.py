@@ -193,28 +193,53 @@ def ring_of_wedges(
     return wedges
 
 
+def bevelled_box(box: Box, bevels: dict[str, float]) -> Hulls:
+    """Box whose upper edges on some sides are cut off at 45 degrees.
+
+    Args:
+        box: The whole box.
+        bevels: Width of the cut, in m, by side: "-x", "+x", "-y" or "+y".
+    """
+    low, high = np.array(box.centre) - np.array(box.size) / 2, np.array(box.centre) + np.array(box.size) / 2
+    shift = np.array([[bevels.get("-x", 0.0), bevels.get("-y", 0.0)], [-bevels.get("+x", 0.0), -bevels.get("+y", 0.0)]])
+    corners = np.array([low[:2], high[:2]])
+    points = []
+    for z, inset in ((low[2], 0.0), (high[2] - np.abs(shift).max(), 0.0), (high[2], 1.0)):
+        (left, front), (right, back) = corners + inset * shift
+        points += [(x, y, z) for x in (left, right) for y in (front, back)]
+    return Hulls((np.array(points),))
+
+
 def block_with_holes(
-    outer: tuple[float, float], depth: float, holes: list[tuple[tuple[float, float], tuple[float, float]]], bottom: float = 0.0
-) -> tuple[Box, ...]:
-    """Boxes of a slab with rectangular through holes.
+    outer: tuple[float, float],
+    depth: float,
+    holes: list[tuple[tuple[float, float], tuple[float, float]]],
+    bottom: float = 0.0,
+    chamfer: float = 0.0,
+) -> tuple[Piece, ...]:
+    """Convex pieces of a slab with rectangular through holes.
 
     Args:
         outer: Size of the slab along x and y, in m.
         depth: Size along z, in m.
         holes: ((size x, size y), (centre x, centre y)) of each hole, in m; they must not overlap along x.
         bottom: Height of the underside, in m.
+        chamfer: Width, in m, of the chamfer of 45 degrees around the upper mouth of each hole; 0 for none.
 
     Raises:
         ValueError: Holes overlap or reach beyond the slab.
     """
     holes = sorted(holes, key=lambda hole: hole[1][0])
-    z, boxes, left = bottom + depth / 2, [], -outer[0] / 2
+    z, pieces, left, cut = bottom + depth / 2, [], -outer[0] / 2, dict[str, float]()
     for (size_x, size_y), (x, y) in holes:
         if x - size_x / 2 <= left or x + size_x / 2 >= outer[0] / 2 or abs(y) + size_y / 2 >= outer[1] / 2:
             raise ValueError(f"hole {size_x} x {size_y} m at ({x}, {y}) overlaps another or the rim of a slab of {outer} m")
-        boxes.append(Box((x - size_x / 2 - left, outer[1], depth), ((x - size_x / 2 + left) / 2, 0.0, z)))
-        for low, high in ((-outer[1] / 2, y - size_y / 2), (y + size_y / 2, outer[1] / 2)):
-            boxes.append(Box((size_x, high - low, depth), (x, (low + high) / 2, z)))
-        left = x + size_x / 2
-    boxes.append(Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)))
-    return tuple(boxes)
+        strip = Box((x - size_x / 2 - left, outer[1], depth), ((x - size_x / 2 + left) / 2, 0.0, z))
+        pieces.append((strip, cut | {"+x": chamfer}))
+        for low, high, side in ((-outer[1] / 2, y - size_y / 2, "+y"), (y + size_y / 2, outer[1] / 2, "-y")):
+            # as wide as the chamfers beside it, so that they end at the hole's corners
+            wall = Box((size_x + 2 * chamfer, high - low, depth), (x, (low + high) / 2, z))
+            pieces.append((wall, {side: chamfer}))
+        left, cut = x + size_x / 2, {"-x": chamfer}
+    pieces.append((Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut))
+    return tuple(bevelled_box(box, bevels) if chamfer else box for box, bevels in pieces)

@@ -24,6 +24,7 @@ from manifeel_ms3.errors import InvalidArgumentError, PluginError, UnknownNameEr
 
 log = logging.getLogger(__name__)
 Class = TypeVar("Class", bound=type)
+Demonstrator = TypeVar("Demonstrator", bound=Callable[..., Any])
 FIRST_EVALUATION_SEED = 100_000
 """Episodes from this seed on are for evaluation, as in the paper's public code; demonstrations use the seeds below it."""
 PREFIX, SUFFIX = "ManiFeel-", "-v1"
@@ -102,15 +103,15 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
     return register
 
 
-def register_demonstrator(*env_ids: str) -> Callable[[Class], Class]:
-    """Class decorator that makes a class the scripted demonstrator of tasks that are registered already.
+def register_demonstrator(*env_ids: str) -> Callable[[Demonstrator], Demonstrator]:
+    """Decorator that makes a class, or a function, the scripted demonstrator of tasks that are registered already.
 
     Raises:
         UnknownNameError: A task is not registered.
         PluginError: A task has a demonstrator of another class.
     """
 
-    def attach(expert_class: Class) -> Class:
+    def attach(expert_class: Demonstrator) -> Demonstrator:
         for env_id in env_ids:
             spec = _known(env_id)
             if spec.demonstrator is not None and _qualified(spec.demonstrator) != _qualified(expert_class):

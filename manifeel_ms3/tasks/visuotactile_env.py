@@ -28,7 +28,7 @@ CONTROL_FREQ = 10
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
 LIGHTING = {"normal": 1.0, "dim": 0.05}
-"""Share of the normal light; 5 % is the paper's."""
+"""Share of the normal light; the paper gives no figure for its dim light."""
 HOLD_SECONDS = 0.5
 """Time for which a goal must hold until the episode is a success, in s."""
 SETTLE_SECONDS = 0.2
@@ -37,7 +37,6 @@ IMAGE_SIZE = 256
 """Width and height of the cameras' images, in pixels (public code of the paper)."""
 FIELD_OF_VIEW = np.deg2rad(75)
 """Field of view of the cameras, in rad (public code of the paper)."""
-SIDE_CAMERA_AT = (0.5, -0.17, 0.17)  # m
 AMBIENT_LIGHT, KEY_LIGHT, FILL_LIGHT = 0.3, 0.8, 0.35  # intensities, chosen by eye
 KEY_DIRECTION, FILL_DIRECTION = [0.4, 0.6, -1], [-0.5, -0.3, -1]
 CONTACTS: dict[str, Any] = dict(
@@ -61,7 +60,8 @@ class VisuotactileEnv(SensingEnv):
       taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`);
     - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Privileged state is in the state modes alone.
 
-    `info` holds `success` (the goal has held for 0.5 s), `fail`, `contact_force` (N; the largest force, in any physics step of
+    `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
+    (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
     the last control step, between the held object and the rest of the world) and the task's own measures.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
@@ -100,7 +100,9 @@ class VisuotactileEnv(SensingEnv):
     max_reward = 4.0
     """Largest value of the dense reward."""
     front_camera_at = (0.68, 0.0, 0.15)
-    """Position of the front camera, in m."""
+    """Position of the front camera, in m (public code of the paper)."""
+    side_camera_at = (0.5, -0.17, 0.17)
+    """Position of the side camera, in m (public code of the paper)."""
     agent: PandaGelSight
 
     def __init__(
@@ -181,6 +183,10 @@ class VisuotactileEnv(SensingEnv):
         """Whether the goal is met at this moment, (N,) bool."""
         raise NotImplementedError
 
+    def paper_goal_reached(self, measures: dict[str, torch.Tensor]) -> torch.Tensor | None:
+        """Whether the paper's public code would count a success at this moment, (N,) bool; None if its goal is not public."""
+        return None
+
     def failed(self, measures: dict[str, torch.Tensor]) -> torch.Tensor:
         """Whether the episode cannot be won any more, (N,) bool."""
         raise NotImplementedError
@@ -205,7 +211,7 @@ class VisuotactileEnv(SensingEnv):
 
     @property
     def _default_sensor_configs(self):
-        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(SIDE_CAMERA_AT, (0.0, 1.0)))
+        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
         return [
             CameraConfig(name, looking_down(*views[name]), IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, near=0.01, far=10)
             for name in self._camera_names
@@ -237,6 +243,7 @@ class VisuotactileEnv(SensingEnv):
         self._make_tactile_sensors()
         self._measured: dict[str, torch.Tensor] | None = None
         self._steps_at_goal = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._success_paper = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self._contact_force = torch.zeros(self.num_envs, device=self.device)
 
     # ---------------------------------------------------------------- episode
@@ -280,6 +287,7 @@ class VisuotactileEnv(SensingEnv):
         with torch.device(self.device):
             self._initialize_task(env_idx)
         self._steps_at_goal[env_idx] = 0
+        self._success_paper[env_idx] = False
         self._contact_force[env_idx] = 0.0
         self._touch_is_fresh, self._measured = False, None
         for sensor in self._tactile_sensors.values():
@@ -296,6 +304,9 @@ class VisuotactileEnv(SensingEnv):
         self._measured = self.measure()  # for the `evaluate` that follows
         reached = self.goal_reached(self._measured)
         self._steps_at_goal = torch.where(reached, self._steps_at_goal + 1, 0)
+        paper_reached = self.paper_goal_reached(self._measured)
+        if paper_reached is not None:
+            self._success_paper |= paper_reached
         return action
 
     def _after_simulation_step(self):
@@ -310,7 +321,10 @@ class VisuotactileEnv(SensingEnv):
     def evaluate(self) -> dict:
         measures, self._measured = self._measured or self.measure(), None
         held = self._steps_at_goal >= round(HOLD_SECONDS * self._control_freq)
-        return dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
+        info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
+        if self.paper_goal_reached(measures) is not None:
+            info["success_paper"] = self._success_paper.clone()
+        return info
 
     # ---------------------------------------------------------------- observation
 

@@ -38,7 +38,7 @@ class Args:
     seed: int = 0
     """Seed of the first episode."""
     env_kwargs: str = "{}"
-    """Further arguments of the task as json, such as '{"fit": "loose"}'."""
+    """Further arguments of the task as json, such as '{"fit": "tight"}'."""
     device: Literal["spacemouse", "gamepad"] | None = None
     """Device to steer with, besides the page; none if not given."""
     host: str = "localhost"

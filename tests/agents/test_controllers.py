@@ -10,7 +10,7 @@ ACTION_DIMS = {"pd_ee_delta_pose_fixed_gripper": 6, "pd_ee_delta_pose": 7, "pd_e
 
 @pytest.fixture(scope="module")
 def env(make_env):
-    return make_env(obs_mode="none", render_backend="none", fit="loose")
+    return make_env(obs_mode="none", render_backend="none", fit="paper")
 
 
 def tool(env) -> tuple[np.ndarray, Rotation]:

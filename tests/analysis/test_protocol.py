@@ -46,12 +46,12 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
         for env_kwargs in (
             dict(sim_backend="physx_cpu"),
             dict(render_backend="none", sensor_configs=dict(width=128), tactile_sensors=["left"]),
-            dict(fit="loose"),
+            dict(fit="paper"),
         )
     )
     assert rendered == plain
     assert plain.variant == ""
-    assert changed.variant == '{"fit": "loose"}'
+    assert changed.variant == '{"fit": "tight"}'
 
 
 def test_results_of_different_initial_states_are_not_mixed(tmp_path):

@@ -11,6 +11,6 @@ from tests.conftest import PEG
 @pytest.fixture(scope="session")
 def demos(tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "trajectory.h5"
-    kwargs = json.dumps(dict(fit="loose", render_backend="none"))
+    kwargs = json.dumps(dict(fit="paper", render_backend="none"))
     args = record.Args(PEG, 2, 1, 0, path, "tacff", cameras=(), tactile_sensors=("right",), env_kwargs=kwargs)
     return record.main(args)

@@ -129,7 +129,7 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
     assert name == "eval"
     assert "eval" not in words  # one command: "last" is not a checkpoint of its own
     evaluation = tyro.cli(cli.command_module("eval").Args, args=words)
-    assert json.loads(evaluation.env_kwargs)["fit"] == "loose"
+    assert json.loads(evaluation.env_kwargs)["fit"] == "paper"
     assert evaluation.out == tmp_path / "evaluate" / jobs[2].key / "00000006.json"
     assert evaluation.checkpoint == tmp_path / "train" / jobs[1].key / "checkpoints/00000006"
 

@@ -23,7 +23,7 @@ from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
 from tests.conftest import PEG
 
-EASY = dict(fit="loose", render_backend="none")
+EASY = dict(fit="paper", render_backend="none")
 KEYS = ["sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 
 

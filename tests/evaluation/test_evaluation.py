@@ -34,7 +34,7 @@ class StandStill:
 
 
 def test_outcome_of_a_success_and_of_a_failure(make_env):
-    env = make_env(obs_mode="none", render_backend="none", fit="loose")
+    env = make_env(obs_mode="none", render_backend="none", fit="paper")
     won = evaluate_episode(env, ExpertPolicy(env, 1), seed=1)
     assert won.success_once
     assert won.success_at_end
@@ -46,7 +46,7 @@ def test_outcome_of_a_success_and_of_a_failure(make_env):
 
 
 def test_same_policy_and_seed_give_the_same_outcome(make_env):
-    env = make_env(obs_mode="none", render_backend="none", fit="loose")
+    env = make_env(obs_mode="none", render_backend="none", fit="paper")
     first = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
     evaluate_episode(env, ExpertPolicy(env, 3), seed=3)
     again = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)

@@ -9,7 +9,16 @@ import trimesh
 from sapien import physx, render
 from scipy.spatial import cKDTree
 
-from manifeel_ms3.geometry import bulb_and_holder, gear_fit, nut_and_bolt, peg_fit, power_fit, reorientation_fit, usb_fit
+from manifeel_ms3.geometry import (
+    FITS,
+    bulb_and_holder,
+    gear_fit,
+    nut_and_bolt,
+    peg_fit,
+    power_fit,
+    reorientation_fit,
+    usb_fit,
+)
 from manifeel_ms3.geometry.balls import ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import battery, bowl, container
 from manifeel_ms3.geometry.gears import neighbour_gear
@@ -17,7 +26,7 @@ from tests.conftest import needs_renderer
 from tests.sensors.bench import PadBench
 
 PARTS = [
-    *(part for fit in (peg_fit("tight"), peg_fit("loose"), usb_fit(), power_fit(), reorientation_fit(), gear_fit())
+    *(part for fit in (*(make(name) for make in (peg_fit, usb_fit, power_fit, gear_fit) for name in FITS), reorientation_fit())
       for part in (fit.plug, fit.socket)),
     *(part for screw in (nut_and_bolt(), bulb_and_holder()) for part in (screw.held, screw.fixed)),
     neighbour_gear("small"), neighbour_gear("large"), ball_stand(), golf_ball(), tennis_ball(), battery(), container(True),

@@ -1,29 +1,35 @@
 """The insertion tasks: success is contact physics alone; near misses do not count."""
 
+import itertools
+
 import numpy as np
 import pytest
 import sapien
 import torch
 from mani_skill.utils.structs import Pose
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit, reorientation_fit, usb_fit
-from manifeel_ms3.geometry.part import Hulls
-from manifeel_ms3.geometry.plugs import PEG_HOLES
+from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit, usb_fit
+from manifeel_ms3.geometry.part import Cylinder, Hulls
+from manifeel_ms3.geometry.plugs import PEG_SOCKETS
 from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from tests.conftest import PEG
 
 FITS = {
-    PEG: peg_fit("tight"),
-    "ManiFeel-USBInsertion-v1": usb_fit(),
-    "ManiFeel-PowerPlugInsertion-v1": power_fit(),
-    "ManiFeel-PegReorientation-v1": reorientation_fit(),
-    "ManiFeel-GearAssembly-v1": gear_fit(),
+    PEG: peg_fit,
+    "ManiFeel-USBInsertion-v1": usb_fit,
+    "ManiFeel-PowerPlugInsertion-v1": power_fit,
+    "ManiFeel-GearAssembly-v1": gear_fit,
 }
+TASKS = (*FITS, "ManiFeel-PegReorientation-v1")
+BEYOND_PLAY = {"paper": 7.2e-4, "tight": 2.2e-4}
+"""Shift of a seated plug, in m, that is more than the play of every pair of parts."""
 
 
-@pytest.fixture(scope="module", params=FITS)
+@pytest.fixture(scope="module", params=TASKS)
 def env(request, make_env):
     return make_env(request.param, obs_mode="state_dict", render_backend="none", reward_mode="dense")
 
@@ -65,6 +71,27 @@ def test_near_misses_are_not_the_goal(env, miss, offset, depth, tilt):
     assert not reached, miss
 
 
+def test_the_papers_success_is_the_mean_distance_of_four_key_points(make_env):
+    """Two thirds of the way in or a tilt of 2 to 4 degrees are enough for it; it stays once it was met."""
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    measures, _ = measures_with_plug_at(env, (0, 0, 0.0085))
+    assert float(measures["keypoint_distance"]) == pytest.approx(0.0085, abs=1e-6)
+    assert base.paper_goal_reached(measures).all()
+    assert not base.paper_goal_reached(measures_with_plug_at(env, (0, 0, 0.0095))[0]).any()
+    tilt = np.deg2rad(2.0)
+    measures, _ = measures_with_plug_at(env, (0, 0, 0), 2.0)
+    expected = 2 * np.sin(tilt / 2) * np.mean(np.abs([-0.25, -0.25 / 3, 0.25 / 3, 0.25]))  # chords of the key points' arcs
+    assert float(measures["keypoint_distance"]) == pytest.approx(expected, rel=1e-4)
+    assert not base.evaluate()["success_paper"].any()
+    base._success_paper[:] = True
+    *_, info = env.step(np.zeros(6))
+    assert info["success_paper"].all()
+    *_, info = env.reset(seed=0)
+    assert not info["success_paper"].any()
+
+
 def test_goal_must_hold_half_a_second(env):
     env.reset(seed=0)
     base = env.unwrapped
@@ -79,7 +106,7 @@ def test_goal_must_hold_half_a_second(env):
 def test_randomisation_covers_its_ranges_and_no_more(env):
     sockets, starts, pitches = [], [], []
     base, ranges = env.unwrapped, env.unwrapped.randomization
-    for seed in range(30):
+    for seed in range(16):
         env.reset(seed=seed)
         sockets.append(base.socket.pose.p[0, :2].numpy() - [0.5, 0.0])
         starts.append(base.agent.tcp_pose_at_base.p[0].numpy() - [0.5, 0.0, 0.15 + base.lift])
@@ -93,7 +120,7 @@ def test_randomisation_covers_its_ranges_and_no_more(env):
     ):
         spread = np.abs(values)
         assert spread.max() <= limit + 0.02 * limit + 4e-3
-        assert spread.max() >= 0.7 * limit
+        assert spread.max() >= 0.6 * limit
 
 
 def test_default_ranges_are_the_papers():
@@ -110,29 +137,44 @@ def test_randomization_argument_narrows(make_env):
         assert narrow.unwrapped.agent.tcp_pose_at_base.p[0].tolist() == pytest.approx([0.5, 0, 0.15], abs=1e-3)
 
 
-def test_plug_fits_its_socket_and_a_shifted_one_does_not(env):
-    """Pieces of the seated plug and of the socket do not overlap; shifted sideways by the clearance and a bit, they do."""
-    fit = env.unwrapped.fit
-    if any(isinstance(piece, Hulls) for piece in fit.plug.pieces):
-        pytest.skip("gears: tests/geometry/test_gears.py")
-    flip = sapien.Pose([0, 0, fit.floor + fit.reach], [0, 1, 0, 0])
+def convex_bodies(piece, pose: sapien.Pose = sapien.Pose()) -> list[ConvexHull]:  # noqa: B008  (a constant)
+    """Each convex body of a piece."""
+    if isinstance(piece, Hulls):
+        clouds = piece.points
+    elif isinstance(piece, Cylinder):
+        angles = 2 * np.pi * np.arange(32) / 32
+        ring = piece.radius * np.c_[np.cos(angles), np.sin(angles)]
+        clouds = [np.concatenate([np.c_[ring, np.full(32, z)] for z in (-piece.length / 2, piece.length / 2)]) + piece.centre]
+    else:
+        clouds = [np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * piece.size + piece.centre]
+    matrix = pose.to_transformation_matrix()
+    return [ConvexHull(cloud @ matrix[:3, :3].T + matrix[:3, 3]) for cloud in clouds]
 
-    def overlap(shift: np.ndarray) -> bool:
-        for piece in fit.plug.pieces:
-            size = getattr(piece, "size", None) or (2 * piece.radius, 2 * piece.radius, piece.length)
-            centre = (flip * sapien.Pose(piece.centre)).p + shift
-            for wall in fit.socket.pieces:
-                gap = np.abs(centre - wall.centre) - (np.array(size) + wall.size) / 2
-                if (gap < -2e-6).all():
-                    return True
-        return False
 
-    assert not overlap(np.zeros(3))
-    loosest = 2.1e-4
-    for axis in (0, 1):
-        shift = np.zeros(3)
-        shift[axis] = loosest
-        assert overlap(shift)
+def overlap(one: ConvexHull, other: ConvexHull) -> float:
+    """Radius, in m, of the largest ball within two convex bodies; 0 or less if they have no point in common."""
+    if (one.max_bound <= other.min_bound).any() or (other.max_bound <= one.min_bound).any():
+        return 0.0
+    both = np.concatenate([one.equations, other.equations])
+    found = linprog([0, 0, 0, -1], A_ub=np.c_[both[:, :3], np.ones(len(both))], b_ub=-both[:, 3], bounds=[(None, None)] * 4)
+    return -found.fun
+
+
+@pytest.mark.parametrize("name", BEYOND_PLAY)
+@pytest.mark.parametrize("make_fit", FITS.values())
+def test_plug_fits_its_socket_and_a_shifted_one_does_not(make_fit, name):
+    """Pieces of the seated plug and of the socket do not overlap; shifted sideways by the play and a bit, they do."""
+    fit = make_fit(name)
+    walls = [body for piece in fit.socket.pieces for body in convex_bodies(piece)]
+
+    def deepest(shift: tuple[float, float]) -> float:
+        seated = sapien.Pose([*shift, fit.floor + fit.reach], [0, 1, 0, 0])
+        plug = [body for piece in fit.plug.pieces for body in convex_bodies(piece, seated)]
+        return max(overlap(body, wall) for body in plug for wall in walls)
+
+    assert deepest((0.0, 0.0)) < 2e-6
+    assert deepest((BEYOND_PLAY[name], 0.0)) > 5e-6
+    assert deepest((0.0, BEYOND_PLAY[name])) > 5e-6
 
 
 def test_gear_needs_its_neighbours_in_place(make_env):
@@ -146,17 +188,17 @@ def test_gear_needs_its_neighbours_in_place(make_env):
     assert not base.goal_reached(base.measure())
 
 
-@pytest.mark.parametrize("fit", PEG_HOLES)
-def test_hole_is_as_large_as_it_says(fit):
-    """Area of the slab = area of its boxes + area of the hole."""
-    boxes = peg_fit(fit).socket.pieces
-    hole = PEG_HOLES[fit]
-    covered = sum(box.size[0] * box.size[1] for box in boxes)
-    assert covered + hole[0] * hole[1] == pytest.approx(0.025**2)
-    for box in boxes:
-        assert (
-            abs(box.centre[0]) + 1e-9 >= (hole[0] + box.size[0]) / 2 or abs(box.centre[1]) + 1e-9 >= (hole[1] + box.size[1]) / 2
-        )
+@pytest.mark.parametrize("name", PEG_SOCKETS)
+def test_hole_is_as_large_as_it_says(name):
+    """A point is in the hole, or in a wall, by the sizes of the hole and its chamfer."""
+    socket, walls = PEG_SOCKETS[name], [body for piece in peg_fit(name).socket.pieces for body in convex_bodies(piece)]
+    floor = socket.plate[1]
+    for height, wider in ((0.5 * socket.depth, 0.0), (socket.depth - 1e-6, socket.chamfer)):
+        half = np.array(socket.hole) / 2 + wider
+        for share, inside in ((0.999, True), (1.001, False)):
+            for corner in itertools.product((-1, 1), repeat=2):
+                point = np.array([*(share * half * corner), floor + height, 1.0])
+                assert all((wall.equations @ point > 0).any() for wall in walls) == inside
 
 
 def test_impossible_holes_are_refused():

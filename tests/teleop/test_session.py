@@ -151,7 +151,7 @@ def test_a_file_of_another_task_stays(desk, tmp_path):
     first.command(EpisodeCommand.SAVE, "1 saved")
     first.close()
     before = (tmp_path / "human.h5").read_bytes()
-    other = KWARGS | dict(fit="loose")
+    other = KWARGS | dict(fit="paper")
     env = gym.make(PEG, **other)
     with pytest.raises(DemonstrationError, match="fit"):
         Session(env, PEG, other, tmp_path / "human.h5", 0, Operator(AXES))

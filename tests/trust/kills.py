@@ -39,7 +39,7 @@ sys.exit(run(lambda args: record.main(args, lambda: print("episode", flush=True)
 """Program that records; it kills itself before the n-th event on a path with a given part: [event, part, n] or null."""
 
 
-def start_recording(path: Path, num: int, moment: list | None = None, fit: str = "loose", **kwargs) -> subprocess.Popen:
+def start_recording(path: Path, num: int, moment: list | None = None, fit: str = "paper", **kwargs) -> subprocess.Popen:
     """Start a process that records states and actions of the peg, and prints a line for each episode."""
     env_kwargs = json.dumps(dict(fit=fit, render_backend="none"))
     arguments = dict(env_id=PEG, num=num, out=str(path), obs_mode="none", env_kwargs=env_kwargs) | kwargs

@@ -28,7 +28,7 @@ from tests.conftest import PEG
 from tests.trust.kills import PATIENCE, forked, recorded, start_recording
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
-KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="loose")
+KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="paper")
 few_and_hundred = pytest.mark.parametrize("count", [1, pytest.param(100, marks=pytest.mark.slow)])
 
 

@@ -15,7 +15,7 @@ from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 STAND_XY = (0.5, 0.0)  # m, nominal
-START_XYZ = (0.5, 0.0, 0.17)  # m
+START_XYZ = (0.5, 0.0, 0.12)  # m (public code of the paper)
 LIFTED = 0.10
 """Height of the golf ball over its seat, in m, at success."""
 IN_PLACE = 0.010
@@ -30,13 +30,13 @@ GOALS = ("lift", "bowls")
 
 @dataclass(frozen=True)
 class BallSortingRandomization:
-    """Half ranges of the uniform distributions; the default of the stand is the paper's."""
+    """Half ranges of the uniform distributions; the defaults are those of the paper and its public code."""
 
     stand_xy: float = 0.05
     """Position of the stand on each axis, in m."""
-    start_xy: float = 0.05
+    start_xy: float = 0.0
     """Position of the tool at the start on each horizontal axis, in m."""
-    start_z: float = 0.02
+    start_z: float = 0.0
     """Height of the tool at the start, in m."""
 
 
@@ -59,6 +59,7 @@ class BallSortingRewardConfig:
     paper_demos=80,
     paper_tables=("II", "III"),
     demo_steps=84,
+    revision=2,
 )
 class BallSortingEnv(VisuotactileEnv):
     """Tell a golf ball from a table-tennis ball by touch, and lift it.
@@ -69,7 +70,7 @@ class BallSortingEnv(VisuotactileEnv):
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - stand: xy +-50 mm around (0.5, 0) m; the balls swap seats with even chances; the golf ball is turned at random
-    - gripper start: 170 mm above the table, xy +-50 mm, z +-20 mm; open
+    - gripper start: 120 mm above the table at (0.5, 0) m; open
 
     **Success Conditions:** held for 0.5 s
     - the golf ball is 100 mm or more above its seat
@@ -172,6 +173,7 @@ class BallSortingEnv(VisuotactileEnv):
     paper_demos=80,
     paper_tables=("I",),
     demo_steps=84,
+    revision=2,
 )
 class BallSortingDimEnv(BallSortingEnv):
     """BallSorting at 5 % of the light."""

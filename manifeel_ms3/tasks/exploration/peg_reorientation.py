@@ -11,8 +11,6 @@ from manifeel_ms3.tasks.insertion.base import SOCKET_XY, InsertionEnv, Insertion
 from manifeel_ms3.tasks.registry import register_task
 
 BOX_OUTER, BOX_HEIGHT = (0.24, 0.26), 0.09  # m
-NOT_INSERTED = 0.1
-"""Share of the rim's depth that the peg may leave at success."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +31,7 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=74,
+    revision=2,
 )
 class PegReorientationEnv(InsertionEnv):
     """Stand a tilted peg up in a rim that the camera cannot see.
@@ -58,9 +57,14 @@ class PegReorientationEnv(InsertionEnv):
     policy_cameras = ("front",)
     has_occluder = True
     front_camera_at = (0.80, 0.0, 0.15)
-    fit = reorientation_fit()
-    max_gap = NOT_INSERTED * fit.depth
+    side_camera_at = (0.5, -0.4, 0.17)
+    fits = ("paper",)
+    paper_threshold = 0.03
     lift = 0.05
+
+    @staticmethod
+    def make_fit(name):
+        return reorientation_fit()
 
     def _load_task(self):
         super()._load_task()

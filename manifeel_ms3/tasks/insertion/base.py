@@ -1,6 +1,7 @@
 """The base class of the insertion tasks: a held plug, a socket on the table, and the plug's foremost face over its floor."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import sapien
@@ -8,13 +9,14 @@ import torch
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
-from manifeel_ms3.geometry import Fit
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.geometry import FITS, Fit
 from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, turned_about, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 SOCKET_XY = (0.5, 0.0)  # m, nominal
 START_XYZ = (0.5, 0.0, 0.15)
-"""Nominal position of the tool, in m, at the start (paper)."""
+"""Nominal position of the tool, in m, at the start (public code of the paper)."""
 GRIP_FORCE = 20.0
 """Force of each pad on the plug, in N."""
 GRIP_INDENTATION = 6e-4
@@ -27,13 +29,15 @@ CLEAR = 0.010
 """Smallest height of the plug over the socket at the start, in m."""
 MAX_ROTATION = 0.4
 """Largest half range of the tool's rotation, in rad, that keeps the hand off the table and its joints off their limits."""
+KEY_POINTS = (-0.25, -0.25 / 3, 0.25 / 3, 0.25)
+"""Places of the key points along the plug's axis, in m from its foremost face: four on a line of 0.5 m (public code)."""
 MAX_PITCH = 0.8
 """Largest half range of the plug's pitch in the hand, in rad."""
 
 
 @dataclass(frozen=True)
 class InsertionRandomization:
-    """Half ranges of the uniform distributions; the defaults are the paper's."""
+    """Half ranges of the uniform distributions; the defaults are those of the paper and its public code."""
 
     socket_xy: float = 0.05
     """Position of the socket on each axis, in m."""
@@ -64,17 +68,35 @@ class InsertionRewardConfig:
 class InsertionEnv(VisuotactileEnv):
     """A held plug is put into a socket.
 
-    Subclasses set `fit` before they call this constructor, and `max_gap`.
+    Subclasses define `make_fit`.
+
+    Args:
+        args: Positional arguments of `VisuotactileEnv`.
+        fit: Sizes of plug and socket, one of `fits`.
+        kwargs: Other arguments of `VisuotactileEnv`.
+
+    Raises:
+        InvalidArgumentError: The fit is not one of `fits`; or as `VisuotactileEnv`.
     """
 
     Randomization = InsertionRandomization
     reward_config = InsertionRewardConfig()
-    fit: Fit
-    """Shapes of plug and socket."""
-    max_gap: float
-    """Distance of the plug's foremost face from the socket's floor, in m, below which the plug is in."""
+    fits: ClassVar[tuple[str, ...]] = FITS
+    """Names of the sizes that the parts come in."""
     lift: float = 0.0
-    """Height by which the tool starts above 150 mm, in m."""
+    """Height by which the tool starts above 150 mm, in m, where the parts are so long that they would start in each other."""
+    paper_threshold: float
+    """Mean distance of the key points, in m, below which the paper's public code counts a success."""
+
+    def __init__(self, *args, fit: str = "paper", **kwargs):
+        self.fit_name = one_of("fit", fit, self.fits)
+        self.fit = self.make_fit(self.fit_name)
+        super().__init__(*args, **kwargs)
+
+    @staticmethod
+    def make_fit(name: str) -> Fit:
+        """The shapes of plug and socket in the sizes of that name."""
+        raise NotImplementedError
 
     def _largest_ranges(self):
         lowest = self.fit.rim + CLEAR + self.fit.reach - self.fit.grip
@@ -113,15 +135,22 @@ class InsertionEnv(VisuotactileEnv):
         plug = self.socket.pose.inv() * self.plug.pose
         ahead = quaternion_apply(plug.q, plug.q.new_tensor([0.0, 0.0, 1.0]).expand(self.num_envs, 3))
         end = plug.p + ahead * self.fit.reach
+        lag = end - end.new_tensor([0.0, 0.0, self.fit.floor])  # (N, 3), m: from the foremost face's place to where it is
+        turn = ahead - ahead.new_tensor([0.0, 0.0, -1.0])
+        key_points = lag[:, None] + turn[:, None] * lag.new_tensor(KEY_POINTS)[:, None]  # (N, 4, 3), m
         return dict(
-            gap=end[:, 2] - self.fit.floor,  # m, of the plug's foremost face over the floor
+            gap=lag[:, 2],  # m, of the plug's foremost face over its place at the floor
             offset=torch.linalg.norm(end[:, :2], dim=1),  # m, of that face's middle from the socket's axis
             tilt=torch.acos(-ahead[:, 2].clamp(-1.0, 1.0)),  # rad
+            keypoint_distance=torch.linalg.norm(key_points, dim=-1).mean(dim=-1),  # m
         )
 
     def goal_reached(self, measures):
         inside = measures["offset"] < self.fit.clearance
-        return inside & (measures["gap"] < self.max_gap) & (measures["tilt"] < MAX_TILT)
+        return inside & (measures["gap"] < self.fit.max_gap) & (measures["tilt"] < MAX_TILT)
+
+    def paper_goal_reached(self, measures):
+        return measures["keypoint_distance"] < self.paper_threshold
 
     def failed(self, measures):
         held = self.agent.tcp.pose.inv() * self.plug.pose
@@ -135,5 +164,5 @@ class InsertionEnv(VisuotactileEnv):
         depth, gains = self.fit.depth, self.reward_config
         near = 1 - torch.tanh(gains.offset_gain * info["offset"] + gains.height_gain * (info["gap"] - depth).clamp(min=0.0))
         upright = near * (1 - torch.tanh(gains.tilt_gain * info["tilt"]))
-        inserted = ((depth - info["gap"]) / (depth - self.max_gap)).clamp(0.0, 1.0)
+        inserted = ((depth - info["gap"]) / (depth - self.fit.max_gap)).clamp(0.0, 1.0)
         return near + upright + inserted * (info["offset"] < gains.beside).float() + info["success"].float()

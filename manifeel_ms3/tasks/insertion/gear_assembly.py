@@ -22,7 +22,7 @@ ON_SHAFT = 1.0e-3
 
 @dataclass(frozen=True)
 class GearRandomization(InsertionRandomization):
-    """Half ranges of the uniform distributions; the defaults are those of the paper's simulation."""
+    """Half ranges of the uniform distributions; the defaults are those of the paper and its public code."""
 
     base_yaw: float = 0.0
     """Rotation of the base about the vertical, in rad."""
@@ -35,13 +35,16 @@ class GearRandomization(InsertionRandomization):
     paper_demos=100,
     paper_tables=("I", "II", "III"),
     demo_steps=106,
+    revision=2,
 )
 class GearAssemblyEnv(InsertionEnv):
     """Put a gear onto its shaft between two others, with which its teeth mesh.
 
     **Task Description:**
     The gripper holds the medium one of three gears (19 teeth, 42 mm across) by a handle and puts it on the middle shaft of a
-    base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both.
+    base, between a small (9) and a large one (29) that turn freely, so that its teeth mesh with both. With `fit="paper"` its
+    bore has 0.5 mm of play on each side and the shaft a chamfered tip, as in the paper's public code; with `fit="tight"` the
+    play is 0.15 mm, and the tip blunt.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - base: xy +-50 mm around (0.5, 0) m; the neighbours are turned at random; `base_yaw`, 0 by default, turns the base in its
@@ -58,14 +61,14 @@ class GearAssemblyEnv(InsertionEnv):
 
     Randomization = GearRandomization
     contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
-    fit = gear_fit()
-    max_gap = 1.0e-3
+    make_fit = staticmethod(gear_fit)
+    paper_threshold = 0.008
     lift = 0.05
 
     def _load_task(self):
         super()._load_task()
         self.neighbours = {
-            name: neighbour_gear(name).build(
+            name: neighbour_gear(name, self.fit_name).build(
                 self.scene, "dynamic", sapien.Pose([SOCKET_XY[0] + SHAFT_X[name], SOCKET_XY[1], BASE_SIZE[2]])
             )
             for name in NEIGHBOURS

@@ -1,13 +1,9 @@
 """The task ManiFeel-PowerPlugInsertion-v1."""
 
 from manifeel_ms3.geometry import power_fit
-from manifeel_ms3.geometry.plugs import BLADE
 from manifeel_ms3.tasks.registry import register_task
 
 from .base import InsertionEnv
-
-NOT_INSERTED = 0.1
-"""Share of the blades' length that may be outside the socket at success."""
 
 
 @register_task(
@@ -17,13 +13,16 @@ NOT_INSERTED = 0.1
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=92,
+    revision=2,
 )
 class PowerPlugInsertionEnv(InsertionEnv):
     """Insert a NEMA 5-15 plug into a socket that looks up.
 
     **Task Description:**
-    The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that looks up. The holes leave
-    0.2 mm on each side; the ground pin, 3 mm longer than the blades, finds its hole first.
+    The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that looks up. With
+    `fit="paper"` plug and socket are those of the paper's public code, 1.8 times the standard, with 0.5 to 0.8 mm of play on
+    each side; with `fit="tight"` they are the standard's, with 0.2 mm. The ground pin, longer than the blades, finds its hole
+    first.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - socket: xy +-50 mm around (0.5, 0) m
@@ -31,12 +30,12 @@ class PowerPlugInsertionEnv(InsertionEnv):
     - plug in hand: pitch about the closing axis +-10 degrees
 
     **Success Conditions:** held for 0.5 s
-    - at least 90 % of the blades is in the socket
+    - the blades are within a tenth of their length of where they end
     - the plug is tilted by less than 3 degrees
 
     **Fail Conditions:** the plug has left the grip (30 mm).
     """
 
-    fit = power_fit()
-    max_gap = NOT_INSERTED * BLADE[2]
+    make_fit = staticmethod(power_fit)
+    paper_threshold = 0.007
     lift = 0.03

@@ -13,9 +13,10 @@ from manifeel_ms3.tasks.placement import height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS, VisuotactileEnv
 
 FIXED_XY = (0.5, 0.0)  # m, nominal
-START_Z = 0.15  # m
+START_Z = 0.12  # m (public code of the paper)
 WOUND_UP = np.deg2rad(200)
-"""Rotation of the hand about the vertical at the start, in rad: near the end of its last joint."""
+"""Rotation of the hand about the vertical at the start, in rad: near the end of its last joint, so that the first turn is long.
+The public code starts at 0."""
 MAX_XY = 0.07
 """Largest half range of horizontal positions, in m, within which the wrist can be turned all the way."""
 CLEAR = 0.02
@@ -29,7 +30,7 @@ OFF_AXIS = 0.004
 
 @dataclass(frozen=True)
 class ScrewingRandomization:
-    """Half ranges of the uniform distributions; the defaults are the paper's."""
+    """Half ranges of the uniform distributions; the defaults are those of the paper and its public code."""
 
     fixed_xy: float = 0.05
     """Position of the bolt or the holder on each axis, in m."""
@@ -59,7 +60,7 @@ class ScrewingEnv(VisuotactileEnv):
 
     Randomization = ScrewingRandomization
     reward_config = ScrewingRewardConfig()
-    default_control_mode = "pd_ee_delta_pose"
+    default_control_mode = "pd_ee_delta_pose_fixed_roll_pitch"
     physics_rate = 720  # at 240 a thread tilts and jams
     contacts = CONTACTS | dict(contact_offset=5e-5)  # m: threads have a tenth of a millimetre of play
     screw: Screw

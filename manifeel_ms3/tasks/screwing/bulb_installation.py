@@ -33,7 +33,7 @@ OPEN = 0.04
 
 @dataclass(frozen=True)
 class BulbRandomization(ScrewingRandomization):
-    """Half ranges of the uniform distributions; the defaults of the first three are the paper's."""
+    """Half ranges of the uniform distributions; the defaults of the first three are those of the paper and its public code."""
 
     screw_depth: float = 0.0012
     """Depth of the bulb in the holder with `start="holder"`, in m."""
@@ -47,6 +47,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
     demo_steps=410,
+    revision=2,
 )
 class BulbInstallationEnv(ScrewingEnv):
     """Screw a light bulb into its holder.
@@ -58,7 +59,7 @@ class BulbInstallationEnv(ScrewingEnv):
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - holder: xy +-50 mm around (0.5, 0) m
 
-    The gripper starts 150 mm above the table, wound up; the bulb's place in it is fixed.
+    The gripper starts 120 mm above the table, wound up; the bulb's place in it is fixed.
 
     **Success Conditions:** held for 0.5 s
     - the cap is within 0.5 mm of the holder's contact

@@ -21,6 +21,7 @@ MAX_TILT = np.deg2rad(2.0)
     paper_tables=("I",),
     demo_megabytes=70.0,
     demo_steps=400,
+    revision=2,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):
     """Screw an M16 nut onto a bolt.
@@ -32,7 +33,7 @@ class NutBoltAssemblyEnv(ScrewingEnv):
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - bolt: xy +-50 mm around (0.5, 0) m
 
-    The gripper starts 150 mm above the table, wound up; the nut's place in it is fixed.
+    The gripper starts 120 mm above the table, wound up; the nut's place in it is fixed.
 
     **Success Conditions:** held for 0.5 s
     - the nut is 1.5 pitches down from where the threads first meet

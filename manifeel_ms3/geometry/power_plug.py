@@ -1,0 +1,152 @@
+"""A NEMA 5-15 plug with two blades and a longer ground pin that finds its hole first, and the socket with three holes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .fits import Fit, Lead
+from .part import Box, Cylinder, Hulls, Part, Piece, bevelled_box, block_with_holes
+
+METAL, BRASS, DARK, WHITE = (0.72, 0.74, 0.78), (0.80, 0.62, 0.20), (0.14, 0.14, 0.16), (0.85, 0.85, 0.82)
+ARC_POINTS = 8
+"""Number of points of the round side of the U-shaped ground pin."""
+
+
+@dataclass(frozen=True)
+class PowerPlugSizes:
+    """Sizes in m. The blades are wide along x and thin along y; the ground pin lies at positive x."""
+
+    blade: tuple[float, float, float]
+    """Each blade: wide, thin, long."""
+    blade_tip: float
+    """Length over which a blade narrows to `TIP_SHARE` of its section; 0 for a blunt one."""
+    spacing: float
+    """Distance of the blades' middles, along y."""
+    offset: float
+    """Distance of the ground pin from the line between the blades, along x."""
+    ground: tuple[float, float, float]
+    """Ground pin: along x, along y, long."""
+    ground_tip: tuple[float, float]
+    """Size of the ground pin's end along y, and the length over which it narrows to it; 0 long for a blunt one."""
+    blade_hole: tuple[float, float]
+    """Each blade's hole: along x, along y."""
+    ground_hole: tuple[float, float]
+    """The ground pin's hole: along x, along y."""
+    depth: float
+    """Depth of the holes."""
+    chamfer: float
+    """Width of the chamfer around the holes' mouths."""
+    block: tuple[float, float, float]
+    """The socket's block."""
+    handle: tuple[float, float, float]
+    """What is held."""
+    head: tuple[float, float, float] | None = None
+    """Broad body at the handle's end, within its length, from which the prongs come."""
+
+
+TIP_SHARE = 0.6
+"""Share of a blade's section that is left at its tip; by eye."""
+SIZES = {
+    # 1.8 times NEMA 5-15, measured in the meshes of the public code
+    "paper": PowerPlugSizes(
+        blade=(0.01161, 0.00256, 0.0250),
+        blade_tip=0.0045,
+        spacing=0.0225,
+        offset=1.8 * 0.0119,
+        ground=(0.00873, 0.00848, 0.0340),
+        ground_tip=(0.0068, 0.0050),
+        blade_hole=(0.0126, 0.0036),
+        ground_hole=(0.01042, 0.00972),
+        depth=0.032,
+        chamfer=2e-4,
+        block=(0.054, 0.090, 0.045),
+        handle=(0.019, 0.045, 0.060),
+        head=(0.056, 0.045, 0.014),
+    ),
+    # NEMA 5-15 (ANSI/NEMA WD 6) with 0.2 mm of play on each side
+    "tight": PowerPlugSizes(
+        blade=(0.00635, 0.0015, 0.0175),
+        blade_tip=0.0,
+        spacing=0.0127,
+        offset=0.0119,
+        ground=(0.0048, 0.0048, 0.0206),
+        ground_tip=(0.0048, 0.0),
+        blade_hole=(0.00675, 0.0019),
+        ground_hole=(0.0052, 0.0052),
+        depth=0.0206,
+        chamfer=0.0,
+        block=(0.060, 0.060, 0.030),
+        handle=(0.019, 0.032, 0.055),
+    ),
+}
+GRIP = -0.006  # m, from the handle's middle
+
+
+def power_fit(fit: str = "paper") -> Fit:
+    """NEMA 5-15 plug on a handle and a socket that looks up.
+
+    Args:
+        fit: "paper" for a plug of 1.8 times the standard with 0.5 to 0.8 mm of play on each side; "tight" for the standard.
+    """
+    sizes = SIZES[fit]
+    half = sizes.handle[2] / 2
+    head = [Box(sizes.head, (0.0, 0.0, half - sizes.head[2] / 2))] if sizes.head else []
+    rim, floor = sizes.block[2], sizes.block[2] - sizes.depth
+    ground, hole = sizes.ground, sizes.ground_hole
+    return Fit(
+        plug=Part(
+            "power_plug",
+            (_ground_pin(sizes, half), *_blades(sizes, half), Box(sizes.handle), *head),
+            DARK,
+            other_colours={0: BRASS, 1: METAL, 2: METAL},
+        ),
+        socket=Part("power_socket", (Box((*sizes.block[:2], floor), (0, 0, floor / 2)), *_outlet(sizes)), WHITE),
+        reach=half + ground[2],
+        grip=GRIP,
+        grip_width=sizes.handle[1],
+        rim=rim,
+        floor=floor,
+        max_gap=0.1 * sizes.blade[2],
+        goes_in_upright=fit == "paper",
+        leads=(Lead(-0.002, (sizes.offset / 2, 0.0)),),
+        **Fit.into_hole((ground[0] / 2, ground[1] / 2), (hole[0] / 2, hole[1] / 2), (sizes.offset / 2, 0.0)),
+    )
+
+
+def _blades(sizes: PowerPlugSizes, bottom: float) -> list[Piece]:
+    x, y, long = sizes.blade
+    places = [(-sizes.offset / 2, side * sizes.spacing / 2) for side in (-1, 1)]
+    if not sizes.blade_tip:
+        return [Box(sizes.blade, (*place, bottom + long / 2)) for place in places]
+    rectangle = np.array([(sx * x / 2, sy * y / 2) for sx in (-1, 1) for sy in (-1, 1)])
+    levels = [(rectangle, 0.0), (rectangle, long - sizes.blade_tip), (TIP_SHARE * rectangle, long)]
+    return [_prong(levels, place, bottom) for place in places]
+
+
+def _ground_pin(sizes: PowerPlugSizes, bottom: float) -> Piece:
+    x, y, long = sizes.ground
+    tip, taper = sizes.ground_tip
+    place = (sizes.offset / 2, 0.0)
+    if not taper:
+        return Cylinder(x / 2, long, (*place, bottom + long / 2))
+    # a U: half round towards +x, straight behind
+    angles = np.linspace(-np.pi / 2, np.pi / 2, ARC_POINTS)
+    arc = np.c_[x / 2 - y / 2 + y / 2 * np.cos(angles), y / 2 * np.sin(angles)]
+    section = np.concatenate([arc, [(-x / 2, -y / 2), (-x / 2, y / 2)]])
+    return _prong([(section, 0.0), (section, long - taper), (tip / y * section, long)], place, bottom)
+
+
+def _prong(levels: list[tuple[np.ndarray, float]], place: tuple[float, float], bottom: float) -> Hulls:
+    """Convex prong through sections (n, 2) at heights over `bottom`."""
+    points = [np.c_[section + place, np.full(len(section), bottom + z)] for section, z in levels]
+    return Hulls((np.concatenate(points),))
+
+
+def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
+    """Slab with the ground hole and, at one x, two blade holes: one wide hole, and a bar between the blades in it."""
+    (x, y), rim = sizes.blade_hole, sizes.block[2]
+    at, middle = -sizes.offset / 2, rim - sizes.depth / 2
+    holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]
+    slab = block_with_holes(sizes.block[:2], sizes.depth, holes, bottom=rim - sizes.depth, chamfer=sizes.chamfer)
+    bar = Box((x + 2 * sizes.chamfer, sizes.spacing - y, sizes.depth), (at, 0.0, middle))
+    return (*slab, bevelled_box(bar, {"-y": sizes.chamfer, "+y": sizes.chamfer}) if sizes.chamfer else bar)

@@ -1,0 +1,134 @@
+"""A USB-A plug on a handle, and the port that takes it one way round alone."""
+
+from dataclasses import dataclass
+
+from .fits import Fit, Lead
+from .part import Box, Part, Piece, block_with_holes
+
+METAL, INSULATOR, DARK, PLASTIC = (0.72, 0.74, 0.78), (0.90, 0.90, 0.90), (0.14, 0.14, 0.16), (0.25, 0.35, 0.55)
+HANDLE = (0.012, 0.030, 0.070)  # m; narrower than a pad, so that touch sees its edges
+GRIP = -0.012  # m, from the handle's middle
+BLOCK, RIM = (0.066, 0.066), 0.037  # m: the port's block, and its height
+
+
+@dataclass(frozen=True)
+class USBSizes:
+    """Sizes in m. "Wide" and "thin" are the two directions of the shell's section; the insulator lies at negative thin."""
+
+    shell: tuple[float, float, float]
+    """Outside of the shell: wide, thin, and its length."""
+    wall: float
+    """Thickness of the shell's sheet."""
+    insulator: tuple[float, float]
+    """Insulator in the shell: wide, thin."""
+    port: tuple[float, float, float]
+    """Port: wide, thin, and its depth."""
+    tongue: tuple[float, float]
+    """The port's tongue: wide, thin."""
+    tongue_at: float
+    """Place of the tongue's middle along thin; it fits into the shell's free half."""
+    recess: float
+    """Distance of the tongue's end from the port's mouth."""
+    wide_axis: int
+    """Axis along which the shell is wide: 0 for x, 1 for y, the fingers' closing axis."""
+    windows: tuple[float, float, float, float] | None = None
+    """The two latch windows in each broad face: their ends along the shell, their width, and the place of their middles."""
+
+
+SIZES = {
+    # 1.8 times the standard, measured in the meshes of the public code; the tongue's place along thin is in the middle of
+    # the shell's free half
+    "paper": USBSizes(
+        shell=(0.0220, 0.0060, 0.0200),
+        wall=0.0006,
+        insulator=(0.0200, 0.0020),
+        port=(0.0234, 0.00918, 0.0183),
+        tongue=(0.01764, 0.00198),
+        tongue_at=0.0010,
+        recess=0.0015,
+        wide_axis=1,
+        windows=(0.0075, 0.0100, 0.0045, 0.0046),  # their width and place by eye
+    ),
+    # USB-A plug (USB 2.0, 6.7) with 0.1 mm of play on each side
+    "tight": USBSizes(
+        shell=(0.0120, 0.0045, 0.0120),
+        wall=0.0003,
+        insulator=(0.0114, 0.0020),
+        port=(0.0122, 0.0047, 0.0120),
+        tongue=(0.0112, 0.0017),
+        tongue_at=0.0010,
+        recess=0.0030,
+        wide_axis=0,
+    ),
+}
+
+
+def usb_fit(fit: str = "paper") -> Fit:
+    """USB-A plug on a handle 12 x 30 x 70 mm, and a port in a block 66 x 66 x 37 mm. It goes in one way round alone.
+
+    Args:
+        fit: "paper" for a plug of 1.8 times the standard with 0.4 to 0.7 mm of play on each side; "tight" for the standard.
+    """
+    sizes = SIZES[fit]
+    floor = RIM - sizes.port[2]
+    shell = _shell(sizes)
+    hole, prong = _along(sizes, *sizes.port[:2]), _along(sizes, *sizes.shell[:2])
+    walls = block_with_holes(BLOCK, sizes.port[2], [(hole, (0.0, 0.0))], bottom=floor)
+    base = Box((*BLOCK, floor), (0.0, 0.0, floor / 2))
+    length = sizes.port[2] - sizes.recess
+    tongue = _box(sizes, (*sizes.tongue, length), (0.0, sizes.tongue_at, floor + length / 2))
+    # a plug that points down has its y turned over, so the tongue stands mirrored in y
+    tongue = Box(tongue.size, (tongue.centre[0], -tongue.centre[1], tongue.centre[2]))
+    pieces: tuple[Piece, ...] = (Box(HANDLE), *shell)
+    return Fit(
+        plug=Part("usb_plug", pieces, METAL, other_colours={0: DARK, 1: INSULATOR}),
+        socket=Part("usb_port", (tongue, base, *walls), PLASTIC, other_colours={0: INSULATOR}),
+        reach=HANDLE[2] / 2 + sizes.shell[2],
+        grip=GRIP,
+        grip_width=HANDLE[1],
+        rim=RIM,
+        floor=floor,
+        max_gap=0.1 * sizes.port[2],  # nine tenths of the way in
+        goes_in_upright=fit == "paper",
+        leads=(
+            Lead(-0.002),
+            Lead(sizes.recess - 0.0005, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
+        ),
+        **Fit.into_hole((prong[0] / 2, prong[1] / 2), (hole[0] / 2, hole[1] / 2)),
+    )
+
+
+def _along(sizes: USBSizes, wide: float, thin: float) -> tuple[float, float]:
+    """The (x, y) of a pair (wide, thin)."""
+    return (wide, thin) if sizes.wide_axis == 0 else (thin, wide)
+
+
+def _box(sizes: USBSizes, size: tuple[float, float, float], centre: tuple[float, float, float]) -> Box:
+    """A box from its (wide, thin, length) and its centre in the same axes."""
+    return Box((*_along(sizes, *size[:2]), size[2]), (*_along(sizes, *centre[:2]), centre[2]))
+
+
+def _shell(sizes: USBSizes) -> list[Box]:
+    """Insulator and the shell's four sheets, the broad ones with their windows; the insulator comes first."""
+    wide, thin, long = sizes.shell
+    bottom, middle = HANDLE[2] / 2, HANDLE[2] / 2 + long / 2
+    insulator = (*sizes.insulator, long)
+    boxes = [_box(sizes, insulator, (0.0, -thin / 2 + sizes.wall + sizes.insulator[1] / 2, middle))]
+    for side in (-1, 1):
+        boxes.append(_box(sizes, (sizes.wall, thin, long), (side * (wide - sizes.wall) / 2, 0.0, middle)))
+        at = side * (thin - sizes.wall) / 2
+        for (left, right), (low, high) in _sheet(sizes):
+            size = (right - left, sizes.wall, high - low)
+            boxes.append(_box(sizes, size, ((left + right) / 2, at, bottom + (low + high) / 2)))
+    return boxes
+
+
+def _sheet(sizes: USBSizes) -> list[tuple[tuple[float, float], tuple[float, float]]]:
+    """Rectangles ((left, right), (low, high)), in m along wide and along the shell, of a broad face around its windows."""
+    half, long = sizes.shell[0] / 2, sizes.shell[2]
+    if sizes.windows is None:
+        return [((-half, half), (0.0, long))]
+    low, high, width, at = sizes.windows
+    edges = (-half, -at - width / 2, -at + width / 2, at - width / 2, at + width / 2, half)
+    beside = [((edges[k], edges[k + 1]), (low, high)) for k in (0, 2, 4)]
+    return [((-half, half), (0.0, low)), *beside, ((-half, half), (high, long))]
