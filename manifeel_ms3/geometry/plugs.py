@@ -1,5 +1,6 @@
 """Pegs and plugs with their sockets: the 12 mm peg of the paper's public code, USB-A, NEMA 5-15."""
 
+from . import materials
 from .fits import Fit
 from .part import Box, Cylinder, Part, block_with_holes
 
@@ -16,7 +17,7 @@ def peg_fit(fit: str) -> Fit:
     """Rectangular peg, 50 mm long, and a socket 9 mm deep; the table is the hole's floor."""
     hole = PEG_HOLES[fit]
     return Fit(
-        plug=Part("peg", (Box(PEG_SIZE),), colour=BRASS, density=2700.0),
+        plug=Part("peg", (Box(PEG_SIZE),), colour=BRASS, density=materials.BRASS),
         socket=Part("socket", block_with_holes((0.025, 0.025), 0.009, [(hole, (0.0, 0.0))]), colour=PLASTIC),
         reach=PEG_SIZE[2] / 2,
         grip=-0.014,
@@ -38,7 +39,7 @@ def reorientation_fit() -> Fit:
     base = Box((0.03, 0.03, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
     rim = block_with_holes((0.03, 0.03), RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
     return Fit(
-        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=2700.0),
+        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=materials.BRASS),
         socket=Part("rim", (base, *rim), colour=PLASTIC),
         reach=z / 2,
         grip=-0.018,  # the fingers stay clear of the rim at 30 degrees
@@ -81,7 +82,13 @@ def usb_fit() -> Fit:
     # the tongue stands mirrored in y: a plug that points down has its y turned over
     tongue = Box(tongue.size, (0.0, -tongue.centre[1], tongue.centre[2]))
     return Fit(
-        plug=Part("usb_plug", (Box((0.012, 0.030, handle)), *shell), DARK, other_colours=dict.fromkeys(range(1, 5), METAL)),
+        plug=Part(
+            "usb_plug",
+            (Box((0.012, 0.030, handle)), *shell),
+            DARK,
+            other_colours=dict.fromkeys(range(1, 5), METAL),
+            other_densities=dict.fromkeys(range(1, 5), materials.STEEL),
+        ),
         socket=Part("usb_port", (base, *walls, tongue), PLASTIC, other_colours={5: (0.9, 0.9, 0.9)}),
         reach=handle / 2 + z,
         grip=-0.012,
@@ -107,7 +114,11 @@ def power_fit() -> Fit:
     blade_hole, ground_hole = (BLADE[0] + 2 * NEMA_GAP, BLADE[1] + 2 * NEMA_GAP), 2 * (GROUND_RADIUS + NEMA_GAP)
     return Fit(
         plug=Part(
-            "power_plug", (Box((0.019, 0.032, handle)), *blades, ground), DARK, other_colours={1: METAL, 2: METAL, 3: BRASS}
+            "power_plug",
+            (Box((0.019, 0.032, handle)), *blades, ground),
+            DARK,
+            other_colours={1: METAL, 2: METAL, 3: BRASS},
+            other_densities=dict.fromkeys((1, 2, 3), materials.BRASS),
         ),
         socket=Part(
             "power_socket",
