@@ -13,6 +13,7 @@ from .ball_sorting import BallSortingExpert as BallSortingExpert
 from .insertion import GearExpert as GearExpert
 from .insertion import InsertionExpert as InsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
+from .peg_reorientation import PegReorientationExpert as PegReorientationExpert
 from .screwing import BulbExpert as BulbExpert
 from .screwing import ScrewingExpert as ScrewingExpert
 

@@ -95,9 +95,7 @@ class InsertionExpertConfig:
     """Number of steps without progress after which the amplitude has doubled, its limit. Tuned."""
 
 
-@register_demonstrator(
-    "ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1", "ManiFeel-PegReorientation-v1"
-)
+@register_demonstrator("ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1")
 class InsertionExpert:
     """Knows the parts, sees roughly where the socket is, and finds the hole by touch.
 
@@ -165,18 +163,21 @@ class InsertionExpert:
         skills, config = self.skills, self.config
         yield np.zeros(6)
         skills.tare()
-        lean = self._lean
         while True:
-            over = np.array([*(self.socket[:2] + self.fit.aim), self._rim])
-            start = self._tool_for(self._corner, above(over, config.hover_height), lean)
-            yield from skills.reach(*start, tolerance=config.approach_tolerance)
-            yield from self._touch_down(over, lean)
-            yield from self._feel_corner(lean)
-            yield from self._stand_up()
+            yield from self._enter()
             yield from self._press()
             here, facing = skills.commanded
             yield from skills.reach(above(here, config.hover_height), facing, tolerance=config.return_tolerance)
             self._see_socket()
+
+    def _enter(self) -> Actions:
+        """Bring the plug's end into the hole, or onto its rim."""
+        over = np.array([*(self.socket[:2] + self.fit.aim), self._rim])
+        start = self._tool_for(self._corner, above(over, self.config.hover_height), self._lean)
+        yield from self.skills.reach(*start, tolerance=self.config.approach_tolerance)
+        yield from self._touch_down(over, self._lean)
+        yield from self._feel_corner(self._lean)
+        yield from self._stand_up()
 
     def _touch_down(self, over: np.ndarray, lean: Rotation) -> Actions:
         """Lower the leading corner; where it lands on the rim instead of in the hole, try the next place of a circle."""
