@@ -12,6 +12,7 @@ from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from .ball_sorting import BallSortingExpert as BallSortingExpert
 from .leaning_insertion import LeaningInsertionExpert as LeaningInsertionExpert
 from .object_search import ObjectSearchExpert as ObjectSearchExpert
+from .peg_reorientation import PegReorientationExpert as PegReorientationExpert
 from .screwing import BulbExpert as BulbExpert
 from .screwing import ScrewingExpert as ScrewingExpert
 from .upright_insertion import UprightInsertionExpert as UprightInsertionExpert

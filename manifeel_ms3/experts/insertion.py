@@ -39,7 +39,7 @@ class InsertionExpertConfig:
 
     disturbance_rate: float = 0.04
     """Chance, in each step, of a push of the hand while the plug is free: one or two in an episode."""
-    disturbance: float = 0.5
+    disturbance: float = 0.3
     """Largest addition of a push to each axis of the action, as a share of the action's range."""
     disturbance_steps: int = 3
     """Number of steps that a push lasts."""
@@ -154,13 +154,14 @@ class InsertionExpert:
         raise NotImplementedError
 
     def _disturb(self) -> np.ndarray:
-        """Addition (6,) to the action: now and then, while the plug is free, a push of the hand in a random direction."""
+        """Addition (6,) to the action: now and then, while the plug is free, a push of the hand to some side."""
         config = self.config
         if self._disturbed_steps == 0:
             free = self._place(self._end)[2] > self._rim + config.free_height
             if not free or self._rng.uniform() > config.disturbance_rate:
                 return np.zeros(6)
             self._disturbance = self._rng.uniform(-config.disturbance, config.disturbance, 6)
+            self._disturbance[2] = abs(self._disturbance[2])  # up: a push down would ram the plug into the rim
             self._disturbed_steps = config.disturbance_steps
         self._disturbed_steps -= 1
         return self._disturbance

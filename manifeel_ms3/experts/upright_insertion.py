@@ -74,6 +74,3 @@ def insertion_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
 def gear_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
     """The demonstrator of the gear for the sizes of the parts."""
     return (UprightGearExpert if env.fit.goes_in_upright else LeaningGearExpert)(env, seed)
-
-
-register_demonstrator("ManiFeel-PegReorientation-v1")(LeaningInsertionExpert)

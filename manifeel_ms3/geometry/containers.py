@@ -8,6 +8,7 @@ CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004
 CONTAINER_FLOOR = 0.004  # m, thickness
 BATTERY_SIZE = 0.025  # m
 TERMINAL_HEIGHT = 0.001  # m
+BATTERY_DENSITY = 2000.0  # kg/m^3: an alkaline block 6LR61 has 45 g in 48.5 x 26.5 x 17.5 mm (data sheets)
 BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010  # m, inside; the floor's thickness
 BOWL_WALL, BOWL_WEDGES = 0.005, 16  # m; number of convex pieces of the round wall
 
@@ -40,7 +41,11 @@ def battery() -> Part:
     size = BATTERY_SIZE
     terminal = Box((size / 3, size / 3, TERMINAL_HEIGHT), (0.0, 0.0, size / 2 + TERMINAL_HEIGHT / 2))
     return Part(
-        "battery", (Box((size, size, size)), terminal), (0.12, 0.35, 0.20), density=2000.0, other_colours={1: (0.8, 0.7, 0.3)}
+        "battery",
+        (Box((size, size, size)), terminal),
+        (0.12, 0.35, 0.20),
+        density=BATTERY_DENSITY,
+        other_colours={1: (0.8, 0.7, 0.3)},
     )
 
 

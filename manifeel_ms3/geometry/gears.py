@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .fits import Fit, Lead
+from .materials import ABS, ALUMINIUM
 from .part import Box, Cylinder, Hulls, Part, Piece, extruded, ring_of_wedges
 
 MODULE = 0.002  # m: pitch diameter per tooth
@@ -23,7 +24,6 @@ RING_OVERLAP = 2e-4  # m, of the ring and the teeth, so that no gap is between t
 NECK_RADIUS = 0.010  # m, of the ring between the gear and its handle
 LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))  # along x and y, with which the bore's rim goes ahead; tuned
 GEAR_FRICTION = 0.15  # greased
-ALUMINIUM = 2700.0  # kg/m^3
 BESIDE = 0.0022  # m from the shaft's side to where the bore's rim is set down; tuned
 TIP_POINTS = 24  # number of corners of a shaft's chamfer; 0.04 mm inside its circle at most
 FLANK_POINTS = 5
@@ -110,8 +110,10 @@ def gear_fit(fit: str = "paper") -> Fit:
             "medium_gear",
             (body, ring, Box(HANDLE_SIZE)),
             COLOURS["medium"],
+            density=ALUMINIUM,
             friction=GEAR_FRICTION,
             other_colours={2: (0.14, 0.14, 0.16)},
+            other_densities={2: ABS},
         ),
         socket=gear_base(fit),
         reach=reach,

@@ -18,6 +18,8 @@ from sapien.render import RenderMaterial
 from manifeel_ms3.paths import cache_dir, writable_cache
 from manifeel_ms3.sensors.depth.surfaces import give_relief
 
+from .materials import ABS
+
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
 """Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""
 ROUGHNESS, SPECULAR = 0.6, 0.3  # of every part's surface, chosen by eye
@@ -135,12 +137,15 @@ class Part:
     """Shapes that are drawn, collide and are touched."""
     colour: tuple[float, float, float]
     """RGB in [0, 1]."""
-    density: float = 1000.0
-    """Density in kg/m^3."""
+    density: float = ABS
+    """Density in kg/m^3 of a dynamic part: that of the material it is drawn as. A light part between stiff pads needs a high
+    physics rate; see `VisuotactileEnv.physics_rate`."""
     friction: float = 0.5
     """Coulomb's coefficient."""
     other_colours: dict[int, tuple[float, float, float]] = field(default_factory=dict)
     """Colours of single pieces, by index in `pieces`."""
+    other_densities: dict[int, float] = field(default_factory=dict)
+    """Densities of single pieces, by index in `pieces`."""
     undrawn: frozenset[int] = frozenset()
     """Indices in `pieces` of those that collide, but are neither drawn nor touched."""
     springs: dict[int, float] = field(default_factory=dict)
@@ -158,7 +163,7 @@ class Part:
                 look = RenderMaterial(base_color=[*colour, 1.0], roughness=ROUGHNESS, specular=SPECULAR)
             # the engine takes negative restitution as a spring, and averages it with the other body's
             material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
-            piece.add_to(builder, material, self.density, look)
+            piece.add_to(builder, material, self.other_densities.get(k, self.density), look)
         builder.initial_pose = initial_pose  # pyright: ignore[reportAttributeAccessIssue]  (ManiSkill annotates its own poses alone)
         builder.set_physx_body_type(body_type)
         actor = builder.build(self.name)

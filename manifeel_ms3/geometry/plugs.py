@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from . import materials
 from .fits import Fit, Lead
 from .part import Box, Part, block_with_holes
 
@@ -45,7 +46,7 @@ def peg_fit(fit: str = "paper") -> Fit:
     plate = (Box((side, side, floor), (0.0, 0.0, floor / 2)),) if floor else ()
     half_hole = (socket.hole[0] / 2, socket.hole[1] / 2)
     return Fit(
-        plug=Part("peg", (Box(PEG_SIZE),), colour=BRASS, density=2700.0),
+        plug=Part("peg", (Box(PEG_SIZE),), colour=BRASS, density=materials.BRASS),
         socket=Part("socket", (*block, *plate), colour=PLASTIC),
         reach=PEG_SIZE[2] / 2,
         grip=-socket.grip,
@@ -69,7 +70,7 @@ def reorientation_fit() -> Fit:
     base = Box((0.03, 0.03, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
     rim = block_with_holes((0.03, 0.03), RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
     return Fit(
-        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=2700.0),
+        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=materials.BRASS),
         socket=Part("rim", (base, *rim), colour=PLASTIC),
         reach=z / 2,
         grip=-0.018,  # the fingers stay clear of the rim at 30 degrees

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from . import materials
 from .fits import Fit, Lead
 from .part import Box, Cylinder, Hulls, Part, Piece, bevelled_box, block_with_holes
 
@@ -99,6 +100,7 @@ def power_fit(fit: str = "paper") -> Fit:
             (_ground_pin(sizes, half), *_blades(sizes, half), Box(sizes.handle), *head),
             DARK,
             other_colours={0: BRASS, 1: METAL, 2: METAL},
+            other_densities=dict.fromkeys(range(3), materials.BRASS),
         ),
         socket=Part("power_socket", (Box((*sizes.block[:2], floor), (0, 0, floor / 2)), *_outlet(sizes)), WHITE),
         reach=half + ground[2],

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from .fits import Fit, Lead
+from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
 METAL, INSULATOR, DARK, PLASTIC = (0.72, 0.74, 0.78), (0.90, 0.90, 0.90), (0.14, 0.14, 0.16), (0.25, 0.35, 0.55)
@@ -80,8 +81,9 @@ def usb_fit(fit: str = "paper") -> Fit:
     # a plug that points down has its y turned over, so the tongue stands mirrored in y
     tongue = Box(tongue.size, (tongue.centre[0], -tongue.centre[1], tongue.centre[2]))
     pieces: tuple[Piece, ...] = (Box(HANDLE), *shell)
+    sheets = dict.fromkeys(range(2, len(pieces)), STEEL)
     return Fit(
-        plug=Part("usb_plug", pieces, METAL, other_colours={0: DARK, 1: INSULATOR}),
+        plug=Part("usb_plug", pieces, METAL, other_colours={0: DARK, 1: INSULATOR}, other_densities=sheets),
         socket=Part("usb_port", (tongue, base, *walls), PLASTIC, other_colours={0: INSULATOR}),
         reach=HANDLE[2] / 2 + sizes.shell[2],
         grip=GRIP,

@@ -27,20 +27,22 @@ def turned_about(axis: int, angle: torch.Tensor) -> torch.Tensor:
     return axis_angle_to_quaternion(turn)
 
 
-def start_pose(n: int, position: tuple[float, float, float], ranges: tuple[float, float, float], rotation: float) -> Pose:
+def start_pose(
+    n: int, position: tuple[float, float, float], ranges: tuple[float, float, float], rotation: float | torch.Tensor
+) -> Pose:
     """Random poses (n,) of a tool that points down.
 
     Args:
         n: Number of poses.
         position: Nominal position, in m.
         ranges: Half range of each coordinate, in m.
-        rotation: Half range of the rotation about each axis of the robot's base, in rad.
+        rotation: Half range of the rotation about every axis of the robot's base, or about each (3,), in rad.
     """
     offset = uniform_in(torch.tensor(ranges), n, 3)
     return Pose.create_from_pq(torch.tensor(position) + offset, random_downward(n, rotation))
 
 
-def random_downward(n: int, rotation: float) -> torch.Tensor:
+def random_downward(n: int, rotation: float | torch.Tensor) -> torch.Tensor:
     """Quaternions (n, 4) of a tool that points down with its x along the base's, turned by +- `rotation` about each axis."""
     turn = axis_angle_to_quaternion(uniform_in(rotation, n, 3))
     return quaternion_multiply(turn, torch.tensor([0.0, 1.0, 0.0, 0.0]).expand(n, 4))

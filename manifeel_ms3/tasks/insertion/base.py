@@ -19,8 +19,8 @@ START_XYZ = (0.5, 0.0, 0.15)
 """Nominal position of the tool, in m, at the start (public code of the paper)."""
 GRIP_FORCE = 20.0
 """Force of each pad on the plug, in N."""
-GRIP_INDENTATION = 6e-4
-"""Indentation of each gel under the grip of 20 N, in m: four contact points of 8 kN/m."""
+GRIP_INDENTATION = 3.2e-4
+"""Indentation of each gel under the grip of 20 N, in m: sixteen contact points of 4 kN/m."""
 MAX_TILT = np.deg2rad(3.0)
 """Angle, in rad, from the socket's axis below which the plug counts as upright."""
 LOST = 0.03
@@ -119,12 +119,17 @@ class InsertionEnv(VisuotactileEnv):
         self.socket.set_pose(Pose.create_from_pq(socket))
 
         position = (*START_XYZ[:2], START_XYZ[2] + self.lift)
-        start = start_pose(n, position, (ranges.start_xy, ranges.start_xy, ranges.start_z), ranges.start_rotation)
+        start = start_pose(n, position, (ranges.start_xy, ranges.start_xy, ranges.start_z), self._start_rotation)
         self.agent.reset_tool(start, self.fit.grip_width / 2 - GRIP_INDENTATION, GRIP_FORCE)
 
         pitch = turned_about(1, uniform_in(ranges.in_hand_pitch, n))
         in_hand = Pose.create_from_pq(q=pitch) * self._grip
         self.plug.set_pose(start * in_hand)
+
+    @property
+    def _start_rotation(self) -> float | torch.Tensor:
+        """Half range of the tool's rotation at the start, in rad: of every axis of the robot's base, or of each (3,)."""
+        return self.randomization.start_rotation
 
     @property
     def _grip(self) -> Pose:
