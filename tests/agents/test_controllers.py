@@ -5,7 +5,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-ACTION_DIMS = {"pd_ee_delta_pose_fixed_gripper": 6, "pd_ee_delta_pose": 7, "pd_ee_delta_yaw": 5}
+ACTION_DIMS = {
+    "pd_ee_delta_pose_fixed_gripper": 6,
+    "pd_ee_delta_pose": 7,
+    "pd_ee_delta_pose_fixed_roll_pitch": 7,
+    "pd_ee_delta_pose_fixed_rotation": 7,
+    "pd_ee_delta_yaw": 5,
+}
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +88,21 @@ def test_yaw_mode_turns_about_the_vertical_alone(make_env):
         env.step(np.array([0, 0, 0, 0, -1.0]))
     _, turned = tool(env)
     assert (turned * facing.inv()).as_rotvec() == pytest.approx([0, 0, 0.2], abs=4e-3)
+
+
+@pytest.mark.parametrize(("task", "axes"), [("ManiFeel-NutBoltAssembly-v1", (3, 4)), ("ManiFeel-ObjectSearch-v1", (3, 4, 5))])
+def test_rotations_that_the_paper_fixes_do_nothing(make_env, task, axes):
+    env = make_env(task, obs_mode="none", render_backend="none")
+    assert env.action_space.shape == (7,)
+    turned = {}
+    for size in (0.0, 1.0):
+        env.reset(seed=0)
+        action = np.zeros(7)
+        action[list(axes)] = size
+        for _ in range(3):
+            env.step(action)
+        turned[size] = env.unwrapped.agent.tcp_pose_at_base.raw_pose
+    assert torch.equal(turned[0.0], turned[1.0])
 
 
 def test_gripper_opens_and_closes(make_env):
