@@ -104,9 +104,9 @@ class Trainer:
 
     def __init__(self, args: TrainArgs, policy_class: type[VisuotactilePolicy], processes: Processes):
         assert args.run_dir is not None
+        self.run_dir, self.processes = args.run_dir, processes
         lr = args.public_code_lr() if args.lr is None else args.lr
         self.args = args = replace(args, lr=lr)
-        self.run_dir, self.processes = args.run_dir, processes
         self.device = processes.device
         keep_freed_memory(self.device)
         seed_everything(args.seed)

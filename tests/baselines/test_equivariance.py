@@ -78,7 +78,11 @@ def test_fields_turn_by_any_angle():
 
 def test_the_papers_encoder_has_the_depth_and_fields_of_the_public_code():
     encoder = EquivariantResNet(128)
-    widths = [(block.net[0].weight.shape[1], block.net[0].weight.shape[0]) for block in encoder.blocks]
+    convolutions = [module for module in encoder.blocks.modules() if isinstance(module, GroupConv) and module.size == 3]
+    widths = [
+        (first.weight.shape[1], second.weight.shape[0])
+        for first, second in zip(convolutions[::2], convolutions[1::2], strict=True)
+    ]
     assert widths == [(8, 8), (8, 16), (16, 32), (32, 64), (64, 128), (128, 128)]
     sides = []
     hooks = [block.register_forward_hook(lambda _m, _i, out: sides.append(out.shape[-1])) for block in encoder.blocks]
