@@ -40,7 +40,7 @@ class Args:
     batch_size: int = 64 if ON_GPU else 8
     """Number of samples in a gradient step."""
     image_size: int = 256
-    """Height and width of the images, pixels; 224 for tactile representations."""
+    """Height and width of the images, pixels; those of TacRGB are 224 for tactile representations."""
     steps: int = 30 if ON_GPU else 6
     """Number of timed gradient steps of each loop."""
     precision: Literal["fp32", "bf16"] = "bf16" if ON_GPU else "fp32"
@@ -60,8 +60,12 @@ SPEC_SENSORS = ("rgb+tacrgb", ("wrist",), ("right",))
 
 def random_episodes(spec, count: int, length: int) -> list[Episode]:
     def episode() -> Episode:
-        images = {key: RNG.integers(0, 255, (length + 1, spec.image_size, spec.image_size, 3), np.uint8) for key in spec.images}
-        return images | {POSE: RNG.random((length + 1, 9), np.float32), "actions": RNG.random((length, 6), np.float32)}
+        sizes = {key: (length + 1, spec.size_of(key), spec.size_of(key), 3) for key in spec.images}
+        images = {key: RNG.integers(0, 255, size, np.uint8) for key, size in sizes.items()}
+        return images | {
+            POSE: RNG.random((length + 1, spec.pose_features), np.float32),
+            "actions": RNG.random((length, 6), np.float32),
+        }
 
     return [episode() for _ in range(count)]
 
@@ -120,8 +124,8 @@ def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iter
 def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) -> float:
     torch.manual_seed(0)
     size = args.image_size if tacrgb == "resnet18" else 224
-    spec = observation_spec(*SPEC_SENSORS, size)
-    data = SequenceDataset(random_episodes(spec, 4, 60), spec, 2, 16, torch.device("cpu" if plain_data else args.device))
+    spec = observation_spec(*SPEC_SENSORS, args.image_size, size)
+    data = SequenceDataset(random_episodes(spec, 4, 60), spec, 2, 16, 8, torch.device("cpu" if plain_data else args.device))
     policy = DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb=tacrgb)), spec, 6).to(args.device)
     steps = loop(args, policy, data)
     for _ in islice(steps, WARM_UP):

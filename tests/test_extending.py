@@ -137,7 +137,7 @@ def test_a_policy_learns(site, monkeypatch):
     policy = RegressionPolicy(PolicyConfig(encoder=encoder, down_dims=(32, 64)), spec, 6)
     optimizer = torch.optim.Adam(policy.parameters(), 3e-3)
     obs = {
-        POSE: torch.rand(3, 2, 9),
+        POSE: torch.rand(3, 2, 7),
         spec.images[0]: torch.randint(0, 255, (3, 2, 32, 32, 3), dtype=torch.uint8),
         spec.force_fields[0]: torch.rand(3, 2, 10, 14, 3),
     }

@@ -52,7 +52,8 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
     """The observations of a policy, from its training settings or a checkpoint's config."""
     cameras, pads = tuple(config["cameras"]), tuple(config["tactile_sensors"])
     rows, columns = config.get("taxel_shape", TAXEL_SHAPE)
-    return observation_spec(config["obs_mode"], cameras, pads, config["image_size"], (rows, columns))
+    sizes = config["image_size"], config["tactile_image_size"]
+    return observation_spec(config["obs_mode"], cameras, pads, *sizes, (rows, columns), config["pose"])
 
 
 class PolicyAgent:

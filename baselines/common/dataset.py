@@ -2,18 +2,23 @@
 
 from collections.abc import Iterable
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats import format_of
+from manifeel_ms3.demonstrations.formats import MANISKILL_H5, format_of
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
 
 Episode = dict[str, np.ndarray]
+SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend", "render_backend")
+"""Arguments of a recording that do not belong to the task: what was observed, and the machine's backends."""
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
@@ -47,22 +52,55 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
     return episodes
 
 
+def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
+    """The arguments of the task with which demonstrations were recorded, such as its lighting or fit, by which evaluation goes.
+
+    Formats other than trajectory files do not hold them.
+
+    Raises:
+        DemonstrationError: Two files were recorded with different arguments.
+    """
+    known = [(file, _task_arguments(file)) for file in files if MANISKILL_H5.matches(file)]
+    for (first, expected), (second, found) in pairwise(known):
+        for name in sorted(expected | found):
+            if expected.get(name) != found.get(name):
+                raise DemonstrationError(
+                    f"{first} was recorded with {name}={expected.get(name)!r}, {second} with {name}={found.get(name)!r}; train "
+                    "on files that were recorded with the same arguments of the task"
+                )
+    return known[0][1] if known else {}
+
+
+def _task_arguments(file: Path) -> dict[str, Any]:
+    recorded = read_header(file)["env_info"]["env_kwargs"]
+    return {name: value for name, value in recorded.items() if name not in SENSING}
+
+
 class SequenceDataset:
     """All frames of all episodes on one device, images as uint8; a sample is an index into them.
 
     A sample at step t holds the observations t - obs_horizon + 1 to t, and the `pred_horizon` actions that begin with the first
-    of them. Before the start of an episode its first step is repeated, after the end its last.
+    of them. Before the start of an episode its first step is repeated, after the end its last. Samples end where an executed
+    action would be such a repetition, as in the paper's public code: an episode of T steps has T - action_horizon + 1 samples.
+    An episode that is shorter than `action_horizon` has one sample.
 
     Args:
         episodes: Episodes from `read_episodes`.
         spec: Observations of the policy.
         obs_horizon: Number of observations of a sample.
         pred_horizon: Number of actions of a sample.
+        action_horizon: Number of actions that are executed from the last observation on.
         device: Device that holds the frames.
     """
 
     def __init__(
-        self, episodes: list[Episode], spec: ObservationSpec, obs_horizon: int, pred_horizon: int, device: torch.device
+        self,
+        episodes: list[Episode],
+        spec: ObservationSpec,
+        obs_horizon: int,
+        pred_horizon: int,
+        action_horizon: int,
+        device: torch.device,
     ):
         self.spec, self.device, self.num_episodes = spec, device, len(episodes)
         lengths = np.array([len(episode["actions"]) for episode in episodes])
@@ -71,8 +109,9 @@ class SequenceDataset:
         self.observations = {key: self._load([episode[key][:-1] for episode in episodes]) for key in spec.keys}
         ends = np.cumsum(lengths)
         starts = ends - lengths
-        step = np.arange(ends[-1])
-        episode_of = np.repeat(np.arange(len(lengths)), lengths)
+        samples = np.maximum(lengths - action_horizon + 1, 1)  # of each episode
+        episode_of = np.repeat(np.arange(len(lengths)), samples)
+        step = np.arange(len(episode_of)) + (starts - np.cumsum(samples) + samples)[episode_of]
         self._place = torch.as_tensor(np.stack([episode_of, step - starts[episode_of]], axis=1))
         first, last = starts[episode_of][:, None], ends[episode_of][:, None] - 1
         begin = step[:, None] - obs_horizon + 1

@@ -11,32 +11,36 @@ from transformers import ResNetConfig, ResNetModel
 
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
-from .observation import POSE, POSE_FEATURES, ObservationSpec, is_tactile
-
-IMAGE_FEATURES = 64
-"""Features of each image and of each force field: 32 key points of two coordinates, as in Diffusion Policy."""
+from .observation import POSE, ObservationSpec, is_tactile
 
 
 @dataclass
 class EncoderConfig:
-    """The networks that encode a policy's observations."""
+    """The networks that encode a policy's observations; the defaults are those of the paper's public code."""
 
     image: str = "resnet18"
-    """Network of each camera, by its name in `IMAGE_ENCODERS`."""
+    """Network of each camera: "resnet18" averages its features over the image, as the paper's public code does;
+    "resnet18_keypoints" has the spatial softmax of the paper's text; "small_cnn" is for a CPU."""
     tacrgb: str = "resnet18"
     """Network of each TacRGB image, by its name in `TACRGB_ENCODERS`."""
     freeze_tacrgb: bool = False
     """Keep the weights of a pretrained TacRGB network as they were loaded, and train only the layers after it."""
     force_field: str = "resnet18"
     """Network of each TacFF force field, by its name in `FIELD_ENCODERS`."""
+    image_features: int = 512
+    """Number of features of each camera image. With "resnet18_keypoints" they are the two coordinates of half as many points,
+    of which Diffusion Policy has 32."""
+    tactile_features: int = 512
+    """Number of features of each TacRGB image and of each TacFF force field; 512 as in the paper's public code."""
     crop: int = 0
-    """Side of the square crops of images, pixels: random in training, central in evaluation; whole images if 0."""
+    """Side of the square crops of camera images, pixels: random in training, central in evaluation; whole images if 0. TacRGB
+    is not cropped: where the gel is pressed has a meaning."""
 
 
 class SpatialSoftmax(nn.Module):
     """Expected image coordinates of `points` learned features (Levine et al. 2016): (B, C, H, W) -> (B, 2 points)."""
 
-    def __init__(self, channels: int, points: int = IMAGE_FEATURES // 2):
+    def __init__(self, channels: int, points: int):
         super().__init__()
         self.score = nn.Conv2d(channels, points, 1)
 
@@ -81,7 +85,7 @@ class SmallCNN(nn.Sequential):
     On a few demonstrations it learns to locate a part in the image in a quarter of the steps that key points need.
     """
 
-    def __init__(self, size: int):
+    def __init__(self, size: int, features: int):
         places = math.ceil(size / 8) ** 2
         super().__init__(
             *_conv(3, 24, kernel_size=5, stride=2),
@@ -90,7 +94,7 @@ class SmallCNN(nn.Sequential):
             *_conv(64, 64),
             nn.Conv2d(64, 16, 1),
             nn.Flatten(),
-            nn.Linear(16 * places, IMAGE_FEATURES),
+            nn.Linear(16 * places, features),
             nn.SiLU(),
         )
 
@@ -102,14 +106,14 @@ def _conv(inputs: int, outputs: int, kernel_size: int = 3, stride: int = 1) -> l
 class SmallFieldNet(nn.Module):
     """A small force field network: two convolutions, then one layer over all places, because places carry meaning."""
 
-    def __init__(self, taxel_shape: tuple[int, int]):
+    def __init__(self, taxel_shape: tuple[int, int], features: int):
         super().__init__()
         rows, columns = (math.ceil(side / 2) for side in taxel_shape)
         self.net = nn.Sequential(
             *_conv(3, 32),
             *_conv(32, 32, stride=2),
             nn.Flatten(),
-            nn.Linear(32 * rows * columns, IMAGE_FEATURES),
+            nn.Linear(32 * rows * columns, features),
             nn.SiLU(),
         )
 
@@ -146,35 +150,47 @@ def load_pretrained(policy: nn.Module, weights: Path) -> None:
         encoder.load(weights)
 
 
-def _key_points(backbone: ResNet18) -> nn.Module:
-    return nn.Sequential(backbone, SpatialSoftmax(backbone.out_channels))
+def _key_points(_size: int, features: int) -> nn.Module:
+    if features % 2:
+        raise InvalidArgumentError(
+            f"{features} features are no pairs of coordinates; 'resnet18_keypoints' needs an even number"
+        )
+    return nn.Sequential(ResNet18(), SpatialSoftmax(ResNet18.out_channels, features // 2))
 
 
-def _pooled(backbone: ResNet18) -> nn.Module:
-    """Mean features instead of key points: ResNet-18 shrinks a field of 10 x 14 taxels to a single place."""
-    return nn.Sequential(backbone, nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(backbone.out_channels, IMAGE_FEATURES))
+def _pooled(_shape: int | tuple[int, int], features: int) -> nn.Module:
+    """The mean of ResNet-18's features over all places, and a layer where another number of features is asked for."""
+    pooled = [ResNet18(), nn.AdaptiveAvgPool2d(1), nn.Flatten()]
+    if features == ResNet18.out_channels:
+        return nn.Sequential(*pooled)
+    return nn.Sequential(*pooled, nn.Linear(ResNet18.out_channels, features), nn.ReLU())  # as in the public code of EquiDP
 
 
-IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {
-    "resnet18": lambda size: _key_points(ResNet18()),
+MakeImageEncoder = Callable[[int, int], nn.Module]
+"""Function from the side of the image, pixels, and a number of features to a network (B, 3, size, size) -> (B, features)."""
+IMAGE_ENCODERS: dict[str, MakeImageEncoder] = {
+    "resnet18": _pooled,
+    "resnet18_keypoints": _key_points,
     "small_cnn": SmallCNN,
 }
-"""Functions from the side of the image, pixels, to a network (B, 3, size, size) -> (B, 64)."""
-TACRGB_ENCODERS: dict[str, Callable[[int], nn.Module]] = dict(IMAGE_ENCODERS)
-"""As `IMAGE_ENCODERS`, for TacRGB images; other packages add theirs with `register_tacrgb_encoder`."""
-FIELD_ENCODERS: dict[str, Callable[[tuple[int, int]], nn.Module]] = {
-    "resnet18": lambda taxel_shape: _pooled(ResNet18()),  # the paper's: the force field as a small image
+"""Networks over camera images."""
+TACRGB_ENCODERS: dict[str, MakeImageEncoder] = dict(IMAGE_ENCODERS)
+"""Networks over TacRGB images; other packages add theirs with `register_tacrgb_encoder`."""
+FIELD_ENCODERS: dict[str, Callable[[tuple[int, int], int], nn.Module]] = {
+    "resnet18": _pooled,  # the paper's: the force field as a small image, which ResNet-18 shrinks to a single place
     "small": SmallFieldNet,
 }
-"""Functions from the rows and columns of taxels to a network (B, 3, rows, columns) -> (B, 64)."""
+"""Functions from the rows and columns of taxels and a number of features to a network (B, 3, rows, columns) -> (B,
+features)."""
 
 
-def register_tacrgb_encoder(name: str, make: Callable[[int], nn.Module]) -> None:
+def register_tacrgb_encoder(name: str, make: MakeImageEncoder) -> None:
     """Add a network for TacRGB images that every policy can use.
 
     Args:
         name: Name by which `EncoderConfig.tacrgb` chooses it.
-        make: Function from the side of the image, pixels, to a network (B, 3, size, size) -> (B, 64).
+        make: Function from the side of the image, pixels, and a number of features to a network
+            (B, 3, size, size) -> (B, features).
 
     Raises:
         InvalidArgumentError: The name is taken.
@@ -191,10 +207,9 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
         UnknownNameError: No network has the configured name.
         InvalidArgumentError: The network does not take images of this size, or cannot be frozen.
     """
-    size = config.crop or spec.image_size
     if not is_tactile(key):
-        return _by_name(IMAGE_ENCODERS, config.image)(size)
-    encoder = _by_name(TACRGB_ENCODERS, config.tacrgb)(size)
+        return by_name(IMAGE_ENCODERS, config.image)(camera_size(config, spec), config.image_features)
+    encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(spec.tactile_image_size, config.tactile_features)
     if config.freeze_tacrgb:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(
@@ -204,16 +219,26 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     return encoder
 
 
+def camera_size(config: EncoderConfig, spec: ObservationSpec) -> int:
+    """Side of the camera images that networks get, pixels; a crop that is larger than the images leaves them whole."""
+    return min(config.crop or spec.image_size, spec.image_size)
+
+
 def field_encoder(config: EncoderConfig, spec: ObservationSpec) -> nn.Module:
     """The network of one TacFF force field.
 
     Raises:
         UnknownNameError: No network has the configured name.
     """
-    return _by_name(FIELD_ENCODERS, config.force_field)(spec.taxel_shape)
+    return by_name(FIELD_ENCODERS, config.force_field)(spec.taxel_shape, config.tactile_features)
 
 
-def _by_name(table: dict[str, Callable], name: str) -> Callable:
+def by_name(table: dict[str, Callable], name: str) -> Callable:
+    """The function that makes the network of a name.
+
+    Raises:
+        UnknownNameError: No network has this name; the message lists those that there are.
+    """
     if name not in table:
         raise UnknownNameError(f"encoder {name!r} is unknown; choose from {sorted(table)}")
     return table[name]
@@ -237,22 +262,34 @@ class ObservationEncoder(nn.Module):
         self.crop, self.spec = config.crop, spec
         self.images = nn.ModuleList(image_encoder(config, spec, key) for key in spec.images)
         self.fields = nn.ModuleList(field_encoder(config, spec) for _ in spec.force_fields)
-        per_step = IMAGE_FEATURES * (len(self.images) + len(self.fields)) + POSE_FEATURES
-        self.out_features = obs_horizon * per_step
+        pads = sum(map(is_tactile, spec.images)) + len(self.fields)
+        cameras = len(spec.images) + len(self.fields) - pads
+        self.out_features = obs_horizon * (
+            config.image_features * cameras + config.tactile_features * pads + spec.pose_features
+        )
 
     def forward(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
         """Encode observations {key: (B, obs_horizon, ...)}: images as uint8, the rest as normalised floats."""
         batch, horizon = obs[POSE].shape[:2]
         features = [obs[POSE].flatten(0, 1)]
         for key, net in zip(self.spec.images, self.images, strict=True):
-            features.append(net(network_images(cropped(obs[key], self.crop, self.training))))
+            features.append(net(network_images(key, obs[key], self.crop, self.training)))
         for key, net in zip(self.spec.force_fields, self.fields, strict=True):
             features.append(net(obs[key].flatten(0, 1).movedim(-1, 1)))
         return torch.cat(features, dim=-1).view(batch, horizon, -1).flatten(1)
 
 
-def network_images(images: torch.Tensor) -> torch.Tensor:
-    """Images (B, T, H, W, 3) uint8 as networks take them: (B * T, 3, H, W) in [-1, 1]."""
+def network_images(key: str, images: torch.Tensor, crop: int, at_random: bool) -> torch.Tensor:
+    """Images (B, T, H, W, 3) uint8 as networks take them: (B * T, 3, H, W) in [-1, 1], those of cameras cropped.
+
+    Args:
+        key: The observation's path.
+        images: The images.
+        crop: Side of the crops of camera images, pixels; 0 for whole images.
+        at_random: Whether crops are taken at random places; else the centre is taken.
+    """
+    if not is_tactile(key):
+        images = cropped(images, crop, at_random)
     return images.flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0
 
 

@@ -4,6 +4,7 @@ Training reads observations from files, evaluation from the environment; both ca
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -14,8 +15,14 @@ from manifeel_ms3.tasks.obs_modes import split_obs_mode
 
 POSE = "extra/tcp_pose"
 """Key of the pose of the tool centre point."""
-POSE_FEATURES = 9
-"""Numbers by which networks know the pose: position and two columns of the rotation matrix (`pose_features`)."""
+PoseForm = Literal["quaternion", "rotation_6d"]
+"""Forms in which networks take the pose: its position with a quaternion, or with two columns of the rotation matrix."""
+POSE_FEATURES: dict[PoseForm, int] = {"quaternion": 7, "rotation_6d": 9}
+"""Number of numbers of a pose, by its form."""
+MIDDLE_QUATERNION = np.array([0.0, np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0])
+"""Quaternion (wxyz) of the hand pointing down with its wrist joint in the middle of its range, which is a yaw of 45 degrees."""
+MIN_IMAGE_SIZE = 16
+"""Smallest side of an image that policies take, pixels."""
 TAXEL_SHAPE = TactileSensorConfig.taxel_shape
 """Rows and columns of taxels of the default sensor."""
 
@@ -29,14 +36,27 @@ class ObservationSpec:
     force_fields: tuple[str, ...]
     """TacFF force fields, float32 (*taxel_shape, 3), N."""
     image_size: int
-    """Height and width to which images are resized, pixels."""
+    """Height and width to which camera images are resized, pixels."""
+    tactile_image_size: int
+    """Height and width to which TacRGB images are resized, pixels."""
     taxel_shape: tuple[int, int] = TAXEL_SHAPE
     """Rows and columns of taxels in a force field."""
+    pose: PoseForm = "quaternion"
+    """Form of the tool's pose."""
 
     @property
     def keys(self) -> list[str]:
         """All observations."""
         return [*self.images, *self.force_fields, POSE]
+
+    @property
+    def pose_features(self) -> int:
+        """Number of numbers of the tool's pose."""
+        return POSE_FEATURES[self.pose]
+
+    def size_of(self, key: str) -> int:
+        """Height and width of an image, pixels."""
+        return self.tactile_image_size if is_tactile(key) else self.image_size
 
 
 def observation_spec(
@@ -44,7 +64,9 @@ def observation_spec(
     cameras: tuple[str, ...],
     tactile_sensors: tuple[str, ...],
     image_size: int,
+    tactile_image_size: int | None = None,
     taxel_shape: tuple[int, int] = TAXEL_SHAPE,
+    pose: PoseForm = "quaternion",
 ) -> ObservationSpec:
     """Observations of a policy that is trained with an observation mode; the tool pose is always among them.
 
@@ -52,12 +74,25 @@ def observation_spec(
         obs_mode: Modalities, such as "rgb+tacff".
         cameras: Names of the cameras.
         tactile_sensors: Sides of the tactile sensors, "left" or "right".
-        image_size: Height and width to which images are resized, pixels.
+        image_size: Height and width to which camera images are resized, pixels.
+        tactile_image_size: Height and width to which TacRGB images are resized, pixels; those of the cameras if not given.
         taxel_shape: Rows and columns of taxels in a force field.
+        pose: Form of the tool's pose.
 
     Raises:
-        InvalidArgumentError: The mode holds privileged observations, or some that the encoders do not take.
+        InvalidArgumentError: The mode holds privileged observations, or some that the encoders do not take, or a size or the
+        form
+            of the pose is not allowed.
     """
+    if tactile_image_size is None:
+        tactile_image_size = image_size
+    for name, size in (("image_size", image_size), ("tactile_image_size", tactile_image_size)):
+        if size < MIN_IMAGE_SIZE:
+            raise InvalidArgumentError(
+                f"{name}={size}: images have at least {MIN_IMAGE_SIZE} pixels a side; the paper's have 256"
+            )
+    if pose not in get_args(PoseForm):
+        raise InvalidArgumentError(f"pose={pose!r}: the forms of a pose are {list(get_args(PoseForm))}")
     own, touch = split_obs_mode(obs_mode)
     if own not in ("rgb", "none"):
         raise InvalidArgumentError(
@@ -66,7 +101,7 @@ def observation_spec(
     images = [f"sensor_data/{camera}/rgb" for camera in cameras if own == "rgb"]
     images += [f"sensor_data/tactile_{side}/rgb" for side in tactile_sensors if "rgb" in touch]
     fields = [f"sensor_data/tactile_{side}/force_field" for side in tactile_sensors if "force_field" in touch]
-    return ObservationSpec(tuple(images), tuple(fields), image_size, taxel_shape)
+    return ObservationSpec(tuple(images), tuple(fields), image_size, tactile_image_size, taxel_shape, pose)
 
 
 def is_tactile(key: str) -> bool:
@@ -75,11 +110,11 @@ def is_tactile(key: str) -> bool:
 
 
 def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:
-    """One observation over time, (T, ...), as networks take it: images resized, poses as nine continuous numbers."""
+    """One observation over time, (T, ...), as networks take it: images resized, poses in the form that the policy takes."""
     if key in spec.images:
-        return prepare_images(value, spec.image_size)
+        return prepare_images(value, spec.size_of(key))
     if key == POSE:
-        return pose_features(value)
+        return rotation_6d_pose(value) if spec.pose == "rotation_6d" else quaternion_pose(value)
     return value.astype(np.float32)
 
 
@@ -90,11 +125,22 @@ def prepare_images(images: np.ndarray, size: int) -> np.ndarray:
     return np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) for image in images])
 
 
-def pose_features(pose: np.ndarray) -> np.ndarray:
+def quaternion_pose(pose: np.ndarray) -> np.ndarray:
+    """Poses (T, 7) with unit wxyz quaternions, of which q and -q, the same rotation, have the same sign.
+
+    The sign is that of the smaller angle to `MIDDLE_QUATERNION`. It changes half a turn away from there; a hand that points
+    down does not come there, because its wrist joint ends 166 degrees to either side of the middle (Franka's data sheet).
+    """
+    quaternion = pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    sign = np.where(quaternion @ MIDDLE_QUATERNION < 0, -1.0, 1.0)
+    return np.concatenate([pose[:, :3], sign[:, None] * quaternion], axis=1).astype(np.float32)
+
+
+def rotation_6d_pose(pose: np.ndarray) -> np.ndarray:
     """Position and first two columns of the rotation matrix, (T, 9), of poses (T, 7) with wxyz quaternions.
 
-    The quaternions q and -q are one rotation and have the same features (Zhou et al. 2019, "On the Continuity of Rotation
-    Representations in Neural Networks").
+    Unlike quaternions, the columns are a continuous function of the rotation everywhere (Zhou et al. 2019, "On the Continuity
+    of Rotation Representations in Neural Networks").
     """
     w, x, y, z = (pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)).T
     first = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], axis=1)

@@ -8,7 +8,7 @@ import torch.nn as nn
 
 from .encoders import EncoderConfig, ObservationEncoder
 from .normalizer import Normalizer
-from .observation import POSE, POSE_FEATURES, ObservationSpec
+from .observation import POSE, ObservationSpec
 from .unet import ConditionalUnet1D
 
 
@@ -63,7 +63,7 @@ class VisuotactilePolicy(nn.Module):
         super().__init__()
         self.config, self.spec, self.action_dim = config, spec, action_dim
         self.encoder, self.unet = self.make_networks()
-        sizes = {POSE: POSE_FEATURES} | dict.fromkeys(spec.force_fields, 3)
+        sizes = {POSE: spec.pose_features} | dict.fromkeys(spec.force_fields, 3)
         self.obs_normalizers = nn.ModuleDict({module_name(key): Normalizer(size) for key, size in sizes.items()})
         self.action_normalizer = Normalizer(action_dim)
 

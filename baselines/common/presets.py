@@ -23,7 +23,7 @@ def for_cpu(args: Args, inference_steps: int, **policy: Any) -> Args:
         args.policy,
         action_horizon=2,  # of the 50 initial states of `make demo`, 36 succeed with 2, 28 with 4, 17 with 8
         obs_horizon=1,  # with 2, a policy infers the next action from its own motion and ignores the images
-        encoder=EncoderConfig(image="small_cnn", tacrgb="small_cnn", force_field="small", crop=76),
+        encoder=EncoderConfig("small_cnn", "small_cnn", force_field="small", image_features=64, tactile_features=64, crop=76),
         down_dims=(64, 128, 256),
         diffusion_step_embed_dim=64,
         pose_noise=0.1,
@@ -35,6 +35,8 @@ def for_cpu(args: Args, inference_steps: int, **policy: Any) -> Args:
         policy=small,
         inference_steps=inference_steps,
         image_size=80,
+        tactile_image_size=80,
+        pose="rotation_6d",
         batch_size=64,
         steps=2000,
         lr=1e-3,

@@ -10,8 +10,11 @@ import torch
 
 from manifeel_ms3.tasks.registry import short_name
 
+from .observation import PoseForm
 from .policy import PolicyConfig
 
+PUBLIC_CODE_LR = 1e-4
+"""Learning rate in the paper's public code, but for its Diffusion Policy; the paper's table has 8e-5 for all policies."""
 PAPER_EPOCHS = 50_000
 """Training epochs of the paper, summed over all demonstrations: with n demonstrations a policy trains 50,000 / n epochs."""
 ON_GPU = torch.cuda.is_available()
@@ -20,7 +23,7 @@ ON_GPU = torch.cuda.is_available()
 
 @dataclass
 class TrainArgs:
-    """Settings of a training run. The defaults are the paper's; the optimiser and EMA are those of Diffusion Policy's code."""
+    """Settings of a training run. The defaults are those of the paper's public code."""
 
     demos: tuple[Path, ...]
     """Trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout."""
@@ -33,7 +36,12 @@ class TrainArgs:
     tactile_sensors: tuple[str, ...] = ("right",)
     """Sides of the tactile sensors that the policy observes: "left" or "right"."""
     image_size: int = 256
-    """Height and width to which all images are resized, pixels."""
+    """Height and width to which camera images are resized, pixels."""
+    tactile_image_size: int = 256
+    """Height and width to which TacRGB images are resized, pixels; 224 for T3 and AnyTouch in the paper."""
+    pose: PoseForm = "quaternion"
+    """Form of the tool's pose: "quaternion" is the paper's, 7 numbers, with a sign that does not jump while the hand points
+    down; "rotation_6d" has 9 numbers, the position and two columns of the rotation matrix."""
     tacrgb_weights: Path | None = None
     """File of weights with which the tactile representation starts: as its authors released them, or from pretrain.py."""
     num_demos: int | None = None
@@ -46,8 +54,9 @@ class TrainArgs:
     """Number of samples in a gradient step of each process."""
     steps: int | None = None
     """Number of gradient steps; if not given, the paper's 50,000 epochs divided by the number of demonstrations."""
-    lr: float = 1e-4
-    """Learning rate of AdamW after the warm-up; it then falls to 0 along a cosine."""
+    lr: float | None = None
+    """Learning rate of AdamW after the warm-up, from which it falls to 0 along a cosine; if not given, that of the paper's
+    public code."""
     betas: tuple[float, float] = (0.95, 0.999)
     """Decay rates of AdamW's first and second moments."""
     weight_decay: float = 1e-6
@@ -88,6 +97,10 @@ class TrainArgs:
     wandb_project: str | None = None
     """Project of Weights & Biases that receives the log, too; WANDB_MODE=offline writes it to disk."""
 
+    def public_code_lr(self) -> float:
+        """The learning rate of the paper's public code for these settings."""
+        return PUBLIC_CODE_LR
+
 
 FREE_ON_RESUME = {
     *("demos", "tacrgb_weights", "run_dir", "resume", "overwrite", "device", "compile", "log_every", "wandb_project"),
@@ -113,7 +126,7 @@ def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:
 
     Args:
         num_demos: Number of training episodes.
-        num_samples: Number of samples in an epoch, which is the number of their steps.
+        num_samples: Number of samples in an epoch (`SequenceDataset`).
         batch_size: Number of samples in a gradient step.
     """
     return round(PAPER_EPOCHS / num_demos) * math.ceil(num_samples / batch_size)

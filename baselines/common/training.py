@@ -39,7 +39,7 @@ from .checkpoint import (
     saved_checkpoints,
     unpack,
 )
-from .dataset import Episode, SequenceDataset, read_episodes
+from .dataset import Episode, SequenceDataset, read_episodes, recorded_env_kwargs
 from .encoders import load_pretrained
 from .memory import keep_freed_memory, lay_out_channels_last
 from .observation import ObservationSpec
@@ -104,7 +104,9 @@ class Trainer:
 
     def __init__(self, args: TrainArgs, policy_class: type[VisuotactilePolicy], processes: Processes):
         assert args.run_dir is not None
-        self.args, self.run_dir, self.processes = args, args.run_dir, processes
+        self.run_dir, self.processes = args.run_dir, processes
+        lr = args.public_code_lr() if args.lr is None else args.lr
+        self.args = args = replace(args, lr=lr)
         self.device = processes.device
         keep_freed_memory(self.device)
         seed_everything(args.seed)
@@ -112,15 +114,14 @@ class Trainer:
         spec = spec_of(vars(args))
         episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
         spec = with_taxel_shape(spec, episodes[0])
-        self.dataset = SequenceDataset(episodes, spec, args.policy.obs_horizon, args.policy.pred_horizon, self.device)
+        horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
+        self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
         self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
         self.config = run_config(args, policy_class, self.dataset)
 
         self.policy = self._make_policy(policy_class)
-        self.optimizer = torch.optim.AdamW(
-            self.policy.parameters(), args.lr, args.betas, weight_decay=args.weight_decay, fused=True
-        )
+        self.optimizer = torch.optim.AdamW(self.policy.parameters(), lr, args.betas, weight_decay=args.weight_decay, fused=True)
         self.schedule = get_cosine_schedule_with_warmup(self.optimizer, args.warmup_steps, self.total_steps)
         self.ema = EMAModel(
             self.policy.parameters(), args.ema_max_decay, use_ema_warmup=True, power=args.ema_power, inv_gamma=1.0, foreach=True
@@ -354,13 +355,14 @@ def with_taxel_shape(spec: ObservationSpec, episode: Episode) -> ObservationSpec
 
 
 def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
-    """The settings of a run, and the facts of its data that its policy depends on, in types that json knows."""
+    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json knows."""
     return as_json(args) | dict(
         policy_name=policy_class.name,
         action_dim=dataset.actions.shape[1],
         taxel_shape=list(dataset.spec.taxel_shape),
         num_demos=dataset.num_episodes,
         num_samples=len(dataset),
+        env_kwargs=recorded_env_kwargs(args.demos),
     )
 
 

@@ -3,32 +3,39 @@
     python baselines/diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
     python baselines/diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
 
-The preset `paper` has the paper's hyperparameters, `cpu` a small network that learns on two CPU cores in minutes.
+The preset `paper` has the settings of the paper's public code, `cpu` a small network that learns on two CPU cores in minutes.
 """
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from baselines.common.encoders import IMAGE_ENCODERS
 from baselines.common.presets import for_cpu
-from baselines.common.train_args import TrainArgs
+from baselines.common.train_args import PUBLIC_CODE_LR, TrainArgs
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.registry import PolicySpec, Preset, preset_cli
 from manifeel_ms3.command_line import run
 
+LR = 8e-5
+"""Learning rate in the paper and in its public code; with UniT, T3 and AnyTouch the code has 1e-4."""
+
 
 @dataclass
 class Args(TrainArgs):
-    """Settings of a training run; the defaults are the paper's."""
+    """Settings of a training run; the defaults are those of the paper's public code."""
 
     policy: DiffusionConfig = field(default_factory=DiffusionConfig)
     inference_steps: int = 100
     """Number of denoising steps in evaluation; with as many as diffusion steps the sampler is DDPM, with fewer DDIM."""
-    lr: float = 8e-5
+
+    def public_code_lr(self):
+        from_scratch = "tacrgb" not in self.obs_mode.split("+") or self.policy.encoder.tacrgb in IMAGE_ENCODERS
+        return LR if from_scratch else PUBLIC_CODE_LR
 
 
 PRESETS = {
-    "paper": Preset("The paper's hyperparameters.", Args(demos=())),
+    "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
         "A small network that learns on two CPU cores in minutes.",
         for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),

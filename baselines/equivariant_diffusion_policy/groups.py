@@ -66,21 +66,22 @@ def filter_basis(size: int) -> torch.Tensor:
 class GroupConv(nn.Module):
     """Convolution (B, C * 8, H, W) of regular fields, or (B, C, H, W) of an image, to regular fields (B, C * 8, H, W).
 
-    The rotations of a channel lie next to each other. Height and width stay the same.
+    The rotations of a channel lie next to each other.
 
     Args:
         inputs: Number of input channels.
         outputs: Number of output channels.
         size: Side of the filters, pixels.
         lifting: Whether the input is an image, not a regular field.
+        padded: Whether the rim is repeated around the input; else the output is smaller by the filters' rim.
     """
 
     basis: torch.Tensor
     shift: torch.Tensor
 
-    def __init__(self, inputs: int, outputs: int, size: int, lifting: bool = False):
+    def __init__(self, inputs: int, outputs: int, size: int, lifting: bool = False, padded: bool = True):
         super().__init__()
-        self.size, self.lifting = size, lifting
+        self.size, self.lifting, self.padded = size, lifting, padded
         seen = 1 if lifting else ORDER
         self.register_buffer("basis", filter_basis(size), persistent=False)
         waves = self.basis.shape[1]
@@ -97,7 +98,7 @@ class GroupConv(nn.Module):
         outputs, inputs, seen, _ = self.weight.shape
         kernel = turned.movedim(0, 1).reshape(outputs * ORDER, inputs * seen, self.size, self.size)
         rim = self.size // 2
-        if rim:  # padding with zeros would draw a square border, which only quarter turns leave unchanged
+        if rim and self.padded:  # padding with zeros would draw a square border, which only quarter turns leave unchanged
             fields = F.pad(fields, (rim, rim, rim, rim), mode="replicate")
         return F.conv2d(fields, kernel, self.bias.repeat_interleave(ORDER))
 
@@ -124,3 +125,24 @@ def halve(fields: torch.Tensor) -> torch.Tensor:
     if fields.shape[-1] % 2 == 0:
         return F.avg_pool2d(fields, 2)
     return F.avg_pool2d(fields, 3, stride=2, padding=1, count_include_pad=False)
+
+
+def pooled(fields: torch.Tensor, factor: int) -> torch.Tensor:
+    """The largest values of fields (B, C, H, W) in windows, of which there are `factor` times fewer along each side.
+
+    Where the sides are no multiples of the factor, windows overlap symmetrically, so that quarter turns stay exact.
+    """
+    return F.adaptive_max_pool2d(fields, [max(side // factor, 1) for side in fields.shape[2:]])
+
+
+def turned(fields: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
+    """Regular fields (B, C, 8) turned by any angles (B,), in rad.
+
+    A field is a function on the circle that is known at eight places; between them it is the sum of the waves of up to four
+    periods that has these values. Turns by multiples of 45 degrees move the values on, and turns add up with those of the
+    group.
+    """
+    places = torch.arange(ORDER, device=fields.device) * (2 * math.pi / ORDER)
+    apart = places[:, None] - places - angle[:, None, None]  # (B, 8, 8), from each place moved on to each place
+    waves = 1 + 2 * sum(torch.cos(n * apart) for n in range(1, ORDER // 2)) + torch.cos(ORDER // 2 * apart)
+    return torch.einsum("bgh,bch->bcg", waves / ORDER, fields)

@@ -1,10 +1,11 @@
 """Equivariant Diffusion Policy (Wang et al. 2024): Diffusion Policy with networks that are equivariant under C8."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 
+from baselines.common.encoders import EncoderConfig
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE
 from baselines.common.policy import unet_settings
@@ -15,12 +16,20 @@ from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantObservationEncoder, E
 
 @dataclass
 class EquivariantConfig(DiffusionConfig):
-    """Settings of the Equivariant Diffusion Policy; the defaults are the paper's."""
+    """Settings of the Equivariant Diffusion Policy; the defaults are those of the paper's public code."""
 
     prediction: Literal["epsilon", "sample"] = "sample"
     sampler: Literal["ddpm", "ddim"] = "ddim"
+    encoder: EncoderConfig = field(
+        default_factory=lambda: EncoderConfig(tacrgb="resnet18_keypoints", tactile_features=128, crop=230)
+    )
+    """Networks that encode the observations. Of the cameras' networks there are equivariant ones, "resnet18" and "small_cnn",
+    with `hidden` regular fields instead of `image_features`."""
     hidden: int = 128
-    """Number of regular channels at the end of the camera encoder; each has eight numbers, one for every rotation of C8."""
+    """Number of regular fields of each camera's features and of an observation; each has eight numbers, one for every rotation
+    of C8."""
+    action_fields: int = 64
+    """Number of regular fields that the U-Net has for an action."""
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):
@@ -33,7 +42,8 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
     def make_networks(self):
         config = self.config
         encoder = EquivariantObservationEncoder(config.encoder, self.spec, config.hidden, config.obs_horizon)
-        return encoder, EquivariantUnet(self.action_dim, encoder.out_features, **unet_settings(config))
+        unet = EquivariantUnet(self.action_dim, encoder.out_features, config.action_fields, **unet_settings(config))
+        return encoder, unet
 
     def fit_normalizers(self, observations, actions):
         super().fit_normalizers(observations, actions)

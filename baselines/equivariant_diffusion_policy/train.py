@@ -3,14 +3,14 @@
     python baselines/equivariant_diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
     python baselines/equivariant_diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
 
-The preset `paper` has the paper's hyperparameters, `cpu` a small network that learns on two CPU cores in minutes.
+The preset `paper` has the settings of the paper's public code, `cpu` a small network that learns on two CPU cores in minutes.
 """
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from baselines.common.encoders import EncoderConfig
+from baselines.common.observation import PoseForm
 from baselines.common.presets import for_cpu
 from baselines.common.train_args import TrainArgs
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
@@ -20,17 +20,19 @@ from manifeel_ms3.command_line import run
 
 @dataclass
 class Args(TrainArgs):
-    """Settings of a training run; the defaults are the paper's."""
+    """Settings of a training run; the defaults are those of the paper's public code."""
 
-    policy: EquivariantConfig = field(default_factory=lambda: EquivariantConfig(encoder=EncoderConfig(crop=230)))
+    policy: EquivariantConfig = field(default_factory=EquivariantConfig)
+    pose: PoseForm = "rotation_6d"
+    """Form of the tool's pose; "rotation_6d" as in the public code, because quaternions do not turn as vectors do."""
     inference_steps: int = 100
     """Number of denoising steps of DDIM in evaluation."""
 
 
 PRESETS = {
-    "paper": Preset("The paper's hyperparameters.", Args(demos=())),
+    "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
-        "A small network that learns on two CPU cores in minutes.", for_cpu(Args(demos=()), inference_steps=8, hidden=16)
+        "A small network that learns on two CPU cores in minutes.", for_cpu(Args(demos=()), inference_steps=8, hidden=64)
     ),
 }
 

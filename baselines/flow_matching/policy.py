@@ -17,7 +17,7 @@ TIME_SCALE = 100.0
 
 @dataclass
 class FlowConfig(PolicyConfig):
-    """Settings of Flow Matching; by default the network learns the velocity along straight paths."""
+    """Settings of Flow Matching; by default the network learns the velocity along straight paths, from Gaussian noise."""
 
     prediction: Literal["velocity", "sample"] = "velocity"
     """Output of the network: the velocity, as in the paper, or the clean actions to which it leads, which a short training
@@ -31,6 +31,9 @@ class FlowConfig(PolicyConfig):
     """Time between the two points of a path that must agree; the whole path takes time 1."""
     velocity_weight: float = 1e-5
     """Weight of the agreement of velocities in the loss. Only with consistency."""
+    public_code: bool = False
+    """Reproduce two traits of the paper's public code: generation starts from noise that is uniform in [0, 1], though training
+    draws Gaussian noise, and the network is given the time in [0, 1] instead of [0, 100]."""
 
 
 class FlowMatchingPolicy(VisuotactilePolicy):
@@ -40,9 +43,20 @@ class FlowMatchingPolicy(VisuotactilePolicy):
     Config = FlowConfig
     config: FlowConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
+    @property
+    def time_scale(self) -> float:
+        """Factor from a time in [0, 1] to what the network is given."""
+        return 1.0 if self.config.public_code else TIME_SCALE
+
+    def noise(self, condition, generator):
+        if not self.config.public_code:
+            return super().noise(condition, generator)
+        shape = (len(condition), self.config.pred_horizon, self.action_dim)
+        return torch.rand(shape, generator=generator, device=condition.device)
+
     def velocity(self, x: torch.Tensor, time: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The velocity (B, T, A) at points x (B, T, A) and times (B,) in [0, 1]."""
-        predicted = self.unet(x, TIME_SCALE * time, condition)
+        predicted = self.unet(x, self.time_scale * time, condition)
         if self.config.prediction == "velocity":
             return predicted
         return (predicted - x) / _column((1 - time).clamp(min=self.config.interval))
@@ -51,7 +65,7 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         noise, time = torch.randn_like(clean), torch.rand(len(clean), device=clean.device)
         if self.config.consistency:
             return self._consistency_loss(noise, clean, time, condition)
-        predicted = self.unet(_between(noise, clean, time), TIME_SCALE * time, condition)
+        predicted = self.unet(_between(noise, clean, time), self.time_scale * time, condition)
         return F.mse_loss(predicted, clean - noise if self.config.prediction == "velocity" else clean)
 
     def _consistency_loss(self, noise, clean, time, condition):

@@ -15,7 +15,7 @@ import torch
 
 from baselines.common.agent import spec_of
 from baselines.common.memory import lay_out_channels_last
-from baselines.common.observation import POSE, POSE_FEATURES
+from baselines.common.observation import POSE
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.evaluation.provenance import machine
@@ -217,11 +217,11 @@ def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, t
     spec, horizon, batch = spec_of(vars(args)), args.policy.obs_horizon, args.batch_size
     network = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE).to(args.device)
     lay_out_channels_last(network)  # as in training
-    images = torch.rand(batch, horizon, spec.image_size, spec.image_size, 3, device=args.device)
-    obs = {key: (255 * images).to(torch.uint8) for key in spec.images}
+    shapes = {key: (batch, horizon, spec.size_of(key), spec.size_of(key), 3) for key in spec.images}
+    obs = {key: torch.randint(255, shape, dtype=torch.uint8, device=args.device) for key, shape in shapes.items()}
     field = (*TactileSensorConfig.taxel_shape, 3)
     obs |= {key: torch.rand(batch, horizon, *field, device=args.device) for key in spec.force_fields}
-    obs[POSE] = torch.rand(batch, horizon, POSE_FEATURES, device=args.device)
+    obs[POSE] = torch.rand(batch, horizon, spec.pose_features, device=args.device)
     return network, args, obs, torch.rand(batch, args.policy.pred_horizon, ACTION_SIZE, device=args.device)
 
 

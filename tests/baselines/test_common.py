@@ -7,28 +7,31 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from baselines.common.dataset import SequenceDataset, read_episodes
+from baselines.common.dataset import SequenceDataset, read_episodes, recorded_env_kwargs
 from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
 from baselines.common.normalizer import Normalizer
-from baselines.common.observation import POSE, observation_spec, pose_features, prepare
+from baselines.common.observation import POSE, observation_spec, prepare, quaternion_pose, rotation_6d_pose
 from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
+from manifeel_ms3.errors import InvalidArgumentError
 from tests.conftest import PEG
 
 SPEC = observation_spec("tacff", (), ("right",), 64)
 FIELD = SPEC.force_fields[0]
+HORIZONS = dict(obs_horizon=2, pred_horizon=16, action_horizon=8)
+SAMPLE = Path(__file__).parents[2] / "data/sample"
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
 def dataset(demos):
-    return SequenceDataset(read_episodes([demos], PEG, SPEC, None), SPEC, obs_horizon=2, pred_horizon=16, device=CPU)
+    return SequenceDataset(read_episodes([demos], PEG, SPEC, None), SPEC, **HORIZONS, device=CPU)
 
 
 def test_samples_are_the_windows_of_the_file(demos, dataset):
     episodes = read_demonstrations(demos, SPEC.keys, PEG)
-    assert len(dataset) == sum(len(e["actions"]) for e in episodes)
-    second = len(episodes[0]["actions"])
+    assert len(dataset) == sum(len(e["actions"]) - 7 for e in episodes)
+    second = len(episodes[0]["actions"]) - 7
     for sample, episode, t in ((10, 0, 10), (second + 5, 1, 5)):
         obs, actions = dataset.sample(torch.tensor([sample]))
         assert np.array_equal(obs[FIELD][0].numpy(), episodes[episode][FIELD][t - 1 : t + 1])
@@ -37,11 +40,37 @@ def test_samples_are_the_windows_of_the_file(demos, dataset):
 
 def test_windows_do_not_cross_episodes(demos, dataset):
     episodes = read_demonstrations(demos, SPEC.keys, PEG)
-    last, first = len(episodes[0]["actions"]) - 1, len(episodes[0]["actions"])
+    last, first = len(episodes[0]["actions"]) - 8, len(episodes[0]["actions"]) - 7
     obs, actions = dataset.sample(torch.tensor([last, first]))
-    assert np.array_equal(actions[0, 2:].numpy(), np.repeat(episodes[0]["actions"][-1:], 14, axis=0))
+    assert np.array_equal(actions[0, 9:].numpy(), np.repeat(episodes[0]["actions"][-1:], 7, axis=0))
     assert np.array_equal(obs[FIELD][1, 0].numpy(), episodes[1][FIELD][0])
     assert np.array_equal(actions[1, 0].numpy(), episodes[1]["actions"][0])
+
+
+def test_no_executed_action_is_padding():
+    """The actions count the steps of their episode: an action that repeats its predecessor's number is padding."""
+    episodes = [{"actions": np.arange(t, dtype=np.float32)[:, None], POSE: np.zeros((t + 1, 7))} for t in (100, 20, 8)]
+    data = SequenceDataset(episodes, observation_spec("none", (), (), 64), **HORIZONS, device=CPU)
+    assert len(data) == 93 + 13 + 1  # as in the paper's public code
+    _, actions = data.sample(torch.arange(len(data)))
+    executed = actions[:, 1:9, 0]
+    assert (executed.diff(dim=1) == 1).all()
+    assert executed[92].tolist() == list(range(92, 100))
+
+
+def test_an_episode_shorter_than_the_executed_actions_has_a_sample():
+    episodes = [{"actions": np.arange(t, dtype=np.float32)[:, None], POSE: np.zeros((t + 1, 7))} for t in (3, 9)]
+    data = SequenceDataset(episodes, observation_spec("none", (), (), 64), **HORIZONS, device=CPU)
+    assert len(data) == 1 + 2
+    assert data.sample(torch.tensor([0]))[1][0, :5, 0].tolist() == [0, 0, 1, 2, 2]
+    assert data.names(torch.tensor([0, 1, 2])) == "episode 0 step 0, episode 1 step 0, episode 1 step 1"
+
+
+def test_the_arguments_of_the_recorded_task_are_known(demos):
+    assert set(recorded_env_kwargs([demos, demos])) == {"fit"}
+    assert recorded_env_kwargs([Path(__file__).parents[1] / "demonstrations/lerobot/images"]) == {}
+    with pytest.raises(DemonstrationError, match=r"was recorded with fit='\w+', .* with fit=None"):
+        recorded_env_kwargs([demos, SAMPLE / PEG / "trajectory.h5"])
 
 
 def test_number_of_demonstrations(demos):
@@ -56,18 +85,40 @@ def test_lerobot_datasets_are_read_beside_files(demos):
     folder = Path(__file__).parents[1] / "demonstrations/lerobot/images"
     episodes = read_episodes([folder, demos], PEG, SPEC, None)
     assert [len(episode["actions"]) for episode in episodes[:2]] == [4, 3]
-    assert len(SequenceDataset(episodes, SPEC, 2, 16, CPU)) == sum(len(episode["actions"]) for episode in episodes)
-    assert episodes[0][POSE].shape == (5, 9)
+    steps = [len(episode["actions"]) for episode in episodes]
+    assert len(SequenceDataset(episodes, SPEC, 2, 16, 1, CPU)) == sum(steps)
+    assert episodes[0][POSE].shape == (5, 7)
 
 
-def test_pose_features_are_the_rotation_whatever_the_quaternions_sign():
+def test_the_papers_pose_has_one_sign_for_each_rotation():
+    quaternion = Rotation.random(20, random_state=0).as_quat()[:, [3, 0, 1, 2]]
+    pose, flipped = np.c_[np.ones((20, 3)), quaternion], np.c_[np.ones((20, 3)), -quaternion]
+    assert np.array_equal(quaternion_pose(pose), quaternion_pose(flipped))
+    assert np.allclose(np.abs(quaternion_pose(pose)), np.abs(pose), atol=1e-6)
+
+
+def test_quaternions_do_not_jump_where_the_wrist_can_turn():
+    yaw = np.deg2rad(np.arange(45 - 166, 45 + 167))  # the range of the wrist joint
+    down = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_quat([1, 0, 0, 0])
+    pose = quaternion_pose(np.c_[np.zeros((len(yaw), 3)), down.as_quat()[:, [3, 0, 1, 2]]])
+    assert np.abs(np.diff(pose, axis=0)).max() < 0.01
+
+
+@pytest.mark.parametrize("task", ["ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"])
+def test_quaternions_do_not_jump_in_demonstrations_that_screw(task):
+    for episode in read_demonstrations(SAMPLE / task / "trajectory.h5", [POSE]):
+        assert np.abs(np.diff(quaternion_pose(episode[POSE]), axis=0)).max() < 0.2
+        assert np.abs(np.diff(episode[POSE], axis=0)).max() > 1  # as the simulator gives them they do
+
+
+def test_rotation_6d_is_the_rotation_whatever_the_quaternions_sign():
     rotation = Rotation.random(20, random_state=0)
     quaternion = rotation.as_quat()[:, [3, 0, 1, 2]]
     pose = np.c_[np.zeros((20, 3)), quaternion]
     flipped = np.c_[np.zeros((20, 3)), -quaternion]
     matrix = rotation.as_matrix()
-    assert np.allclose(pose_features(pose)[:, 3:], np.c_[matrix[:, :, 0], matrix[:, :, 1]], atol=1e-6)
-    assert np.allclose(pose_features(pose), pose_features(flipped), atol=1e-6)
+    assert np.allclose(rotation_6d_pose(pose)[:, 3:], np.c_[matrix[:, :, 0], matrix[:, :, 1]], atol=1e-6)
+    assert np.allclose(rotation_6d_pose(pose), rotation_6d_pose(flipped), atol=1e-6)
 
 
 def test_images_are_resized_alike_for_training_and_evaluation():
@@ -76,6 +127,23 @@ def test_images_are_resized_alike_for_training_and_evaluation():
     prepared = prepare(spec.images[0], images, spec)
     assert prepared.shape == (3, 64, 64, 3)
     assert np.array_equal(prepare(spec.images[0], images[1:2], spec)[0], prepared[1])
+
+
+def test_tacrgb_has_a_size_of_its_own():
+    spec = observation_spec("rgb+tacrgb", ("wrist",), ("right",), 64, 48)
+    camera, pad = (prepare(key, np.zeros((2, 80, 80, 3), np.uint8), spec) for key in spec.images)
+    assert (camera.shape, pad.shape) == ((2, 64, 64, 3), (2, 48, 48, 3))
+
+
+@pytest.mark.parametrize("sizes", [(0, 64), (64, -1)])
+def test_sizes_that_are_no_sizes_are_refused(sizes):
+    with pytest.raises(InvalidArgumentError, match=r"image_size=.*at least 16 pixels"):
+        observation_spec("rgb+tacrgb", ("wrist",), ("right",), *sizes)
+
+
+def test_an_unknown_form_of_the_pose_names_those_there_are():
+    with pytest.raises(InvalidArgumentError, match=r"pose='euler'.*quaternion.*rotation_6d"):
+        observation_spec("rgb", ("wrist",), (), 64, pose="euler")
 
 
 @pytest.mark.parametrize("mode", ["state", "rgb+depth", "pointcloud"])
@@ -103,12 +171,12 @@ def test_resnet18_has_group_norm_and_the_published_size():
 def test_encoder_sees_every_modality(name):
     spec = observation_spec("rgb+tacff", ("wrist",), ("right",), 64)
     image = "resnet18" if name == "resnet18" else "small_cnn"
-    encoder = ObservationEncoder(EncoderConfig(image=image, force_field=name), spec, 2).eval()
+    encoder = ObservationEncoder(EncoderConfig(image=image, image_features=32, force_field=name), spec, 2).eval()
     torch.manual_seed(0)
     obs = {
         spec.images[0]: torch.randint(0, 255, (2, 2, 64, 64, 3), dtype=torch.uint8),
         spec.force_fields[0]: torch.rand(2, 2, 10, 14, 3),
-        POSE: torch.rand(2, 2, 9),
+        POSE: torch.rand(2, 2, 7),
     }
     features = encoder(obs)
     assert features.shape == (2, encoder.out_features)
@@ -128,6 +196,42 @@ def test_crops_are_random_in_training_and_central_in_evaluation():
     assert not torch.equal(crops, central)
     windows = images[0, 0].unfold(0, 48, 1).unfold(1, 48, 1).permute(0, 1, 3, 4, 2).reshape(-1, 48, 48, 3)
     assert (windows == crops[0, 0]).flatten(1).all(1).any()
+
+
+@pytest.mark.parametrize(
+    ("mode", "changes", "per_step"),
+    [
+        ("rgb+tacff", {}, 512 + 512 + 7),  # the paper's public code
+        ("rgb+tacrgb", {}, 512 + 512 + 7),
+        ("rgb", {}, 512 + 7),
+        ("rgb+tacff", dict(image="resnet18_keypoints", image_features=64), 64 + 512 + 7),  # the paper's text
+    ],
+)
+def test_conditions_have_the_sizes_of_the_paper(mode, changes, per_step):
+    spec = observation_spec(mode, ("wrist",), ("right",), 256)
+    with torch.device("meta"):
+        encoder = ObservationEncoder(EncoderConfig(**changes), spec, 2)
+    assert encoder.out_features == 2 * per_step
+
+
+@pytest.mark.parametrize("image", ["small_cnn", "resnet18", "resnet18_keypoints"])
+@pytest.mark.parametrize("crop", [40, 76])
+def test_crops_are_of_cameras_alone_and_may_be_larger_than_the_images(image, crop):
+    spec = observation_spec("rgb+tacrgb", ("wrist",), ("right",), 48, 32)
+    encoder = ObservationEncoder(EncoderConfig(image, "small_cnn", image_features=8, tactile_features=8, crop=crop), spec, 1)
+    camera, pad = spec.images
+    sizes = {}
+    for key, net in zip(spec.images, encoder.images, strict=True):
+        net.register_forward_pre_hook(lambda _net, inputs, key=key: sizes.update({key: inputs[0].shape[-1]}))
+    obs = {key: torch.zeros(2, 1, spec.size_of(key), spec.size_of(key), 3, dtype=torch.uint8) for key in spec.images}
+    assert encoder(obs | {POSE: torch.zeros(2, 1, 7)}).shape == (2, 8 + 8 + 7)
+    assert sizes == {camera: min(crop, 48), pad: 32}
+
+
+def test_key_points_are_pairs_of_coordinates():
+    spec = observation_spec("rgb", ("wrist",), (), 64)
+    with pytest.raises(InvalidArgumentError, match="7 features are no pairs"):
+        ObservationEncoder(EncoderConfig("resnet18_keypoints", image_features=7), spec, 2)
 
 
 def test_unknown_encoder_names_those_there_are():

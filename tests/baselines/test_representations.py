@@ -1,6 +1,7 @@
 """Tactile representations: published weights fit, pictures alone can train them, policies can use them."""
 
 import json
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -268,7 +269,7 @@ def test_pictures_alone_train_a_representation(name, pictures, tmp_path, monkeyp
     sizes = dict(image_size=size, batch_size=8, steps=steps, lr=2e-3, adversary_from=50, log_every=1, device="cpu")
     losses = pretrain.main(pretrain.Args(name, (pictures,), tmp_path / "weights.safetensors", **sizes))
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:3])
-    fresh = RepresentationEncoder(make(), size)
+    fresh = RepresentationEncoder(make(), size, 64)
     before = [parameter.clone() for parameter in fresh.parameters()]
     load_pretrained(torch.nn.Sequential(fresh), tmp_path / "weights.safetensors")
     assert any(not torch.equal(old, new) for old, new in zip(before, fresh.parameters(), strict=True))
@@ -296,8 +297,8 @@ def test_a_frozen_representation_stays_as_it_was(frozen, monkeypatch):
 
 
 def test_settings_that_do_not_fit_are_named(tmp_path):
-    with pytest.raises(ValueError, match="a multiple of 16, not 30"):
-        ObservationEncoder(EncoderConfig(tacrgb="sparsh", crop=30), SPEC, 1)
+    with pytest.raises(ValueError, match="a multiple of 16, not 30; give --tactile-image-size 224"):
+        ObservationEncoder(EncoderConfig(tacrgb="sparsh"), replace(SPEC, tactile_image_size=30), 1)
     with pytest.raises(ValueError, match="'resnet18' is no representation"):
         ObservationEncoder(EncoderConfig(freeze_tacrgb=True), SPEC, 1)
     with pytest.raises(ValueError, match="no network of this policy takes them"):
@@ -307,7 +308,7 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
 @pytest.mark.parametrize("name", TACRGB_ENCODERS)
 def test_every_network_of_touch_can_be_laid_out_for_training(name):
     with torch.device("meta"):
-        encoder = TACRGB_ENCODERS[name](224)
+        encoder = TACRGB_ENCODERS[name](224, 512)
     lay_out_channels_last(encoder)  # of weights of other ranks, a video's say, nothing is asked
     laid_out = [p.is_contiguous(memory_format=torch.channels_last) for p in encoder.parameters() if p.dim() == 4]
     assert all(laid_out)

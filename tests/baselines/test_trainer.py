@@ -141,8 +141,9 @@ def test_force_field_encoders_take_the_taxels_of_the_data():
     (key,) = SPEC.force_fields
     spec = with_taxel_shape(SPEC, {key: torch.zeros(5, 7, 9, 3).numpy()})
     assert (SPEC.taxel_shape, spec.taxel_shape) == (TAXEL_SHAPE, (7, 9))
-    for name in ("small", "resnet18"):
-        assert field_encoder(EncoderConfig(force_field=name), spec)(torch.zeros(2, 3, 7, 9)).shape == (2, 64)
+    for name, features in (("small", 24), ("resnet18", 24), ("resnet18", 512)):
+        encoder = field_encoder(EncoderConfig(force_field=name, tactile_features=features), spec)
+        assert encoder(torch.zeros(2, 3, 7, 9)).shape == (2, features)
 
 
 def test_a_name_of_an_encoder_is_given_once():

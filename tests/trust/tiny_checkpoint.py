@@ -19,6 +19,7 @@ def save_tiny_checkpoint(folder: Path) -> Path:
         diffusion_steps=20,
     )
     observed = dict(obs_mode="tacff", cameras=[], tactile_sensors=["right"], image_size=32)
+    observed |= dict(tactile_image_size=32, pose="quaternion")
     policy = SPEC.policy_class(config, observation_spec("tacff", (), ("right",), 32), 6)
     about = dict(policy_name=SPEC.name, policy=as_json(config), action_dim=6, inference_steps=20, step=1) | observed
     save_checkpoint(folder, about, policy.state_dict(), {})

@@ -1,0 +1,99 @@
+"""Equivariant networks over camera images: if the image turns by an eighth, their features (B, fields, 8) move on by one."""
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import torch
+import torch.nn as nn
+
+from .groups import ORDER, FieldNorm, GroupConv, halve, pooled, representation
+
+CHANNELS_PER_GROUP = 16
+"""Channels that a block of the small network normalises together."""
+
+
+class GroupBlock(nn.Module):
+    """Two convolutions of regular fields with a skip connection.
+
+    Args:
+        inputs: Number of input channels.
+        outputs: Number of output channels.
+        normalised: Whether each convolution is followed by a normalisation.
+    """
+
+    def __init__(self, inputs: int, outputs: int, normalised: bool):
+        super().__init__()
+
+        def norm() -> nn.Module:
+            return FieldNorm(max(outputs // CHANNELS_PER_GROUP, 1), outputs) if normalised else nn.Identity()
+
+        first, second = GroupConv(inputs, outputs, 3), GroupConv(outputs, outputs, 3)
+        if not normalised:  # the sums of many blocks would otherwise grow a hundredfold before training (Goyal et al. 2017)
+            nn.init.zeros_(second.weight)
+        self.net = nn.Sequential(first, norm(), nn.ReLU(), second, norm())
+        self.skip = GroupConv(inputs, outputs, 1) if inputs != outputs else nn.Identity()
+
+    def forward(self, fields: torch.Tensor) -> torch.Tensor:
+        return (self.net(fields) + self.skip(fields)).relu()
+
+
+class EquivariantResNet(nn.Module):
+    """The encoder of the paper's public code (`EquivariantResEncoder230Cyclic`): six residual blocks, each followed by pooling.
+
+    It differs in two places, so that quarter turns are exact: a rim is repeated instead of filled with zeros, and pooling
+    windows are symmetric for odd sides. An image of 230 pixels has the sides 226, 113, 56, 28, 14, 7, 2 and 1.
+
+    Args:
+        fields: Number of regular fields of the features.
+    """
+
+    def __init__(self, fields: int):
+        super().__init__()
+        widths = [max(fields // k, 1) for k in (16, 16, 8, 4, 2, 1, 1)]
+        self.lift = nn.Sequential(GroupConv(3, widths[0], 5, lifting=True, padded=False), nn.ReLU())
+        self.blocks = nn.ModuleList(GroupBlock(i, o, normalised=False) for i, o in pairwise(widths))
+        self.last = nn.Sequential(GroupConv(fields, fields, 3), nn.ReLU())
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        fields = self.lift(image)
+        for k, block in enumerate(self.blocks, start=1):
+            fields = pooled(block(fields), 2 if k < len(self.blocks) else 3)
+        return self.last(fields).mean((2, 3)).unflatten(1, (-1, ORDER))
+
+
+class EquivariantKeyPoints(nn.Module):
+    """A small network for a CPU: heat maps, of which each gives its expected coordinates along the axes of every frame.
+
+    Args:
+        fields: Number of regular fields of the features, two for each key point.
+    """
+
+    axes: torch.Tensor
+
+    def __init__(self, fields: int):
+        super().__init__()
+        widths = [max(fields // k, 1) for k in (32, 16, 8, 4)]
+        self.lift = nn.Sequential(GroupConv(3, widths[0], 5, lifting=True), FieldNorm(1, widths[0]), nn.ReLU())
+        self.blocks = nn.ModuleList(GroupBlock(i, o, normalised=True) for i, o in pairwise(widths))
+        self.score = GroupConv(widths[-1], fields // 2, 1)
+        self.register_buffer("axes", representation(2, ((0, 1),)), persistent=False)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        fields = self.lift(halve(image))
+        for k, block in enumerate(self.blocks):
+            fields = block(halve(fields) if k < 2 else fields)  # an eighth of the image's size at the end
+        right = torch.linspace(-1, 1, fields.shape[3], device=image.device)
+        up = torch.linspace(1, -1, fields.shape[2], device=image.device)
+        outside = torch.hypot(right, up[:, None]) > 1  # turns leave the inscribed circle unchanged
+        heat = self.score(fields).masked_fill(outside, -torch.inf)
+        weight = heat.flatten(2).softmax(-1).view(len(image), -1, ORDER, *fields.shape[2:])
+        place = torch.stack([(weight.sum(3) * right).sum(-1), (weight.sum(4) * up).sum(-1)], dim=-1)  # (B, points, 8, 2)
+        return torch.einsum("gba,ncgb->ncag", self.axes, place).flatten(1, 2)
+
+
+EQUIVARIANT_IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {
+    "resnet18": EquivariantResNet,
+    "small_cnn": EquivariantKeyPoints,
+}
+"""Functions from a number of regular fields to a network (B, 3, size, size) -> (B, fields, 8), by the names that other policies
+have for the networks in their place."""
