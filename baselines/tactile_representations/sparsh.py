@@ -108,4 +108,4 @@ def untouched_image() -> np.ndarray:
     rows, columns = (np.linspace(-1, 1, n) for n in config.image_shape)
     place = place_terms(*np.meshgrid(rows, columns, indexing="ij"))
     background = Shader.load(Path(config.optics.calibration)).background
-    return (place @ background.T + 0.5).clip(0, 255).astype(np.uint8)
+    return ((place @ background.T).astype(np.float32) + 0.5).clip(0, 255).astype(np.uint8)
