@@ -115,7 +115,7 @@ def shelf(tmp_path_factory) -> Path:
     )
     network = T3()
     (shelf / "t3_medium/encoders").mkdir(parents=True)
-    torch.save(network.encoder.state_dict(), shelf / "t3_medium/encoders/gs_green.pth")
+    torch.save(network.encoder.state_dict(), shelf / "t3_medium/encoders/mini.pth")
     torch.save(network.trunk.state_dict(), shelf / "t3_medium/trunk.pth")
     return shelf
 

@@ -1,7 +1,7 @@
 """Observation encoders: one network per camera, tactile sensor and modality; their features are concatenated."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,9 @@ class EncoderConfig:
     """Network of each TacRGB image, by its name in `TACRGB_ENCODERS`."""
     freeze_tacrgb: bool = False
     """Keep the weights of a pretrained TacRGB network as they were loaded, and train only the layers after it."""
+    tacrgb_sensor: str | None = None
+    """Sensor whose published weights the TacRGB network uses, if it has some for each sensor (t3: "mini", "gs_green", ...;
+    anytouch: "gelsight", "gelsight_mini", ...); if not given, the first, which the paper's public code uses."""
     force_field: str = "resnet18"
     """Network of each TacFF force field, by its name in `FIELD_ENCODERS`."""
     image_features: int = 512
@@ -122,14 +125,22 @@ class SmallFieldNet(nn.Module):
 
 
 class PretrainedEncoder(nn.Module):
-    """An image encoder with a part that is pretrained. Subclasses define both methods."""
+    """An image encoder with a part that is pretrained. Subclasses define all methods."""
 
     def freeze(self) -> None:
         """Exclude the pretrained part from training."""
         raise NotImplementedError
 
+    def choose_sensor(self, name: str) -> None:
+        """Use the published weights of the sensor of this name."""
+        raise NotImplementedError
+
     def load(self, weights: Path) -> None:
         """Load the weights of the pretrained part."""
+        raise NotImplementedError
+
+    def fit(self, images: Iterable[torch.Tensor]) -> None:
+        """Take the statistics that the network needs from the training images, uint8 (S, H, W, 3) each."""
         raise NotImplementedError
 
 
@@ -210,12 +221,15 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     if not is_tactile(key):
         return by_name(IMAGE_ENCODERS, config.image)(camera_size(config, spec), config.image_features)
     encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(spec.tactile_image_size, config.tactile_features)
-    if config.freeze_tacrgb:
+    if config.freeze_tacrgb or config.tacrgb_sensor:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(
-                f"freeze_tacrgb=True: {config.tacrgb!r} is no representation that could be loaded; leave freeze_tacrgb False"
+                f"{config.tacrgb!r} is no representation that could be loaded; leave out freeze_tacrgb and tacrgb_sensor"
             )
-        encoder.freeze()
+        if config.freeze_tacrgb:
+            encoder.freeze()
+        if config.tacrgb_sensor:
+            encoder.choose_sensor(config.tacrgb_sensor)
     return encoder
 
 

@@ -6,9 +6,9 @@ from typing import Any, ClassVar, cast
 import torch
 import torch.nn as nn
 
-from .encoders import EncoderConfig, ObservationEncoder
+from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
 from .normalizer import Normalizer
-from .observation import POSE, ObservationSpec
+from .observation import POSE, ObservationSpec, is_tactile
 from .unet import ConditionalUnet1D
 
 
@@ -86,6 +86,9 @@ class VisuotactilePolicy(nn.Module):
         for key in (POSE, *self.spec.force_fields):
             self.obs_normalizer(key).fit(observations[key])
         self.action_normalizer.fit(actions)
+        for network in self.modules():
+            if isinstance(network, PretrainedEncoder):
+                network.fit(observations[key] for key in self.spec.images if is_tactile(key))
 
     def obs_normalizer(self, key: str) -> Normalizer:
         """The normaliser of an observation."""

@@ -1,9 +1,9 @@
 """Tactile representations as TacRGB encoders of a policy, registered by name."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
-import torch.nn as nn
 
 from baselines.common.encoders import PretrainedEncoder, register_tacrgb_encoder
 from manifeel_ms3.errors import InvalidArgumentError
@@ -16,7 +16,7 @@ from .unit import UniT
 
 
 class RepresentationEncoder(PretrainedEncoder):
-    """A tactile representation, and a linear layer to the number of features that a policy takes.
+    """A tactile representation, and its head: layers from the representation to the features that a policy takes.
 
     Args:
         representation: The network.
@@ -29,25 +29,46 @@ class RepresentationEncoder(PretrainedEncoder):
 
     def __init__(self, representation: Representation, size: int, features: int):
         super().__init__()
-        if size % representation.patch:
-            name, patch = type(representation).__name__, representation.patch
-            raise InvalidArgumentError(
-                f"{name} takes images whose sides are a multiple of {patch}, not {size}; give --tactile-image-size 224"
-            )
+        require_size(representation, size)
         self.representation, self.frozen = representation, False
-        self.out = nn.Linear(representation.out_features, features)
+        self.out = representation.head(features)
 
     def freeze(self) -> None:
         self.representation.requires_grad_(False)
         self.frozen = True
 
+    def choose_sensor(self, name: str) -> None:
+        self.representation.choose_sensor(name)
+
     def load(self, weights: Path) -> None:
         self.representation.load(weights)
 
+    def fit(self, images: Iterable[torch.Tensor]) -> None:
+        self.representation.fit(images)
+
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.frozen):
-            features = self.representation(image)
-        return self.out(features)
+            output = self.representation(image)
+        return self.out(output)
+
+
+def require_size(representation: Representation, size: int, option: str = "--tactile-image-size") -> None:
+    """Check that a representation takes square images of a size.
+
+    Args:
+        representation: The network.
+        size: Side of the images, pixels.
+        option: Option of the command line that sets the size, for the error's message.
+
+    Raises:
+        InvalidArgumentError: It does not.
+    """
+    patch = representation.patch
+    if size < patch or size % patch:
+        raise InvalidArgumentError(
+            f"{type(representation).__name__} takes images whose sides are a multiple of {patch}, not {size}; give {option} "
+            f"{representation.size}"
+        )
 
 
 register_tacrgb_encoder("unit", lambda size, features: RepresentationEncoder(UniT(), size, features))

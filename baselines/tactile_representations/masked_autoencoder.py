@@ -35,12 +35,14 @@ class MaskedAutoencoder(nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Mean squared error of the hidden patches, each normalised to mean 0 and standard deviation 1."""
-        tokens = self.representation.embed(image)
+        picture = self.representation.prepare(image)
+        tokens = self.representation.embed(picture)
         order = torch.rand(tokens.shape[:2], device=image.device).argsort(1)
         kept = order[:, : round((1 - self.masked) * tokens.shape[1])]
-        predicted = self._decoded(self.representation.encode(_pick(tokens, kept)), kept, tokens.shape[1])
+        seen = self.representation.encode(_pick(tokens, kept))[:, self.representation.leading :]
+        predicted = self._decoded(seen, kept, tokens.shape[1])
         patch = self.representation.patch
-        patches = F.unfold(image, patch, stride=patch).transpose(1, 2)
+        patches = F.unfold(picture, patch, stride=patch).transpose(1, 2)
         target = (patches - patches.mean(-1, keepdim=True)) / (patches.var(-1, keepdim=True) + VARIANCE_EPS).sqrt()
         hidden = order[:, kept.shape[1] :]
         return F.mse_loss(_pick(predicted, hidden), _pick(target, hidden))

@@ -1,13 +1,14 @@
 """Train a tactile representation on TacRGB images alone, from demonstrations or any other trajectory file that holds them.
 
-    python -m baselines.tactile_representations.pretrain unit --demos a.h5 b.h5 --out unit.safetensors
-    python -m baselines.tactile_representations.pretrain t3 --demos a.h5 --out t3.safetensors
+    python -m baselines.tactile_representations.pretrain unit --demos nut.h5 --env-id ManiFeel-NutBoltAssembly-v1
+    python -m baselines.tactile_representations.pretrain t3 --demos a.h5 b.h5 --out t3.safetensors
 
-UniT is trained as a VQGAN (Esser et al. 2021), the transformers by masked autoencoding; the option `--tacrgb-weights` of a
-policy's training takes the result.
+The first is what the paper ManiFeel does for all its tasks. UniT is trained as a VQGAN (Esser et al. 2021), the transformers by
+masked autoencoding; the option `--tacrgb-weights` of a policy's training takes the result.
 """
 
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -26,11 +27,13 @@ from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.files import atomic_write
 from manifeel_ms3.progress import progress_bar
 
 from .anytouch import AnyTouch
+from .encoder import require_size
 from .masked_autoencoder import MaskedAutoencoder
-from .representation import TokenRepresentation
+from .representation import TokenRepresentation, in_unit_range
 from .sparsh import Sparsh
 from .t3 import T3
 from .unit import UniT
@@ -40,6 +43,8 @@ MAE_BETAS, MAE_WEIGHT_DECAY = (0.9, 0.95), 0.05
 """Decay rates of AdamW's moments, and its weight decay (He et al. 2022, table 8)."""
 VQGAN_BETAS = (0.5, 0.9)
 """Decay rates of Adam's moments, as in the public code of Esser et al. (2021)."""
+EPOCHS = 50
+"""Number of times that training sees each image unless told otherwise, as in the paper's public code for UniT."""
 ADVERSARY_WEIGHT = 0.1
 """Weight of the discriminator's judgement in the loss; constant, whereas Esser et al. (2021, eq. 7) adapt theirs."""
 REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
@@ -53,18 +58,22 @@ class Args:
     """Name of the representation."""
     demos: tuple[Path, ...]
     """Trajectory files with TacRGB images."""
+    env_id: str | None = None
+    """Environment id of the task that all demonstrations must be of; any tasks if not given."""
     out: Path = Path("representation.safetensors")
-    """File of the trained weights."""
-    image_size: int = 224
-    """Height and width to which images are resized, pixels; the same as in the policy's training."""
-    batch_size: int = 32
-    """Number of images in a gradient step."""
-    steps: int = 20_000
-    """Number of gradient steps."""
-    lr: float = 1e-4
-    """Learning rate of the optimiser."""
-    adversary_from: int = 5000
-    """Gradient step from which a discriminator judges the images that UniT reconstructs."""
+    """File of the trained weights; it appears when training has ended."""
+    image_size: int | None = None
+    """Height and width to which images are resized, pixels, the same as TacRGB has in the policy's training; if not given, 256
+    for unit and 224 for the others, as in the paper."""
+    batch_size: int = 16
+    """Number of images in a gradient step; the default is that of the paper's public code for UniT."""
+    steps: int | None = None
+    """Number of gradient steps; if not given, those of 50 epochs, as in the paper's public code for UniT."""
+    lr: float = 7.2e-5
+    """Learning rate of the optimiser; the default is that of the paper's public code for UniT, 4.5e-6 for each of 16 images."""
+    adversary_from: int = 2000
+    """Gradient step from which a discriminator judges the images that UniT reconstructs; the default is that of the paper's
+    public code."""
     seed: int = 0
     """Seed of the initial weights and of the order of the images."""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
@@ -77,41 +86,53 @@ def main(args: Args) -> list[float]:
     """Train, write the weights, and return every `log_every`-th loss.
 
     Raises:
-        DemonstrationError: The files hold no TacRGB images.
+        InvalidArgumentError: The representation does not take images of this size.
+        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
+        FileWriteError: The weights cannot be written.
     """
     torch.manual_seed(args.seed)
-    images = torch.as_tensor(tacrgb_images(args.demos, args.image_size))
-    keep_freed_memory(args.device)
     representation = REPRESENTATIONS[args.representation]().to(args.device)
-    training = VqganTraining(representation, args) if isinstance(representation, UniT) else MaeTraining(representation, args)
-    losses = []
+    size = args.image_size or representation.size
+    require_size(representation, size, "--image-size")
+    images = torch.as_tensor(tacrgb_images(args.demos, size, args.env_id))
+    representation.fit([images])
+    keep_freed_memory(args.device)
+    if isinstance(representation, UniT):
+        training = VqganTraining(representation, args)
+    else:
+        training = MaeTraining(representation, args, size)
+    losses, steps = [], args.steps or math.ceil(EPOCHS * len(images) / args.batch_size)
     with progress_bar() as bar:
-        task = bar.add_task("training", total=args.steps)
-        for step in range(args.steps):
+        task = bar.add_task("training", total=steps)
+        for step in range(steps):
             batch = images[torch.randint(len(images), (args.batch_size,))].to(args.device)
             loss = training.step(batch.movedim(-1, 1).float() / 127.5 - 1, step)
             if step % args.log_every == 0:
                 losses.append(float(loss))
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    save_file({name: t.contiguous() for name, t in training.result.state_dict().items()}, args.out)
+    with atomic_write(args.out) as partial:
+        save_file({name: t.contiguous() for name, t in representation.state_dict().items()}, partial)
     log.info("%s", args.out)
     return losses
 
 
-def tacrgb_images(files: Iterable[Path], size: int) -> np.ndarray:
+def tacrgb_images(files: Iterable[Path], size: int, env_id: str | None = None) -> np.ndarray:
     """All TacRGB images of trajectory files, uint8 (N, size, size, 3).
 
     Args:
         files: Trajectory files.
         size: Height and width to which images are resized, pixels.
+        env_id: Environment id of the task that all files must be of; any tasks if None.
 
     Raises:
-        DemonstrationError: The files hold no TacRGB images.
+        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
     """
     images = []
     for path in files:
+        task = read_header(path)["env_info"]["env_id"]
+        if env_id not in (None, task):
+            raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demos")
         with open_trajectories(path) as file:
             for i in range(len(read_header(path)["episodes"])):
                 trajectory: Any = file[f"traj_{i}"]
@@ -131,11 +152,11 @@ class MaeTraining:
     Args:
         representation: The transformer.
         args: Settings of the training.
+        size: Side of the images, pixels.
     """
 
-    def __init__(self, representation: TokenRepresentation, args: Args):
-        self.result = representation
-        self.model = MaskedAutoencoder(representation, args.image_size).to(args.device)
+    def __init__(self, representation: TokenRepresentation, args: Args, size: int):
+        self.model = MaskedAutoencoder(representation, size).to(args.device)
         self.optimizer = torch.optim.AdamW(self.model.parameters(), args.lr, MAE_BETAS, weight_decay=MAE_WEIGHT_DECAY)
 
     def step(self, image: torch.Tensor, step: int) -> torch.Tensor:
@@ -156,13 +177,14 @@ class VqganTraining:
     """
 
     def __init__(self, unit: UniT, args: Args):
-        self.result, self.vqgan, self.adversary_from = unit.saved, unit.vqgan, args.adversary_from
+        self.vqgan, self.adversary_from = unit.vqgan, args.adversary_from
         self.discriminator = patch_discriminator().to(args.device)
         self.optimizer = torch.optim.Adam(self.vqgan.parameters(), args.lr, VQGAN_BETAS)
         self.adversary = torch.optim.Adam(self.discriminator.parameters(), args.lr, VQGAN_BETAS)
 
     def step(self, image: torch.Tensor, step: int) -> torch.Tensor:
         """Take gradient step number `step` on images (B, 3, H, W) in [-1, 1], and return the loss."""
+        image = in_unit_range(image)
         decoded = self.vqgan(image)
         error = F.l1_loss(decoded.sample, image)
         loss = error + decoded.commit_loss.mean()

@@ -38,8 +38,12 @@ NESTING = ("model", "state_dict")
 """Names under which checkpoints of training programs keep the weights."""
 
 
-def read_released(path: Path) -> dict[str, torch.Tensor]:
+def read_released(path: Path, wanted: str = "the file that the authors released") -> dict[str, torch.Tensor]:
     """The weights of a file that torch has written, bare or in a training program's checkpoint.
+
+    Args:
+        path: Path of the file.
+        wanted: The file that should be given, for the error's message.
 
     Raises:
         CheckpointError: The file is missing, broken, of another kind, or holds no weights.
@@ -49,8 +53,8 @@ def read_released(path: Path) -> dict[str, torch.Tensor]:
             return _read(archive, Path(path).stat().st_size)
     except Exception as error:  # zip and pickle raise many kinds over foreign data
         raise CheckpointError(
-            f"{path} cannot be read as weights ({type(error).__name__}: {error}); give the file that the authors released, as "
-            "torch 1.6 or later writes it"
+            f"{path} cannot be read as weights ({type(error).__name__}: {error}); give {wanted}, as torch 1.6 or later "
+            "writes it"
         ) from error
 
 

@@ -1,7 +1,8 @@
 """T3-medium (Zhao et al. 2024, "Transferable Tactile Transformers for Representation Learning Across Diverse Sensors").
 
 Each sensor has its own encoder of three layers; all sensors share a trunk of nine. Both together are a ViT-B with 86 M
-parameters.
+parameters. Images are normalised by the statistics of their own data set, as each of the authors' data sets is; the feature is
+the class token, as in the paper's public code.
 """
 
 from pathlib import Path
@@ -11,30 +12,29 @@ import torch.nn as nn
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
-from .released_weights import read_released
-from .representation import TokenRepresentation, imagenet_normalised
+from .representation import ColourNormalisation, TokenRepresentation
 from .vit import EPS, Block, PatchEmbed, interpolate_pos_embed
 
-SENSOR = "gs_green"
-"""Name of the released encoder that the authors use for a sensor without an encoder of its own."""
-SIZE = 224
-"""Side of the images that the published weights were trained on, pixels."""
+SENSORS = ("mini", "gs_green", "gs_black", "gs_tag", "gs_360_v2", "digit", "wedge", "finray")
+"""Names of the released encoders; the paper's public code takes that of the GelSight Mini."""
+TRUNK_EPS = 1e-5
+"""Epsilon of the trunk's layer norms: torch's default, whereas the encoders have timm's."""
 
 
 class _Encoder(nn.Module):
-    def __init__(self, width: int, depth: int, heads: int, patch: int):
+    def __init__(self, width: int, depth: int, heads: int, patch: int, size: int):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.pos_embed = nn.Parameter(0.02 * torch.randn(1, (SIZE // patch) ** 2 + 1, width))
+        self.pos_embed = nn.Parameter(0.02 * torch.randn(1, (size // patch) ** 2 + 1, width))
         self.patch_embed = PatchEmbed(3, width, patch)
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
+        self.blocks = nn.ModuleList(Block(width, heads, EPS) for _ in range(depth))
 
 
 class _Trunk(nn.Module):
     def __init__(self, width: int, depth: int, heads: int):
         super().__init__()
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(depth))
-        self.norm = nn.LayerNorm(width, EPS)
+        self.blocks = nn.ModuleList(Block(width, heads, TRUNK_EPS) for _ in range(depth))
+        self.norm = nn.LayerNorm(width, TRUNK_EPS)
 
 
 class T3(TokenRepresentation):
@@ -46,31 +46,55 @@ class T3(TokenRepresentation):
         heads: Number of attention heads.
     """
 
-    patch = 16
+    patch, size, leading = 16, 224, 1
+    released = "the folder t3_medium with encoders/<sensor>.pth and trunk.pth"
+    sensors, sensor = SENSORS, SENSORS[0]
 
     def __init__(self, width: int = 768, depth: tuple[int, int] = (3, 9), heads: int = 12):
         super().__init__()
         self.width = self.out_features = width
-        self.encoder, self.trunk = _Encoder(width, depth[0], heads, self.patch), _Trunk(width, depth[1], heads)
+        self.encoder = _Encoder(width, depth[0], heads, self.patch, self.size)
+        self.trunk = _Trunk(width, depth[1], heads)
+        self.normalisation = ColourNormalisation()
 
-    def embed(self, image):
-        patches = self.encoder.patch_embed(imagenet_normalised(image))
-        grid = [side // self.patch for side in image.shape[2:]]
-        return patches + interpolate_pos_embed(self.encoder.pos_embed[:, 1:], grid)
+    def fit(self, images):
+        self.normalisation.fit(images)
+
+    def prepare(self, image):
+        return self.normalisation(image)
+
+    def embed(self, picture):
+        grid = [side // self.patch for side in picture.shape[2:]]
+        return self.encoder.patch_embed(picture) + interpolate_pos_embed(self.encoder.pos_embed[:, 1:], grid)
 
     def encode(self, tokens):
         first = (self.encoder.cls_token + self.encoder.pos_embed[:, :1]).expand(len(tokens), -1, -1)
         tokens = torch.cat([first, tokens], dim=1)
         for block in (*self.encoder.blocks, *self.trunk.blocks):
             tokens = block(tokens)
-        return self.trunk.norm(tokens)[:, 1:]
+        return self.trunk.norm(tokens)
 
-    def read_released(self, path: Path):
-        """The weights of the released folder, which holds encoders/<sensor>.pth and trunk.pth."""
-        files = dict(encoder=path / f"encoders/{SENSOR}.pth", trunk=path / "trunk.pth")
-        if missing := [str(file) for file in files.values() if not file.is_file()]:
-            raise CheckpointError(f"{path} lacks {missing}; give the folder t3_medium that the authors released")
-        return {f"{part}.{name}": t for part, file in files.items() for name, t in read_released(file).items()}
+    def pool(self, tokens):
+        return tokens[:, 0]
+
+    def read(self, path: Path):
+        """The weights of the released folder, or of a file that `pretrain.py` wrote."""
+        if path.suffix == ".safetensors":
+            return super().read(path)
+        parts = {part: _weights_file(path, stem) for part, stem in (("encoder", f"encoders/{self.sensor}"), ("trunk", "trunk"))}
+        return {f"{part}.{name}": t for part, file in parts.items() for name, t in super(T3, self).read(file).items()}
 
     def convert_state_dict(self, weights):
         return weights
+
+
+def _weights_file(folder: Path, stem: str) -> Path:
+    """The file of this stem in the released folder, as the authors saved it or as safetensors.
+
+    Raises:
+        CheckpointError: There is none.
+    """
+    for suffix in (".pth", ".safetensors"):
+        if (folder / f"{stem}{suffix}").is_file():
+            return folder / f"{stem}{suffix}"
+    raise CheckpointError(f"{folder} lacks {stem}.pth; give {T3.released}")

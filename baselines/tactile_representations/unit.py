@@ -1,10 +1,11 @@
 """UniT (Xu et al. 2025, "Data Efficient Tactile Representation with Generalization to Unseen Objects"): a VQGAN's encoder.
 
-It is trained on TacRGB images of a few simple objects (`pretrain.py`); a policy takes the latents before their quantisation.
+It is trained on TacRGB images of a few simple objects (`pretrain.py`), in the paper ManiFeel on those of nut-and-bolt assembly
+alone. A policy takes the latents before their quantisation, and trains a head over them.
 """
 
 import re
-from pathlib import Path
+from itertools import pairwise
 
 import torch
 import torch.nn as nn
@@ -12,31 +13,35 @@ from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (diff
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
-from .representation import Representation
+from .representation import Representation, in_unit_range
 
 LATENT_CHANNELS, CODES = 3, 1024
 """Channels of the latents and size of the codebook, as in the released checkpoint."""
 CHANNELS = (128, 128, 256, 512)
 """Channels from the finest to the coarsest scale, as in the released checkpoint."""
-HEAD_GROUPS = 4
-"""Groups of the normalisation in the head."""
+HEAD_CHANNELS = (128, 256, 512)
+"""Channels of the head's convolutions, as in both public codes (ZhengtongXu/UniT and purdue-mars/manifeel)."""
+HEAD_HIDDEN = 512
+"""Features of the head's two hidden layers, as in ManiFeel's public code."""
 DIFFUSERS_ATTENTION = {"norm": "group_norm", "q": "to_q", "k": "to_k", "v": "to_v", "proj_out": "to_out.0"}
 """Names of attention layers: taming-transformers' to diffusers'."""
 
 
 class UniT(Representation):
-    """UniT's VQGAN, and a head over its latents.
+    """UniT's VQGAN: latents (B, 3, H / 8, W / 8).
 
     Args:
         channels: Channels from the finest to the coarsest scale.
-        attention: Whether the coarsest scale has attention, as in the released weights (trained at 128 x 160).
-        out_features: Number of features.
+        attention: Whether the coarsest scale has attention, as in the weights that UniT's authors released, which were trained
+            on 128 x 160 pixels; the paper ManiFeel uses 256 x 256 pixels and no attention.
     """
 
-    patch = 8
+    patch, out_features = 8, LATENT_CHANNELS
+    released = "a checkpoint of UniT's VQGAN"
 
-    def __init__(self, channels: tuple[int, ...] = CHANNELS, attention: bool = False, out_features: int = 512):
+    def __init__(self, channels: tuple[int, ...] = CHANNELS, attention: bool = False):
         super().__init__()
+        self.size = 128 if attention else 256
         coarsest = "Attn" if attention else ""
         finer = len(channels) - 1
         self.vqgan = VQModel(
@@ -47,33 +52,17 @@ class UniT(Representation):
             latent_channels=LATENT_CHANNELS,
             num_vq_embeddings=CODES,
         )
-        self.head = nn.Sequential(
-            *_block(LATENT_CHANNELS, 128),
-            nn.MaxPool2d(2),
-            *_block(128, 256),
-            nn.MaxPool2d(2),
-            *_block(256, 512),
-            nn.AdaptiveMaxPool2d(2),
-        )
-        self.out = nn.Linear(4 * 512, out_features)
-        self.out_features = out_features
 
     def forward(self, image):
-        return self.out(self.head(self.vqgan.encode(image).latents).flatten(1))
+        return self.vqgan.encode(in_unit_range(image)).latents
 
-    @property
-    def saved(self) -> Representation:
-        """The part that is saved after pretraining: the VQGAN without the head, which each policy trains anew."""
-        return _Vqgan(self.vqgan)
-
-    def load(self, path: Path) -> None:
-        self.saved.load(path)
-
-
-class _Vqgan(Representation):
-    def __init__(self, vqgan: VQModel):
-        super().__init__()
-        self.vqgan = vqgan
+    def head(self, features):
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise((LATENT_CHANNELS, *HEAD_CHANNELS)):
+            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), ChannelNorm(outputs), nn.LeakyReLU(0.01)]
+        layers += [nn.AdaptiveAvgPool2d(1), nn.Flatten()]
+        layers += [nn.Linear(HEAD_CHANNELS[-1], HEAD_HIDDEN), nn.ReLU(), nn.Linear(HEAD_HIDDEN, HEAD_HIDDEN), nn.ReLU()]
+        return nn.Sequential(*layers, nn.Linear(HEAD_HIDDEN, features))
 
     def convert_state_dict(self, weights):
         if has_attention(weights) and not has_attention(self.state_dict()):
@@ -83,8 +72,11 @@ class _Vqgan(Representation):
         return {f"vqgan.{n}": t for n, t in from_taming(weights, len(self.vqgan.config["block_out_channels"])).items()}
 
 
-def _block(inputs: int, outputs: int) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, 3, padding=1), nn.GroupNorm(HEAD_GROUPS, outputs), nn.LeakyReLU()]
+class ChannelNorm(nn.LayerNorm):
+    """Layer norm over the channels of each place of an image (B, C, H, W)."""
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        return super().forward(image.movedim(1, -1)).movedim(-1, 1)
 
 
 def has_attention(weights: dict[str, torch.Tensor]) -> bool:

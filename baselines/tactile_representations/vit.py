@@ -48,12 +48,12 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """A transformer block (B, N, width) -> (B, N, width), with layer scale if `scaled`."""
+    """A transformer block (B, N, width) -> (B, N, width), with layer norms of this epsilon and layer scale if `scaled`."""
 
-    def __init__(self, width: int, heads: int, scaled: bool = False):
+    def __init__(self, width: int, heads: int, eps: float = EPS, scaled: bool = False):
         super().__init__()
-        self.norm1, self.attn = nn.LayerNorm(width, EPS), Attention(width, heads)
-        self.norm2, self.mlp = nn.LayerNorm(width, EPS), Mlp(width)
+        self.norm1, self.attn = nn.LayerNorm(width, eps), Attention(width, heads)
+        self.norm2, self.mlp = nn.LayerNorm(width, eps), Mlp(width)
         self.ls1, self.ls2 = (LayerScale(width) if scaled else nn.Identity() for _ in range(2))
 
     def forward(self, tokens: torch.Tensor) -> torch.Tensor:
