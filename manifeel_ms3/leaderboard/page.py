@@ -12,16 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.estimates import Estimate, mean_success
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.protocol import (
-    LAST,
-    Condition,
-    ConditionResults,
-    Estimate,
-    collect,
-    condition_of,
-    mean_success,
-)
+from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import write_text
