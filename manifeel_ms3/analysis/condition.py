@@ -30,11 +30,19 @@ NO_SETTINGS = frozenset(
     }
 )
 """Entries of a policy's configuration that make no other policy. Every other entry does."""
-OF_MODALITY = {
-    "tacrgb": ("policy.encoder.tacrgb", "policy.encoder.freeze_tacrgb", "tacrgb_weights", "tactile_image_size"),
-    "tacff": ("policy.encoder.force_field",),
+OF_MODALITIES = {
+    "image_size": ("rgb",),
+    "policy.encoder.image": ("rgb",),
+    "policy.encoder.image_features": ("rgb",),
+    "tactile_image_size": ("tacrgb",),
+    "tacrgb_weights": ("tacrgb",),
+    "policy.encoder.tacrgb": ("tacrgb",),
+    "policy.encoder.tacrgb_sensor": ("tacrgb",),
+    "policy.encoder.freeze_tacrgb": ("tacrgb",),
+    "policy.encoder.force_field": ("tacff",),
+    "policy.encoder.tactile_features": ("tacrgb", "tacff"),
 }
-"""Settings without effect on a policy that does not observe a modality."""
+"""Settings that have an effect only on a policy that observes one of some modalities."""
 ENCODER, NETWORK = "policy.encoder.tacrgb", "policy.encoder.image"
 """Settings that name the networks of TacRGB and of the cameras."""
 LEARNT_ON = "trained on"
@@ -167,8 +175,7 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
         config: Configuration of the policy, with nested entries.
         obs_mode: Observation mode, without which some settings have no effect.
     """
-    modes = obs_mode.split("+")
-    idle = {name for mode, names in OF_MODALITY.items() if mode not in modes for name in names}
+    idle = {name for name, modes in OF_MODALITIES.items() if not set(modes) & set(obs_mode.split("+"))}
     named = {name: value for name, value in config.items() if name not in NO_SETTINGS and name != "obs_mode"}
     return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
 
