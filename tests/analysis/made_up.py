@@ -53,7 +53,7 @@ def write_run(
     name = json.dumps([config, kwargs], sort_keys=True, default=str)
     rng = np.random.default_rng(list(name.encode()))
     for step in np.linspace(last_step / checkpoints, last_step, checkpoints).astype(int).tolist():
-        won = rng.random(episodes) < rate
+        won = rng.permutation(episodes) < rate * episodes
         seeds = evaluation_seeds(episodes)
         outcomes = [EpisodeOutcome(one, bool(win), bool(win), 9, 1.0, 1.0) for one, win in zip(seeds, won, strict=True)]
         path = folder / str(rng.integers(1 << 62)) / f"evaluations/{step:08d}.json"

@@ -39,9 +39,9 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     ((comparison, (outcome,)),) = ((asked, found) for asked, found in answers.items() if found)
     assert comparison.claim.startswith("1. TacFF is above vision")
     assert outcome.verdict == "holds"
-    assert outcome.difference.value == pytest.approx(0.3, abs=0.05)
+    assert outcome.difference.value == pytest.approx(0.3)
     page = (tmp_path / "claims.md").read_text()
-    assert "| PegInsertion | rgb+tacff over rgb (wrist, diffusion_policy, 50 demonstrations) | +3" in page
+    assert "| PegInsertion | rgb+tacff over rgb (wrist, diffusion_policy, 50 demonstrations) | +30% [" in page
     assert page.count("| not run |") == len(answers) - 1
 
 
@@ -51,7 +51,7 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     page = page_of(tmp_path)
     ran, beside = (line for line in page.splitlines() if "3 x 10 x 50" in line)
     assert ran.startswith("| PegInsertion | rgb wrist | diffusion_policy |  | 50 | paper | `")
-    assert beside.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 50 | 14 ± 1% | 2")
+    assert beside.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 50 | 14 ± 1% | 20% [")
     assert beside.endswith("| 10% | 3 x 10 x 50 | paper |")  # the deviation of 10, 20 and 30 %
     assert "| I | USBInsertion | rgb | diffusion_policy |  | 50 | 49 ± 3% | not run |" in page
     assert "learnt nothing" not in page
@@ -96,7 +96,7 @@ def test_two_results_of_one_condition_seed_and_step_are_refused(tmp_path):
     write_run(tmp_path / "a", VISION, 0.4)
     write_run(tmp_path / "b", VISION, 0.6, run_dir="elsewhere", keep=3)  # the same policy, kept in another folder
     with pytest.raises(
-        ResultError, match=r"two results of PegInsertion, rgb wrist, diffusion_policy, 50 .*seed 0 and step 25000"
+        ResultError, match=r"two results of PegInsertion, rgb wrist, diffusion_policy, 50 .*seed 0 and step \d+"
     ):
         claims.main(claims.Args((tmp_path,)))
 
