@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition
 from .paper import SCRATCH
-from .presets import PAPER, Setup, setup_of
+from .presets import PAPER, Setup, has_presets_encoder, setup_of
 from .protocol import ConditionResults
 
 Found = Mapping[Condition, ConditionResults]
@@ -29,7 +29,7 @@ def answering(wanted: Condition, found: Found) -> dict[Setup, Condition]:
     """
     answers: dict[Setup, Condition] = {}
     for condition in found:
-        if _as_the_paper_says(condition) == wanted:
+        if as_the_paper_says(condition) == wanted:
             other = answers.setdefault(setup_of(condition), condition)
             if other != condition:
                 apart = sorted({name for name, _ in set(condition.settings) ^ set(other.settings)})
@@ -48,7 +48,7 @@ def answering_all(wanted: Sequence[Condition], found: Found) -> dict[Setup, list
     return {setup: [one[setup] for one in answers] for setup in in_order}
 
 
-def _as_the_paper_says(condition: Condition) -> Condition:
-    """A condition without its settings; an encoder like that of the cameras is the one that is trained from scratch."""
-    encoder = SCRATCH if condition.encoder and condition.encoder == condition.network else condition.encoder
+def as_the_paper_says(condition: Condition) -> Condition:
+    """A condition without its settings; its preset's encoder of TacRGB is the one that is trained from scratch."""
+    encoder = SCRATCH if condition.encoder and has_presets_encoder(condition) else condition.encoder
     return replace(condition, settings=(), encoder=encoder)

@@ -57,6 +57,12 @@ def setup_of(condition: Condition) -> Setup:
     return Setup(nearest, changes[nearest])
 
 
+def has_presets_encoder(condition: Condition) -> bool:
+    """Whether the encoder of TacRGB is the preset's own, which is trained from scratch."""
+    preset = _presets(condition.policy).get(setup_of(condition).preset)
+    return preset is not None and condition.encoder == preset.policy.encoder.tacrgb
+
+
 def _changes(condition: Condition, settings: Mapping[str, str], preset: Any) -> Settings:
     """What differs from a preset, given by the arguments of its training."""
     expected = dict(settings_of(_as_json(_as_trained(preset, condition)), condition.obs_mode)) | PAPER_PRECISION

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -24,6 +23,7 @@ from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
 from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.matching import as_the_paper_says
 from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.presets import setup_of
@@ -139,7 +139,7 @@ def _condition_planned(job: Job) -> Condition:
     )
     condition = condition_of(result)
     assert str(setup_of(condition)) in ("paper", "paper, precision bf16"), condition
-    return replace(condition, settings=())
+    return as_the_paper_says(condition)
 
 
 def test_an_encoder_is_pretrained_once_and_the_policies_start_from_it(tmp_path):
