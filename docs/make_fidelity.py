@@ -179,14 +179,9 @@ def start_rows() -> Iterator[Row]:
         same = all(abs(ours[name] - value) < TOLERANCE for name, value in theirs.items())
         yield spec.name, "", shown[0], shown[1], _verdict(same), "" if same else WHY_STARTS.get(spec.name, OVER_THREADS)
     for spec in paper_tasks():
-        theirs = f"tool {CODE_HEIGHTS.get(spec.name, 0.15) * 1000:.0f} mm over the table"
-        yield _row(
-            spec.name,
-            "",
-            theirs,
-            f"tool {start_height(spec) * 1000:.0f} mm over the table",
-            WHY_STARTS.get(spec.name, OVER_THREADS),
-        )
+        heights = (CODE_HEIGHTS.get(spec.name, 0.15), start_height(spec))
+        there, here = (f"tool {height * 1000:.0f} mm over the table" for height in heights)
+        yield _row(spec.name, "", there, here, WHY_STARTS.get(spec.name, OVER_THREADS))
 
 
 def start_height(spec: TaskSpec) -> float:
