@@ -67,6 +67,7 @@ CODE_HEIGHTS = dict(
 )
 """Height of the tool at the start in the public code, in m; 0.15 for the other tasks."""
 ACTION_SIZES = dict(pd_ee_delta_pose_fixed_gripper=6, pd_ee_delta_pose=7, pd_ee_delta_yaw=5)
+SAMPLERS = {"diffusion_policy": "ddpm", "equivariant_diffusion_policy": "ddim"}
 SETTINGS: dict[str, tuple[Any, Any]] = {  # setting: (paper, public code); "" where it says nothing
     "policy.obs_horizon": (2, 2),
     "policy.action_horizon": (8, 8),
@@ -79,7 +80,7 @@ SETTINGS: dict[str, tuple[Any, Any]] = {  # setting: (paper, public code); "" wh
     "inference_steps": (100, 100),
     "policy.diffusion_steps": (100, 100),
     "policy.prediction": ("", {"diffusion_policy": "epsilon", "equivariant_diffusion_policy": "sample"}),
-    "policy.sampler": ({"diffusion_policy": "ddpm", "equivariant_diffusion_policy": "ddim"},) * 2,
+    "policy.sampler": (SAMPLERS, SAMPLERS),
     "policy.down_dims": ("", (512, 1024, 2048)),
     "policy.kernel_size": ("", 5),
     "policy.n_groups": ("", 8),

@@ -136,7 +136,7 @@ def read_study(path: Path, _including: tuple[Path, ...] = ()) -> Study:
         raise StudyError(f"{path} has no grids; see configs/ for examples")
     given = content.get("resources", {})
     _require_known(given, set(KINDS), f"{path}: resources")
-    given = dict(pretrain=given.get("train", {})) | given
+    given: dict[str, Any] = dict(pretrain=given.get("train", {})) | given
     resources: dict[Kind, Resources] = {
         kind: _section(Resources, given.get(kind, {}), f"{path}: resources/{kind}") for kind in KINDS
     }
