@@ -104,7 +104,7 @@ class TrainArgs:
 
 FREE_ON_RESUME = {
     *("demos", "tacrgb_weights", "run_dir", "resume", "overwrite", "device", "compile", "log_every", "wandb_project"),
-    *("steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
+    *("steps", "total_steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
     *("eval_episodes", "eval_workers", "eval_env_kwargs"),
 }
 """Settings that may change when a run is resumed."""

@@ -118,7 +118,7 @@ class Trainer:
         self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
         self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
-        self.config = run_config(args, policy_class, self.dataset)
+        self.config = run_config(args, policy_class, self.dataset) | dict(total_steps=self.total_steps)
 
         self.policy = self._make_policy(policy_class)
         self.optimizer = torch.optim.AdamW(self.policy.parameters(), lr, args.betas, weight_decay=args.weight_decay, fused=True)

@@ -205,7 +205,7 @@ def progress(study: Study, jobs: list[Job], root: Path) -> Group:
     """A table with the numbers of jobs by their status, and one of the jobs that are running."""
     running = [job for job in jobs if is_running(job, root)]
     counts = Table("job", "done", "running", "failed", "all", "CPU hours left")
-    for kind in KINDS:
+    for kind in (kind for kind in KINDS if any(job.kind == kind for job in jobs)):
         counts.add_row(kind, *_counts(study, kind, jobs, running, root))
     names = Table("running", "for, min")
     for job in running[:SHOWN]:
@@ -238,12 +238,12 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
         costs = [cost.estimate(job, root, needs.workers) for job in group if not is_done(job, root)]
         hours = sum(one.seconds for one in costs if one) / 3600
         cpu, gpu = cpu + hours * needs.cpus, gpu + hours * needs.gpus
-        source = costs[0].source if costs and costs[0] else "done"
+        source = "done" if not costs else costs[0].source if costs[0] else "not known before the first has run"
         table.add_row(
             kind, title, f"{len(costs)} of {len(group)}", f"{hours * needs.cpus:.2f}", f"{hours * needs.gpus:.2f}", source
         )
     table.add_section()
-    table.add_row("", "all jobs that are left", "", f"{cpu:.2f}", f"{gpu:.2f}", "")
+    table.add_row("", "all jobs that are left whose cost is known", "", f"{cpu:.2f}", f"{gpu:.2f}", "")
     return table
 
 

@@ -27,11 +27,23 @@ def record_arguments(job: Job, root: Path, workers: int) -> list[str]:
     return [settings["env_id"], *amount, *sensing, *out]
 
 
+def weights_of(job: Job, root: Path) -> Path:
+    """File of the weights that the pretraining of an encoder writes."""
+    return job.folder(root) / "weights.safetensors"
+
+
+def pretrain_arguments(job: Job, root: Path) -> list[str]:
+    """Arguments of `python -m baselines.tactile_representations.pretrain` for a job."""
+    (record,) = job.needs
+    return [job.settings["encoder"], "--demos", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
+
+
 def train_arguments(job: Job, root: Path) -> list[str]:
     """Arguments of `manifeel train <policy>` for a job; the first is the preset."""
-    (record,) = job.needs
+    record, *pretrained = job.needs
     preset, *flags = train_flags(job.settings)
-    return [preset, "--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root)), *flags]
+    weights = [text for need in pretrained for text in ("--tacrgb-weights", str(weights_of(need, root)))]
+    return [preset, "--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root)), *flags, *weights]
 
 
 def train_flags(settings: dict[str, Any]) -> list[str]:
@@ -62,6 +74,8 @@ def shell_command(job: Job, root: Path, workers: int) -> str:
     """One line of shell that does a job by hand; the jobs that it needs must be done before."""
     if job.kind == "record":
         return shlex.join(["manifeel", "record", *record_arguments(job, root, workers)])
+    if job.kind == "pretrain":
+        return shlex.join(["python", "-m", "baselines.tactile_representations.pretrain", *pretrain_arguments(job, root)])
     if job.kind == "train":
         return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root)])
     (train,) = job.needs

@@ -76,19 +76,19 @@ class Trial:
 
 
 def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEstimate | None:
-    """How long a job will take.
+    """How long a job will take; None if that is not known.
 
     Args:
         job: The job.
         root: Folder of all jobs.
         workers: Number of processes that simulate.
-        try_out: Whether to run trials if no job like this one was done here; otherwise the answer is None then.
+        try_out: Whether to run trials if no job like this one was done here. There are none of the pretraining of encoders.
     """
-    parallel = 1 if job.kind == "train" else workers
+    parallel = workers if job.kind in ("record", "evaluate") else 1
     took = [status["seconds"] / max(status["units"], 1) * status["parallel"] for status in _done(job, root)]
     if took:
         return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")
-    if not try_out:
+    if not try_out or job.kind == "pretrain":
         return None
     return CostEstimate(_unit_seconds(job, root) * _units(job) / parallel, "a trial")
 
@@ -116,9 +116,11 @@ def _units(job: Job) -> int:
     settings = job.settings
     if job.kind == "record":
         return settings["num"]
+    if job.kind == "pretrain":
+        return 1
     if job.kind == "evaluate":
         return settings["episodes"] * settings["checkpoints"]
-    args, (record,) = training_args(job), job.needs
+    args, record = training_args(job), job.needs[0]
     demos = args.num_demos or record.settings["num"]
     samples = demos * _demonstration_steps(record.settings["env_id"])
     return args.steps or default_steps(demos, samples, args.batch_size)
@@ -133,9 +135,11 @@ def _demonstration_steps(env_id: str) -> float:
 
 
 def trials_of(job: Job) -> tuple[Trial, ...]:
-    """The trials from which the cost of a job is estimated."""
+    """The trials from which the cost of a job is estimated; none for the pretraining of an encoder."""
     if job.kind == "record":
         return (_simulation_trial(job, OBS_MODE),)
+    if job.kind == "pretrain":
+        return ()
     train = job if job.kind == "train" else job.needs[0]
     network = train.settings["policy"], *train_flags(_work(train.settings))
     if job.kind == "train":

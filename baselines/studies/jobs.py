@@ -20,6 +20,7 @@ import tyro
 from baselines.common.checkpoint import saved_checkpoints
 from baselines.common.training import CHECKPOINTS
 from baselines.registry import policy_spec
+from baselines.tactile_representations import pretrain
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
@@ -30,7 +31,7 @@ from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
 
-from .command_lines import evaluate_arguments, record_arguments, training_args, trajectory_of
+from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
 from .study import Job
 
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
@@ -89,7 +90,7 @@ def _perform(job: Job, root: Path, workers: int) -> None:
         with suppress(FileWriteError):  # on a full disk the error itself is told
             write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
-    parallel = 1 if job.kind == "train" else workers
+    parallel = workers if job.kind in ("record", "evaluate") else 1
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
 
@@ -107,6 +108,12 @@ def _record(job: Job, root: Path, workers: int) -> int:
     """Record demonstrations with everything that any policy observes, and return their number."""
     record.main(tyro.cli(record.Args, args=record_arguments(job, root, workers)), on_episode=lambda: None)
     return len(read_header(trajectory_of(job, root))["episodes"])
+
+
+def _pretrain(job: Job, root: Path, _workers: int) -> int:
+    """Train an encoder of TacRGB, and return 1: what it costs is known of the whole alone."""
+    pretrain.main(tyro.cli(pretrain.Args, args=pretrain_arguments(job, root)))
+    return 1
 
 
 def _train(job: Job, root: Path, _workers: int) -> int:
@@ -146,7 +153,7 @@ def is_result_of(checkpoint: Path, path: Path) -> bool:
     return all(evaluated.get(name) == value for name, value in config.items() if name not in PATHS)
 
 
-WORK = dict(record=_record, train=_train, evaluate=_evaluate)
+WORK = dict(record=_record, pretrain=_pretrain, train=_train, evaluate=_evaluate)
 
 
 def read_status(path: Path) -> dict[str, Any]:

@@ -13,12 +13,13 @@ from typing import Any, Literal, get_args, get_origin
 import yaml
 
 from baselines.registry import policy_spec
+from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.command_line import PACKAGE
 from manifeel_ms3.errors import InvalidFileError, UnknownNameError
 from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
-Kind = Literal["record", "train", "evaluate"]
-KINDS: tuple[Kind, ...] = ("record", "train", "evaluate")
+Kind = Literal["record", "pretrain", "train", "evaluate"]
+KINDS: tuple[Kind, ...] = ("record", "pretrain", "train", "evaluate")
 TABLE = "table "
 """What `tasks` begins with where it names a table of the paper instead of listing tasks: "table I"."""
 
@@ -69,7 +70,10 @@ class Grid:
     train: dict[str, Any] = field(default_factory=dict)
     """Further flags of `manifeel train`, such as {steps: 2000, batch-size: 16}."""
     encoder_flags: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Flags of `manifeel train` that one encoder of TacRGB needs, such as {t3: {image-size: 224}}."""
+    """Flags of `manifeel train` that one encoder of TacRGB needs, such as {t3: {tacrgb-weights: weights/t3_medium}}."""
+    pretrain: dict[str, str] = field(default_factory=dict)
+    """Encoders of TacRGB that are first trained on the paper's number of demonstrations of one task, and the id of that task:
+    {unit: ManiFeel-NutBoltAssembly-v1}."""
     episodes: int = 50
     """Number of evaluation episodes of a checkpoint."""
     checkpoints: int = 10
@@ -88,7 +92,10 @@ class Study:
 
 @dataclass(frozen=True)
 class Job:
-    """One recording, one training run or one evaluation, with a folder that is named by everything it depends on."""
+    """One recording, one pretraining of an encoder, one training run or one evaluation.
+
+    Its folder is named by everything that it depends on.
+    """
 
     kind: Kind
     title: str
@@ -129,6 +136,7 @@ def read_study(path: Path, _including: tuple[Path, ...] = ()) -> Study:
         raise StudyError(f"{path} has no grids; see configs/ for examples")
     given = content.get("resources", {})
     _require_known(given, set(KINDS), f"{path}: resources")
+    given: dict[str, Any] = dict(pretrain=given.get("train", {})) | given
     resources: dict[Kind, Resources] = {
         kind: _section(Resources, given.get(kind, {}), f"{path}: resources/{kind}") for kind in KINDS
     }
@@ -158,10 +166,14 @@ def _grid(entry: Any, place: str) -> Grid:
             entry = entry | dict(tasks=tasks_of_table(tasks.removeprefix(TABLE)) if tasks.startswith(TABLE) else [tasks])
         grid = _section(Grid, entry, place)
         recorded = [grid.demos or task_spec(task).paper_demos for task in grid.tasks]
+        for task in grid.pretrain.values():
+            task_spec(task)
         for policy in grid.policies:
             policy_spec(policy)
     except UnknownNameError as error:
         raise StudyError(f"{place}: {error}") from error
+    if unknown := set(grid.pretrain) - set(get_args(Representation)):
+        raise StudyError(f"{place}: pretrain {sorted(unknown)} cannot be pretrained; choose from {get_args(Representation)}")
     if too_many := [count for count in grid.num_demos if count and count > max(recorded, default=0)]:
         raise StudyError(f"{place}: num_demos {too_many} are more than the {max(recorded)} recorded; raise `demos`")
     return grid
@@ -202,10 +214,16 @@ def jobs_of(study: Study) -> list[Job]:
     jobs: dict[str, Job] = {}
     for grid in study.grids:
         for evaluate in _evaluations(grid):
-            (train,) = evaluate.needs
-            for job in (*train.needs, train, evaluate):
+            for job in _with_needs(evaluate):
                 jobs.setdefault(job.key, job)
     return sorted(jobs.values(), key=lambda job: KINDS.index(job.kind))
+
+
+def _with_needs(job: Job) -> Iterator[Job]:
+    """A job after all those that it needs."""
+    for need in job.needs:
+        yield from _with_needs(need)
+    yield job
 
 
 def _evaluations(grid: Grid) -> Iterator[Job]:
@@ -215,17 +233,23 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         if encoder and "tacrgb" not in mode.split("+"):
             continue
         camera = task_spec(task).policy_camera if camera == "policy" else camera
-        train = _training(grid, _recording(grid, task, camera), policy, mode, encoder, num_demos, seed)
+        record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
+        train = _training(grid, record, policy, mode, encoder, num_demos, seed)
         settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
         settings |= dict(env_kwargs=_env_kwargs(grid), version=version(PACKAGE))
         yield Job("evaluate", train.title, settings, (train,))
 
 
-def _recording(grid: Grid, task: str, camera: str) -> Job:
-    count = grid.demos or task_spec(task).paper_demos
-    settings = dict(env_id=task, num=count, camera=camera, env_kwargs=_env_kwargs(grid))
-    settings |= dict(revision=task_spec(task).revision)
+def _recording(task: str, count: int, camera: str, env_kwargs: str) -> Job:
+    settings = dict(env_id=task, num=count, camera=camera, env_kwargs=env_kwargs, revision=task_spec(task).revision)
     return Job("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
+
+
+def _pretraining(encoder: str, task: str) -> Job:
+    """The training of an encoder of TacRGB on the recording that Table I needs anyway."""
+    record = _recording(task, task_spec(task).paper_demos, task_spec(task).policy_camera, "{}")
+    settings = dict(encoder=encoder, version=version(PACKAGE))
+    return Job("pretrain", f"{encoder} on {short_name(task)}", settings, (record,))
 
 
 def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Job:
@@ -239,7 +263,8 @@ def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num
     demonstrations = f"{num_demos} demonstrations" if some else ""
     title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
     settings = dict(policy=policy, preset=grid.preset, flags=flags, version=version(PACKAGE))
-    return Job("train", title, settings, (record,))
+    pretrained = (_pretraining(encoder, grid.pretrain[encoder]),) if encoder in grid.pretrain else ()
+    return Job("train", title, settings, (record, *pretrained))
 
 
 def _env_kwargs(grid: Grid) -> str:

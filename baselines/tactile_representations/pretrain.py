@@ -50,11 +50,15 @@ ADVERSARY_WEIGHT = 0.1
 REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
 
 
+Representation = Literal["unit", "t3", "anytouch", "sparsh"]
+"""Names of the representations that can be trained."""
+
+
 @dataclass
 class Args:
     """Settings of the training of a tactile representation."""
 
-    representation: tyro.conf.Positional[Literal["unit", "t3", "anytouch", "sparsh"]]
+    representation: tyro.conf.Positional[Representation]
     """Name of the representation."""
     demos: tuple[Path, ...]
     """Trajectory files with TacRGB images."""

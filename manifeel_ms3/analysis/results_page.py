@@ -7,7 +7,7 @@ of a run, the leaderboard) have plotly's interactive ones.
 import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -20,10 +20,15 @@ from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
-from .claims import claims_table, find_with_one_network, results_of_claims
+from .claims import claims_page
+from .condition import Condition, condition_of
+from .estimates import difference, mean_success
 from .markdown import markdown_table
+from .matching import answering_all
 from .paper import reported
-from .protocol import LAST, Condition, ConditionResults, collect, condition_of, difference, mean_success
+from .paper_beside import runtime_table, similarity_table
+from .presets import setup_of
+from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
 
 log = logging.getLogger(__name__)
 REFERENCES = ("MeanAction", "Untrained")
@@ -37,8 +42,28 @@ HEAD = """# Results
 
 *Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is typed by hand.*
 
-Success is success at any step of an episode, with its interval of 95 %: the mean over training seeds, the last checkpoints (at
-most {last}) and the evaluation episodes; "of" says how many there are of each. Cost is that of training, all seeds together.
+Success is success at any step of an episode, with its interval of 95 % over training seeds and initial states: the mean over
+training seeds, the last checkpoints (at most {last}) and the evaluation episodes; "of" says how many there are of each. "Std"
+is the standard deviation over training seeds. "Settings" names the preset of the policy and what differs from it, "id" is the
+hash of everything that makes the condition another one. Cost is that of training, all seeds together.
+"""
+LEFT_OUT = """
+Runs with fewer than {episodes} episodes or {steps:,} gradient steps, and runs whose training was stopped, have another purpose:
+they are listed here and enter nothing below.
+"""
+TABLES = """
+## The paper's tables
+
+Mean ± standard deviation over training seeds. Only conditions with the paper's number of demonstrations appear, and each
+set-up has a row of its own. The paper contradicts itself on ball sorting: its list of set-ups has dim light alone, but Tables I
+and II report different rates for the same policies; here, Tables II and III are run in both lights.
+"""
+CLAIMS = """
+## The paper's claims
+
+Each claim is a difference of two conditions on the same initial states, with its interval of 95 % ([how](evaluation.md)). Both
+have the same settings, and equally many demonstrations: the paper's. Claim 4 may rest on the public code: it trains Flow
+Matching on Gaussian noise, but starts it from uniform noise ([fidelity](fidelity.md)).
 """
 
 
@@ -61,9 +86,10 @@ def main(args: Args) -> Path:
         ResultError: There is no result, or one is broken.
     """
     results = results_in(*args.results)
+    similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
-    write_text(args.out, "".join(page(results, figure.relative_to(args.out.parent) if has_figure else None)))
+    write_text(args.out, "".join(page(results, figure.relative_to(args.out.parent) if has_figure else None, similarities)))
     log.info("%s", args.out)
     return args.out
 
@@ -106,48 +132,60 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
     return True
 
 
-def page(results: list[dict[str, Any]], curves: Path | None = None) -> Iterator[str]:
+def page(results: list[dict[str, Any]], curves: Path | None = None, similarities: Sequence[Path] = ()) -> Iterator[str]:
     """The Markdown page, part by part.
 
     Args:
         results: Contents of result files.
         curves: Path of the figure with learning curves, relative to the page; no figure if not given.
+        similarities: Files that `manifeel similarity` wrote.
     """
-    found = collect(results)
+    collected = collect(results)
+    found = of_the_protocol(collected)
     yield HEAD.format(last=LAST)
     yield "\n## What was run\n\n"
-    yield _table_of_conditions(found, results)
+    yield _table_of_conditions(collected, results)
+    if len(found) < len(collected):
+        yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
     if curves:
         yield f"\n![Loss in training over gradient steps]({curves})\n"
     if rows := list(_gains_over_references(found)):
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
-    yield "\n## The paper's tables\n\nThe paper's networks are ResNet-18; where another one was run here, \"network\" names "
-    yield "it.\n\n"
+    yield f"{TABLES}\n"
     yield _table_of_the_paper(found)
-    yield "\n## The paper's claims\n\nEach claim is a difference of two conditions on the same initial states, with its "
-    yield "interval of 95 % ([how](evaluation.md)).\n\n"
-    yield claims_table(results_of_claims(found))
+    yield f"{CLAIMS}\n"
+    yield claims_page(found)
+    yield runtime_table(results)
+    yield similarity_table(similarities)
 
 
 def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]]) -> str:
     rows = []
     for condition, here in _sorted(found):
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
-        what = (_task(condition), condition.sensing, condition.policy, condition.network, condition.encoder)
-        rows.append((*what, condition.num_demos, mean_success(here), here.size, cost, machines))
-    names = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations", "success", "of", "cost", "on")
-    return markdown_table(names, rows)
+        what = (_task(condition), condition.sensing, condition.policy, condition.encoder, condition.num_demos)
+        note = f"left out: {here.why_left_out}" if here.why_left_out else None
+        success = (mean_success(here), _deviation(here), here.size, note)
+        rows.append((*what, setup_of(condition), f"`{condition.key}`", *success, cost, machines))
+    names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
+    return markdown_table((*names, "success", "std", "of", "note", "cost", "on"), rows)
 
 
 def _table_of_the_paper(found: dict[Condition, ConditionResults]) -> str:
     rows = []
     for table, condition, rate in reported():
-        results, network = find_with_one_network([condition], found)
-        here = (mean_success(*results), results[0].size, network) if results else ("not run", None, None)
-        rows.append((table, condition.task, condition.obs_mode, condition.policy, condition.encoder, f"{rate:.0%}", *here))
-    return markdown_table(("table", "task", "sensing", "policy", "TacRGB encoder", "paper", "here", "of", "network"), rows)
+        what = (table, condition.task, condition.obs_mode, condition.policy, condition.encoder, condition.num_demos, rate)
+        answers = [(setup, found[here]) for setup, (here,) in answering_all([condition], found).items()]
+        ran = [(mean_success(here), _deviation(here), here.size, setup) for setup, here in answers]
+        rows += [(*what, *cells) for cells in ran or [("not run", None, None, None)]]
+    names = ("table", "task", "sensing", "policy", "TacRGB encoder", "demonstrations", "paper")
+    return markdown_table((*names, "here", "std", "of", "settings"), rows)
+
+
+def _deviation(results: ConditionResults) -> str | None:
+    return None if results.seed_deviation is None else f"{results.seed_deviation:.0%}"
 
 
 def _sorted(found: dict[Condition, ConditionResults]) -> list[tuple[Condition, ConditionResults]]:
@@ -155,12 +193,13 @@ def _sorted(found: dict[Condition, ConditionResults]) -> list[tuple[Condition, C
 
 
 def _task(condition: Condition) -> str:
-    return f"{condition.task} `{condition.variant}`" if condition.variant else condition.task
+    revision = f"revision {condition.revision}" if condition.revision > 1 else ""
+    return " ".join(filter(None, (condition.task, f"`{condition.variant}`" if condition.variant else "", revision)))
 
 
 def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator[tuple[str, ...]]:
     for (condition, results), (other, learnt_nothing) in product(_sorted(found), repeat=2):
-        same_task = (condition.env_id, condition.variant) == (other.env_id, other.variant)
+        same_task = (condition.env_id, condition.variant, condition.revision) == (other.env_id, other.variant, other.revision)
         comparable = same_task and other.obs_mode in ("none", condition.obs_mode)
         if comparable and other.policy in REFERENCES and condition.policy not in REFERENCES:
             gain, p_value = difference(results, learnt_nothing)

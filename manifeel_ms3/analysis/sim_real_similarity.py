@@ -29,7 +29,7 @@ from manifeel_ms3.files import write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .protocol import Estimate
+from .estimates import Estimate
 
 log = logging.getLogger(__name__)
 Features = Callable[[np.ndarray], np.ndarray]
@@ -76,6 +76,8 @@ class Args:
     """Number of resamples of the bootstrap."""
     out: Path = Path("runs/similarity")
     """Folder for similarity.json and nearest.png."""
+    object: str = ""
+    """Object that both sides touch, such as the paper's "ball", "bulb" or "gear", beside which the page of results shows it."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,10 @@ class Similarity:
 
     fid: Estimate
     kid: Estimate
+    modality: str
+    """Modality, "tacrgb" or "tacff"."""
+    object: str
+    """Object that both sides touch; "" if it was not named."""
     features: str
     """Name of the features, as it was asked for."""
     dimensions: int
@@ -106,6 +112,8 @@ def main(args: Args) -> Similarity:
     result = Similarity(
         bootstrapped(fid, sim, real, args.resamples),
         bootstrapped(kid, sim, real, args.resamples),
+        args.modality,
+        args.object,
         args.features,
         sim.shape[1],
         len(sim),

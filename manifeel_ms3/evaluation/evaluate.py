@@ -193,6 +193,7 @@ def _of_checkpoint(checkpoint: Path, kwargs: dict[str, Any], extra: dict[str, An
     config = checkpoint_config(checkpoint)
     if missing := [name for name in ("env_id", *SENSING) if name not in config]:
         raise CheckpointError(f"{checkpoint}: its config.json lacks {missing}; train the policy again")
+    config |= {name: value for name, value in kwargs.items() if name == "inference_steps" and value}  # what the policy does
     source = PolicySource(checkpoint.resolve(), kwargs=json.dumps(kwargs))  # training may move the link `last` meanwhile
     sensing = {name: config[name] for name in SENSING}
     return Evaluation(source, task_spec(config["env_id"]).env_id, sensing | extra, config)

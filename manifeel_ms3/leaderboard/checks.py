@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from manifeel_ms3.analysis.protocol import condition_of
+from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds, task_spec
 

@@ -12,16 +12,11 @@ from typing import Any
 
 import numpy as np
 
+from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.estimates import Estimate, mean_success
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.protocol import (
-    LAST,
-    Condition,
-    ConditionResults,
-    Estimate,
-    collect,
-    condition_of,
-    mean_success,
-)
+from manifeel_ms3.analysis.presets import setup_of
+from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import write_text
@@ -124,10 +119,10 @@ def leaderboard_table(rows: list[Row]) -> str:
         about, condition = row.submission.about, row.condition
         name = markdown_text(about.name)
         task = f"{condition.task} {condition.variant}".strip()
-        what = (task, condition.sensing, condition.policy, condition.network, condition.encoder)
+        what = (task, condition.sensing, condition.policy, str(setup_of(condition)), condition.encoder)
         numbers = (condition.num_demos, row.success, row.results.size, row.rerun_text)
         cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
-    what = ("task", "sensing", "policy", "network", "TacRGB encoder", "demonstrations")
+    what = ("task", "sensing", "policy", "settings", "TacRGB encoder", "demonstrations")
     return head + markdown_table((*what, "success", "of", "run again", "submission"), cells)
 
 
@@ -151,6 +146,7 @@ def _for_page(row: Row) -> dict[str, Any]:
         cameras=", ".join(condition.cameras),
         policy=condition.policy,
         network=condition.network,
+        setup=str(setup_of(condition)),
         encoder=condition.encoder,
         name=about.name,
         authors=about.authors,

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import hypergeom
 
-from manifeel_ms3.analysis.protocol import Condition, condition_of
+from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.evaluate import Evaluation, run_episodes

@@ -5,10 +5,14 @@ import json
 import numpy as np
 import pytest
 
-from manifeel_ms3.analysis.protocol import Condition, ConditionResults, collect, condition_of, difference, mean_success
+from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
+from manifeel_ms3.analysis.estimates import difference, mean_success
+from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
+
+from .made_up import config_of
 
 RNG = np.random.default_rng(0)
 
@@ -33,7 +37,8 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
             write(tmp_path, seed, step, [step == 30, step >= 20, seed == 1])
     collected = collect(results_in(tmp_path), last=2)
     (condition,) = collected
-    assert condition == Condition(PEG, "rgb+tacrgb", "diffusion_policy", "t3", ("wrist",), 50)
+    settings = (("policy.encoder.image", '"resnet18"'),)
+    assert condition == Condition(PEG, "rgb+tacrgb", "diffusion_policy", "t3", ("wrist",), ("right",), 50, settings=settings)
     assert collected[condition].episode_seeds == [100, 101, 102]
     assert collected[condition].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
     assert mean_success(collected[condition]).value == pytest.approx(8 / 12)
@@ -45,13 +50,36 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
         condition_of(result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
         for env_kwargs in (
             dict(sim_backend="physx_cpu"),
-            dict(render_backend="none", sensor_configs=dict(width=128), tactile_sensors=["left"]),
-            dict(fit="paper"),
+            dict(render_backend="none", lighting="normal"),  # a default that is spelled out
+            dict(fit="tight"),
         )
     )
     assert rendered == plain
     assert plain.variant == ""
     assert changed.variant == '{"fit": "tight"}'
+    sensed = [dict(tactile_sensors=["left"]), dict(sensor_configs=dict(width=128)), dict(tactile=dict(units="tacsl"))]
+    results = (result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]) for env_kwargs in sensed)
+    assert len({plain.key, changed.key, *(condition_of(result).key for result in results)}) == 5
+
+
+def test_demonstrations_of_another_variant_make_another_policy():
+    def trained_on(**recorded) -> Condition:
+        config = dict(policy_name="diffusion_policy", obs_mode="rgb", env_kwargs=recorded)
+        return condition_of(result_of(PEG, dict(lighting="dim"), config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
+
+    assert trained_on(lighting="dim").settings == ()
+    assert trained_on().settings == (("trained on", ""),)
+    assert trained_on(lighting="dim", fit="tight").settings == (("trained on", '{"fit": "tight", "lighting": "dim"}'),)
+
+
+def test_what_is_written_down_beside_the_settings_makes_no_other_policy():
+    config = config_of("diffusion_policy", "paper", "PegInsertion", "rgb", 0)
+    settings = dict(settings_of(config, "rgb"))
+    assert settings == dict(settings_of({name: value for name, value in config.items() if name not in NO_SETTINGS}, "rgb"))
+    expected = {"image_size", "steps", "lr", "batch_size", "inference_steps", "policy.action_horizon", "policy.encoder.image"}
+    assert expected <= set(settings)
+    assert not any("tacrgb" in name or "force_field" in name for name in settings)  # without effect on what sees no touch
+    assert "policy.encoder.freeze_tacrgb" in dict(settings_of(config, "rgb+tacrgb"))
 
 
 def test_results_of_different_initial_states_are_not_mixed(tmp_path):
@@ -69,15 +97,45 @@ def test_one_checkpoint_has_wilsons_interval():
     assert mean_success(never).high == pytest.approx(1.96**2 / (50 + 1.96**2), rel=1e-3)  # Wilson (1927), at no success
 
 
-def test_interval_is_that_of_the_mean_over_seeds():
-    """Against the standard error of the seeds' means: with many seeds, the percentile bootstrap comes near the normal one."""
-    many = runs(0.4, seeds=200)
-    means = many.success.mean((1, 2))
-    half = 1.96 * means.std(ddof=1) / np.sqrt(len(means))
-    estimate = mean_success(many)
-    assert estimate.value == pytest.approx(means.mean())
-    assert estimate.low == pytest.approx(means.mean() - half, abs=0.15 * half)
-    assert estimate.high == pytest.approx(means.mean() + half, abs=0.15 * half)
+@pytest.mark.parametrize("along", ["seeds", "starts"])
+def test_interval_is_that_of_what_varies(along):
+    """Against the normal interval of the mean, where success depends on the training seed alone, or on the start alone."""
+    rates = RNG.random(200) < 0.4
+    axis = dict(seeds=(200, 1, 1), starts=(1, 1, 200))[along]
+    varied = np.broadcast_to(rates.astype(float).reshape(axis), (200, 10, 200))
+    half = 1.96 * rates.std(ddof=1) / np.sqrt(200)
+    estimate = mean_success(ConditionResults(varied, list(range(200))))
+    assert estimate.value == pytest.approx(rates.mean())
+    assert estimate.low == pytest.approx(rates.mean() - half, abs=0.1 * half)
+    assert estimate.high == pytest.approx(rates.mean() + half, abs=0.1 * half)
+
+
+def test_seeds_widen_the_interval_of_a_difference():
+    """Ten seeds and fifty starts whose effects are known: the intervals hold the true difference, which is none."""
+    rng, held, half_widths = np.random.default_rng(1), 0, []
+    for _ in range(100):
+        seed_effects, starts = rng.normal(0, 0.1, (2, 10, 1, 1)), rng.uniform(0.2, 0.8, 50)
+        sides = ((rng.random((10, 3, 50)) < starts + effect).astype(float) for effect in seed_effects)
+        found, p = difference(*(ConditionResults(side, list(range(50))) for side in sides))
+        held += found.low <= 0 <= found.high
+        assert (p < 0.05) == (not found.low <= 0 <= found.high) or abs(p - 0.05) < 0.01
+        half_widths.append((found.high - found.low) / 2)
+    expected = 1.96 * np.sqrt(2 * 0.1**2 / 10)  # of the seeds' effects alone
+    assert held >= 88
+    assert expected < np.mean(half_widths) < 1.5 * expected
+
+
+def test_the_deviation_over_seeds_is_that_of_their_means():
+    success = np.stack([np.full((10, 50), rate) for rate in (0.2, 0.4, 0.6)])
+    assert ConditionResults(success, list(range(50))).seed_deviation == pytest.approx(0.2)
+    assert runs(0.5, seeds=1).seed_deviation is None
+
+
+def test_a_difference_takes_as_many_checkpoints_from_both():
+    early_and_late = np.concatenate([np.zeros((1, 9, 50)), np.ones((1, 1, 50))], axis=1)
+    late = np.ones((1, 1, 50))
+    found, _ = difference(*(ConditionResults(side, list(range(50))) for side in (early_and_late, late)))
+    assert found.value == 0.0
 
 
 def test_tasks_weigh_the_same_however_many_seeds_they_have():

@@ -12,17 +12,24 @@ from pathlib import Path
 import pytest
 import tyro
 
+from baselines.common.checkpoint import as_json
 from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.jobs import is_done, perform
-from baselines.studies.study import StudyError, jobs_of, read_study
+from baselines.studies.study import Job, StudyError, jobs_of, read_study
+from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
+from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.matching import as_the_paper_says
+from manifeel_ms3.analysis.paper import paper_condition, reported
+from manifeel_ms3.analysis.paper_claims import comparisons
+from manifeel_ms3.analysis.presets import setup_of
 from manifeel_ms3.errors import MachineError
 from manifeel_ms3.evaluation.result import results_in
-from manifeel_ms3.tasks.registry import tasks_of_table
+from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[2]
@@ -70,13 +77,14 @@ def test_a_job_is_named_by_all_that_it_depends_on(study):
 def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     study = read_study(path)
     jobs = jobs_of(study)
-    assert {job.kind for job in jobs} == {"record", "train", "evaluate"}
+    pretrained = {"pretrain"} if any(grid.pretrain for grid in study.grids) else set()
+    assert {job.kind for job in jobs} == {"record", "train", "evaluate"} | pretrained
     trials = [trial for job in jobs for trial in cost.trials_of(job)]
     measured = {trial.key: dict(seconds=0.5) for trial in trials}  # the trials themselves: the tests below
     (tmp_path / cost.TRIALS).write_text(json.dumps(measured))
     table = study_command.plan(study, jobs, tmp_path)
     assert table.row_count == len({(job.kind, job.title.partition(", seed")[0]) for job in jobs}) + 1
-    assert list(table.columns[1].cells)[-1] == "all jobs that are left"
+    assert list(table.columns[1].cells)[-1] == "all jobs that are left whose cost is known"
     assert float(list(table.columns[3].cells)[-1]) > 0
     assert {json.dumps(trial.arguments) for trial in trials if trial.measure is cost.gradient_step}
     for job in jobs:
@@ -107,6 +115,61 @@ def test_a_table_of_the_paper_stands_for_its_tasks(study):
     }
     assert counts["ManiFeel-GearAssembly-v1"] == 50
     assert counts["ManiFeel-BulbInstallation-v1"] is None  # the paper recorded 20: all are used
+
+
+def test_the_papers_studies_answer_every_claim_and_every_cell_of_its_tables():
+    """Each condition of the paper is planned with its settings, as a result of the study would be collected."""
+    planned = {_condition_planned(job) for job in jobs_of(read_study(REPOSITORY / "configs/paper.yaml")) if job.kind == "train"}
+    wanted = {condition for _, condition, _ in reported()}
+    wanted |= {side for comparison in comparisons() for side in (comparison.first, comparison.second)}
+    wanted |= {paper_condition("ObjectSearch", "rgb", camera="wrist", variant=dict(lighting="dim"))}
+    missing = sorted(map(str, wanted - planned))
+    assert missing == []
+
+
+def _condition_planned(job: Job) -> Condition:
+    args, record = training_args(job), job.needs[0]
+    sensing = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
+    learning_rate = args.lr or args.public_code_lr()
+    config = as_json(args) | dict(lr=learning_rate, num_demos=args.num_demos or record.settings["num"])
+    kwargs = json.loads(record.settings["env_kwargs"]) | sensing
+    policy, revision = job.settings["policy"], task_spec(args.env_id).revision
+    result = dict(
+        env_id=args.env_id, env_kwargs=kwargs, obs_mode=args.obs_mode, policy=policy, config=config, revision=revision
+    )
+    condition = condition_of(result)
+    assert str(setup_of(condition)) in ("paper", "paper, precision bf16"), condition
+    return as_the_paper_says(condition)
+
+
+def test_an_encoder_is_pretrained_once_and_the_policies_start_from_it(tmp_path):
+    jobs = jobs_of(read_study(REPOSITORY / "configs/representation.yaml"))
+    (pretrain,) = (job for job in jobs if job.kind == "pretrain")
+    (record,) = pretrain.needs
+    assert record.settings["env_id"] == "ManiFeel-NutBoltAssembly-v1"
+    of_table_one = {job.key for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))}
+    assert record.key in of_table_one  # the recording that Table I needs anyway
+    trained = [job for job in jobs if job.kind == "train" and job.settings["flags"]["policy.encoder.tacrgb"] == "unit"]
+    assert len(trained) == 12
+    for job in trained:
+        assert pretrain in job.needs
+        assert training_args(job, tmp_path).tacrgb_weights == tmp_path / f"pretrain/{pretrain.key}/weights.safetensors"
+    words = shlex.split(shell_command(pretrain, tmp_path, 1))
+    assert words[:4] == ["python", "-m", "baselines.tactile_representations.pretrain", "unit"]
+    args = tyro.cli(PretrainArgs, args=words[3:])
+    assert args.demos == (record.folder(tmp_path) / "trajectory.h5",)
+    assert cost.estimate(pretrain, tmp_path, 1) is None
+    assert jobs.index(record) < jobs.index(pretrain) < min(map(jobs.index, trained))
+
+
+def test_encoders_of_table_three_have_equal_demonstrations():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/representation.yaml"))
+    trained = [job for job in jobs if job.kind == "train"]
+    assert {_condition_planned(job).num_demos for job in trained} == {50}
+    trained = [training_args(job) for job in trained]
+    assert {(args.image_size, args.policy.encoder.image) for args in trained} == {
+        (256, "resnet18")
+    }  # the camera stays as it is
 
 
 def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
@@ -154,6 +217,11 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
         ("grids: {tasks: table I}", "`grids` has the wrong type"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seed: 1}]", "'seed'.* are not known"),
         ("grids: [{seeds: [0]}]", "tasks"),
+        ("grids: [{tasks: table III, pretrain: {unit: ManiFeel-Knitting-v1}}]", "'ManiFeel-Knitting-v1' is not registered"),
+        (
+            "grids: [{tasks: table III, pretrain: {resnet18: ManiFeel-PegInsertion-v1}}]",
+            r"pretrain \['resnet18'\] cannot be pre",
+        ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1]}]\nresources: {training: {}}", "'training'.* are not known"),
     ],
 )

@@ -171,7 +171,7 @@ class BallSortingEnv(VisuotactileEnv):
     max_episode_steps=400,
     category="exploration",
     paper_demos=80,
-    paper_tables=("I",),
+    paper_tables=("I", "II", "III"),
     demo_steps=84,
     revision=2,
 )

@@ -1,0 +1,192 @@
+"""Conditions: what is evaluated, told apart by everything that makes another policy.
+
+A `Condition` is a task, its observations, a policy, and the settings that the policy was trained and run with: two results are
+of the same condition only if they differ in nothing but the training seed, the checkpoint, and where they were computed.
+"""
+
+import hashlib
+import inspect
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from typing import Any
+
+from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.tasks.registry import short_name, task_spec
+
+SENSING = ("obs_mode", "cameras", "tactile_sensors")
+"""Arguments of an environment that have fields of their own in a `Condition`."""
+BACKENDS = ("sim_backend", "render_backend")
+"""Arguments of an environment that say what computes it, and make no other condition."""
+NO_SETTINGS = frozenset(
+    {
+        *("policy_name", "env_id", *SENSING, "num_demos", "env_kwargs"),  # have fields of their own
+        *("seed", "step"),  # what a condition has several of
+        *("action_dim", "taxel_shape", "num_samples"),  # follow from the task and its demonstrations
+        *("demos", "run_dir", "resume", "overwrite", "device", "compile", "trained_on", "training_seconds"),  # where and how
+        *("total_steps", "save_every", "keep", "log_every"),
+        *("eval_episodes", "eval_workers", "eval_env_kwargs", "wandb_project"),
+    }
+)
+"""Entries of a policy's configuration that make no other policy. Every other entry does."""
+OF_MODALITIES = {
+    "image_size": ("rgb",),
+    "policy.encoder.image": ("rgb",),
+    "policy.encoder.image_features": ("rgb",),
+    "tactile_image_size": ("tacrgb",),
+    "tacrgb_weights": ("tacrgb",),
+    "policy.encoder.tacrgb": ("tacrgb",),
+    "policy.encoder.tacrgb_sensor": ("tacrgb",),
+    "policy.encoder.freeze_tacrgb": ("tacrgb",),
+    "policy.encoder.force_field": ("tacff",),
+    "policy.encoder.tactile_features": ("tacrgb", "tacff"),
+}
+"""Settings that have an effect only on a policy that observes one of some modalities."""
+ENCODER, NETWORK = "policy.encoder.tacrgb", "policy.encoder.image"
+"""Settings that name the networks of TacRGB and of the cameras."""
+LEARNT_ON = "trained on"
+"""Setting of a policy whose demonstrations were recorded with other arguments of the task than its evaluation has."""
+KEY_LENGTH = 8
+"""Digits of a condition's hash that are shown."""
+Settings = tuple[tuple[str, str], ...]
+"""Names and values, in the order of the names. Names of nested entries are joined by dots, values are json."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A task, its observations and a policy with all its settings: everything but the training seed."""
+
+    env_id: str
+    """Id of the task."""
+    obs_mode: str
+    """Observation mode, such as "rgb+tacff"."""
+    policy: str
+    """Registered name of the policy, or the name of its class."""
+    encoder: str = ""
+    """Encoder of TacRGB images; empty without them."""
+    cameras: tuple[str, ...] = ()
+    """Cameras that the policy observes."""
+    pads: tuple[str, ...] = ()
+    """Sides of the tactile sensors that the policy observes."""
+    num_demos: int | None = None
+    """Number of training episodes."""
+    variant: str = ""
+    """Arguments of the task other than its defaults, such as its fit, light or units of touch, as json."""
+    revision: int = 1
+    """Revision of the task."""
+    settings: Settings = ()
+    """All other settings that make another policy."""
+
+    @property
+    def task(self) -> str:
+        """Short name of the task."""
+        return short_name(self.env_id)
+
+    @property
+    def sensing(self) -> str:
+        """Observation mode, cameras, and tactile sensors other than the right one alone, as a page shows them."""
+        return " ".join((self.obs_mode, *self.cameras, *(self.pads if self.pads != ("right",) else ())))
+
+    @property
+    def network(self) -> str:
+        """Encoder of camera images; empty for a policy that is no baseline."""
+        return str(json.loads(dict(self.settings).get(NETWORK, '""')))
+
+    @property
+    def key(self) -> str:
+        """Hash that names the condition: two conditions with the same key agree in everything."""
+        content = json.dumps(asdict(self), sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:KEY_LENGTH]
+
+    def __str__(self) -> str:
+        demos = f"{self.num_demos} demonstrations" if self.num_demos else ""
+        what = (self.task, self.variant, self.sensing, self.policy, self.encoder, demos)
+        return f"{', '.join(filter(None, what))} ({self.key})"
+
+
+def condition_of(result: dict[str, Any]) -> Condition:
+    """The condition that a result belongs to.
+
+    Entries of the policy's configuration that are of another type than the baselines' count as absent.
+    """
+    config, obs_mode = result["config"], result["obs_mode"]
+    modes = obs_mode.split("+")
+    settings = settings_of(config, obs_mode)
+    variant = variant_of(result["env_id"], result["env_kwargs"])
+    recorded = config.get("env_kwargs")
+    if isinstance(recorded, dict) and (learnt := variant_of(result["env_id"], recorded)) != variant:
+        settings = tuple(sorted((*settings, (LEARNT_ON, learnt))))
+    num_demos = config.get("num_demos")
+    return Condition(
+        result["env_id"],
+        obs_mode,
+        result["policy"].rpartition(":")[2],
+        str(json.loads(dict(settings).get(ENCODER, '""'))),
+        _names(result["env_kwargs"].get("cameras")) if "rgb" in modes else (),
+        (_names(result["env_kwargs"].get("tactile_sensors")) or ("right",)) if {"tacrgb", "tacff"} & set(modes) else (),
+        num_demos if isinstance(num_demos, int) else None,
+        variant,
+        result["revision"],
+        tuple((name, value) for name, value in settings if name != ENCODER),
+    )
+
+
+def _names(given: Any) -> tuple[str, ...]:
+    return tuple(map(str, given)) if isinstance(given, (list, tuple)) else ()
+
+
+def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
+    """Arguments of a task that are not its defaults, as json; "" if there are none.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make`.
+    """
+    defaults = _default_arguments(env_id)
+    other = {
+        name: value
+        for name, value in env_kwargs.items()
+        if name not in (*SENSING, *BACKENDS) and not (name in defaults and defaults[name] == value)
+    }
+    return json.dumps(other, sort_keys=True) if other else ""
+
+
+@cache
+def _default_arguments(env_id: str) -> dict[str, Any]:
+    """The defaults of a task's own arguments; {} for a task that is not registered here."""
+    try:
+        classes = task_spec(env_id).env_class.__mro__
+    except UnknownNameError:
+        return {}
+    parameters = [inspect.signature(one.__init__).parameters for one in reversed(classes) if "__init__" in vars(one)]
+    return {
+        name: parameter.default
+        for of_class in parameters
+        for name, parameter in of_class.items()
+        if parameter.default is not parameter.empty
+    }
+
+
+def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
+    """The settings of a policy that make another one.
+
+    Args:
+        config: Configuration of the policy, with nested entries.
+        obs_mode: Observation mode, without which some settings have no effect.
+    """
+    idle = {name for name, modes in OF_MODALITIES.items() if not set(modes) & set(obs_mode.split("+"))}
+    named = {name: value for name, value in config.items() if name not in NO_SETTINGS and name != "obs_mode"}
+    return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
+
+
+def _flat(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names joined by dots and values as json of a configuration's innermost entries."""
+    places = [("", config)]
+    while places:
+        place, entries = places.pop()
+        for name, value in entries.items():
+            if isinstance(value, dict) and value:
+                places.append((f"{place}{name}.", value))
+            else:
+                yield f"{place}{name}", json.dumps(value, sort_keys=True)

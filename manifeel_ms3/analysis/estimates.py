@@ -1,0 +1,103 @@
+"""Success rates and their differences, with intervals over training seeds and initial states.
+
+Another training seed gives another policy, another initial state another episode; a mean varies with both. The bootstrap
+therefore draws both anew, each independently of the other (the pigeonhole bootstrap, Owen 2007, which errs on the wide side).
+Checkpoints of one run are no independent samples: they are averaged before anything is drawn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from manifeel_ms3.evaluation.result import ResultError
+from manifeel_ms3.evaluation.statistics import wilson_interval
+
+from .protocol import ConditionResults
+
+RESAMPLES = 4000
+"""Number of resamples of a bootstrap; the ends of intervals then vary by less than half a point."""
+TAILS = (0.025, 0.975)
+"""Quantiles at the ends of an interval of 95 %."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its interval of 95 %."""
+
+    value: float
+    """The number itself."""
+    low: float
+    """Lower end of the interval."""
+    high: float
+    """Upper end of the interval."""
+
+    def __str__(self) -> str:
+        return f"{self.value:.0%} [{self.low:.0%}, {self.high:.0%}]"
+
+    @property
+    def signed(self) -> str:
+        """Text of a difference, with its sign."""
+        return f"{self.value:+.0%} [{self.low:+.0%}, {self.high:+.0%}]"
+
+
+def mean_success(*tasks: ConditionResults) -> Estimate:
+    """Mean success over conditions, each weighing the same.
+
+    Its interval is from a bootstrap over training seeds and initial states, within each condition. A single checkpoint has
+    Wilson's interval. Where a single seed was trained, the interval is of that one policy.
+    """
+    if len(tasks) == 1 and tasks[0].success.shape[:2] == (1, 1):
+        succeeded, episodes = int(tasks[0].success.sum()), len(tasks[0].episode_seeds)
+        return Estimate(succeeded / episodes, *wilson_interval(succeeded, episodes))
+    rng = np.random.default_rng(0)
+    drawn = [_resampled_means(_rates(task), _weights(rng, len(task.episode_seeds)), rng) for task in tasks]
+    value = float(np.mean([task.success.mean() for task in tasks]))
+    return _estimate(value, np.mean(drawn, axis=0), tasks, lowest=0.0)
+
+
+def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estimate, float]:
+    """How much more often the first condition succeeds than the second, and the p-value of no difference.
+
+    Both count with equally many checkpoints. The bootstrap draws the same initial states for both, and training seeds for each
+    apart. The p-value is twice the share of resamples on the rarer side of zero.
+
+    Raises:
+        ResultError: The two were evaluated on different episodes.
+    """
+    if first.episode_seeds != second.episode_seeds:
+        raise ResultError(
+            "the two conditions were evaluated on different initial states; evaluate both with as many --episodes"
+        )
+    checkpoints = min(first.success.shape[1], second.success.shape[1])
+    rng = np.random.default_rng(0)
+    starts = _weights(rng, len(first.episode_seeds))
+    sides = [_rates(side, checkpoints) for side in (first, second)]
+    value = float(sides[0].mean() - sides[1].mean())
+    drawn = np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides))
+    rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
+    return _estimate(value, drawn, (first, second), lowest=-1.0), float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
+
+
+def _rates(results: ConditionResults, checkpoints: int | None = None) -> np.ndarray:
+    """Success (training seeds, episodes) over the last checkpoints; over all of them if their number is not given."""
+    return results.success[:, -(checkpoints or results.success.shape[1]) :].mean(1)
+
+
+def _weights(rng: np.random.Generator, count: int) -> np.ndarray:
+    """How much each of `count` samples weighs in each resample (RESAMPLES, count)."""
+    return rng.multinomial(count, np.full(count, 1 / count), RESAMPLES) / count
+
+
+def _resampled_means(rates: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Means (RESAMPLES,) of rates (training seeds, episodes), given the weights of the episodes."""
+    return np.einsum("rs,se,re->r", _weights(rng, len(rates)), rates, starts, optimize=True)
+
+
+def _estimate(value: float, drawn: np.ndarray, of: Sequence[ConditionResults], lowest: float) -> Estimate:
+    if np.ptp(drawn) < 1e-12:  # nothing varies, so that a bootstrap has nothing to draw from:
+        fewest = min(len(results.episode_seeds) for results in of)
+        unseen = wilson_interval(0, fewest)[1]  # the rate that an outcome may have which none of so many episodes has shown
+        return Estimate(value, max(value - unseen, lowest), min(value + unseen, 1.0))
+    low, high = np.quantile(drawn, TAILS)
+    return Estimate(value, float(low), float(high))

@@ -1,0 +1,54 @@
+"""Find the results that answer for a condition of the paper, and compare like with like.
+
+The paper's condition leaves settings open: all conditions of a comparison must then have the same ones. So each set-up, such as
+the paper's preset or the small networks, gives an answer of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from manifeel_ms3.evaluation.result import ResultError
+
+from .condition import Condition
+from .paper import SCRATCH
+from .presets import PAPER, Setup, has_presets_encoder, setup_of
+from .protocol import ConditionResults
+
+Found = Mapping[Condition, ConditionResults]
+
+
+def answering(wanted: Condition, found: Found) -> dict[Setup, Condition]:
+    """The conditions that answer for one of the paper, one for each set-up.
+
+    Args:
+        wanted: A condition of the paper, without settings.
+        found: The results that enter comparisons.
+
+    Raises:
+        ResultError: Two conditions answer in one set-up, such as encoders that start from different weights.
+    """
+    answers: dict[Setup, Condition] = {}
+    for condition in found:
+        if as_the_paper_says(condition) == wanted:
+            other = answers.setdefault(setup_of(condition), condition)
+            if other != condition:
+                apart = sorted({name for name, _ in set(condition.settings) ^ set(other.settings)})
+                raise ResultError(
+                    f"{other} and {condition} would both answer for one condition of the paper, and differ in {apart}; give "
+                    "the folders of one of them"
+                )
+    return answers
+
+
+def answering_all(wanted: Sequence[Condition], found: Found) -> dict[Setup, list[Condition]]:
+    """The conditions that answer for several of the paper, in each set-up that has all of them; the paper's preset is first."""
+    answers = [answering(condition, found) for condition in wanted]
+    common = set.intersection(*(set(one) for one in answers))
+    in_order = sorted(common, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+    return {setup: [one[setup] for one in answers] for setup in in_order}
+
+
+def as_the_paper_says(condition: Condition) -> Condition:
+    """A condition without its settings; its preset's encoder of TacRGB is the one that is trained from scratch."""
+    encoder = SCRATCH if condition.encoder and has_presets_encoder(condition) else condition.encoder
+    return replace(condition, settings=(), encoder=encoder)

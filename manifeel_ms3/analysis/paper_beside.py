@@ -1,0 +1,87 @@
+"""Training times, and distances to real touch, beside the paper's: parts of the page of results."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from manifeel_ms3.evaluation.result import ResultError
+
+from .condition import condition_of
+from .markdown import markdown_table
+from .paper import DP, RUNTIME, RUNTIME_DEMOS, SIMILARITY, TACRGB
+
+SECONDS_PER_MINUTE = 60
+RUNTIME_TASKS = ("BallSorting", "BallSortingDim")
+RUNTIME_TEXT = """
+## Training time
+
+Minutes for one epoch of Diffusion Policy with TacRGB, sorting with {demos} demonstrations and batches of 8. The epochs differ
+in length, since the paper's demonstrations were recorded on a real robot; samples per second do not depend on that. Its GPU is
+an NVIDIA A30. Ours is measured by `manifeel study configs/runtime.yaml`.
+"""
+SIMILARITY_TEXT = """
+## Simulated and real touch
+
+Distances of simulated to real tactile images, by features of a network; the smaller, the more alike. The paper's are of a
+ResNet that it does not name. Ours need pictures of a real sensor, which this repository does not have: `manifeel similarity
+--sim trajectory.h5 --real PICTURES --object ball` measures them, and this page shows them if it is given their folder.
+"""
+
+
+def runtime_table(results: Sequence[dict[str, Any]]) -> str:
+    """Markdown: minutes of an epoch by encoder of TacRGB, the paper's and those of the results at hand."""
+    rows = []
+    for encoder, minutes in RUNTIME.items():
+        timed = {_timed(result): result for result in results if _is_of_runtime(result, encoder)}
+        here = [(f"{one / SECONDS_PER_MINUTE:.1f}", f"{rate:.1f}", machine) for one, rate, machine in sorted(timed)]
+        rows += [(encoder, minutes, *one) for one in here or [("not run", None, None)]]
+    names = ("TacRGB encoder", "paper, min", "here, min", "here, samples per second", "on")
+    return f"{RUNTIME_TEXT.format(demos=RUNTIME_DEMOS)}\n{markdown_table(names, rows)}"
+
+
+def _is_of_runtime(result: dict[str, Any], encoder: str) -> bool:
+    condition, config = condition_of(result), result["config"]
+    asked = (condition.task in RUNTIME_TASKS, condition.policy == DP, condition.obs_mode == TACRGB)
+    known = all(config.get(name) for name in ("training_seconds", "step", "num_samples", "batch_size", "trained_on"))
+    return all(asked) and known and condition.encoder == encoder and condition.num_demos == RUNTIME_DEMOS
+
+
+def _timed(result: dict[str, Any]) -> tuple[float, float, str]:
+    """Seconds of an epoch, samples per second, and the machine."""
+    config = result["config"]
+    step_seconds = config["training_seconds"] / config["step"]
+    epoch = step_seconds * math.ceil(config["num_samples"] / config["batch_size"])
+    return epoch, config["batch_size"] / step_seconds, config["trained_on"]["gpu"] or config["trained_on"]["cpu"]
+
+
+def similarity_table(files: Sequence[Path]) -> str:
+    """Markdown: FID and KID by modality and object, the paper's and those of files that `manifeel similarity` wrote.
+
+    Raises:
+        ResultError: A file is not one of those.
+    """
+    measured = [_similarity(path) for path in files]
+    rows = []
+    for modality, objects in SIMILARITY.items():
+        for name, (fid, kid) in objects.items():
+            here = [one for one in measured if (one["modality"], one["object"]) == (modality, name)]
+            cells = [(_interval(one["fid"]), _interval(one["kid"]), one["features"]) for one in here]
+            rows += [(modality, name, fid, kid, *one) for one in cells] or [
+                (modality, name, fid, kid, "not measured", None, None)
+            ]
+    names = ("modality", "object", "paper, FID", "paper, KID", "here, FID", "here, KID", "features here")
+    return f"{SIMILARITY_TEXT}\n{markdown_table(names, rows)}"
+
+
+def _similarity(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return {name: content[name] for name in ("modality", "object", "features", "fid", "kid")}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ResultError(f"{path} is no file of `manifeel similarity` ({error}); measure again with --object") from error
+
+
+def _interval(estimate: dict[str, float]) -> str:
+    return "{value:.3g} [{low:.3g}, {high:.3g}]".format(**estimate)
