@@ -50,7 +50,7 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
         write_run(tmp_path, VISION, rate, seed, checkpoints=10)
     page = page_of(tmp_path)
     ran, beside = (line for line in page.splitlines() if "3 x 10 x 50" in line)
-    assert ran.startswith("| PegInsertion | rgb wrist | diffusion_policy |  | 50 | paper | `")
+    assert ran.startswith("| PegInsertion revision 2 | rgb wrist | diffusion_policy |  | 50 | paper | `")
     assert beside.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 50 | 14 ± 1% | 20% [")
     assert beside.endswith("| 10% | 3 x 10 x 50 | paper |")  # the deviation of 10, 20 and 30 %
     assert "| I | USBInsertion | rgb | diffusion_policy |  | 50 | 49 ± 3% | not run |" in page
@@ -125,7 +125,7 @@ def test_settings_that_make_another_policy_are_never_compared(tmp_path, change):
 
 def test_another_variant_of_the_task_is_another_condition(tmp_path):
     write_run(tmp_path, VISION, 0.2)
-    write_run(tmp_path, TACFF, 0.9, env_kwargs=dict(fit="loose"))
+    write_run(tmp_path, TACFF, 0.9, env_kwargs=dict(fit="tight"))
     assert answered(tmp_path) == []
     write_run(tmp_path, TACFF, 0.5, env_kwargs=dict(tactile=dict(units="tacsl")))
     ((claim, *_),) = answered(tmp_path)

@@ -10,6 +10,7 @@ from manifeel_ms3.analysis.estimates import difference, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
 
 from .made_up import config_of
@@ -37,8 +38,9 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
             write(tmp_path, seed, step, [step == 30, step >= 20, seed == 1])
     collected = collect(results_in(tmp_path), last=2)
     (condition,) = collected
-    settings = (("policy.encoder.image", '"resnet18"'),)
-    assert condition == Condition(PEG, "rgb+tacrgb", "diffusion_policy", "t3", ("wrist",), ("right",), 50, settings=settings)
+    settings, revision = (("policy.encoder.image", '"resnet18"'),), task_spec(PEG).revision
+    expected = Condition(PEG, "rgb+tacrgb", "diffusion_policy", "t3", ("wrist",), ("right",), 50, "", revision, settings)
+    assert condition == expected
     assert collected[condition].episode_seeds == [100, 101, 102]
     assert collected[condition].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
     assert mean_success(collected[condition]).value == pytest.approx(8 / 12)

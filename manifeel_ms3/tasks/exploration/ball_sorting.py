@@ -86,6 +86,7 @@ class BallSortingEnv(VisuotactileEnv):
     policy_cameras = ("front",)
     default_control_mode = "pd_ee_delta_pose"
     front_camera_at = (0.80, 0.0, 0.15)
+    side_camera_at = (0.5, -0.4, 0.17)
 
     def __init__(self, *args, goal: str = "lift", **kwargs):
         self.goal = one_of("goal", goal, GOALS)
