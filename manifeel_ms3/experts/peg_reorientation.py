@@ -48,6 +48,10 @@ class PegReorientationConfig(InsertionExpertConfig):
     stand_up_push: tuple[float, float, float] = (3e-4, 3e-4, -3e-4)
     in_hole: float = 0.003
     """Depth of the peg's end in the hole, in m, at which what angle is left turns in the hole. Tuned."""
+    straight: float = float(np.deg2rad(0.7))
+    """Angle in the hand, in rad, at which the peg in the hole is pressed down. Tuned."""
+    straighten_steps: int = 20
+    """Number of steps after which it is pressed down at any angle. Tuned."""
     turns: int = 4
     """Number of pushes after which the peg is inserted as it is. Tuned."""
 
@@ -87,12 +91,21 @@ class PegReorientationExpert(InsertionExpert):
                 break
             yield from self._turn_peg(np.sign(angle))
         yield from super()._enter()
+        yield from self._straighten()
+
+    def _straighten(self) -> Actions:
+        """Turn what angle is left in the hand, which the hole's walls do when the hand moves sideways."""
+        for _ in range(self.config.straighten_steps):
+            angle = self._in_hand_angle()
+            in_hole = self._place(self._end)[2] < self._rim - self.config.entered
+            if abs(angle) < self.config.straight or not in_hole:
+                return
+            yield self._slide(np.sign(angle) * self.config.push_step / 2, 0.0)
 
     def _is_outside(self, stuck: int) -> bool:
-        slipped = (
-            abs(self._in_hand_angle()) > self.config.slipped and self._place(self._end)[2] > self._rim - self.config.in_hole
-        )
-        return slipped or super()._is_outside(stuck)
+        slipped = abs(self._in_hand_angle()) > self.config.slipped
+        shallow = self._place(self._end)[2] > self._rim - self.config.in_hole
+        return bool(slipped and (shallow or stuck > self.config.patience)) or super()._is_outside(stuck)
 
     def _turn_peg(self, towards: float) -> Actions:
         """Push the peg upright, its end towards +x (1.0) or -x (-1.0) of the hand, against the rim's outside."""
