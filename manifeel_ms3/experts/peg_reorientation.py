@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.geometry.part import Box
 from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
@@ -73,7 +74,9 @@ class PegReorientationExpert(InsertionExpert):
 
     def __init__(self, env: PegReorientationEnv, seed: int):
         super().__init__(env, seed)
-        self._half_width = max(abs(p.centre[0]) + p.size[0] / 2 for p in env.fit.socket.pieces)
+        foot = env.fit.socket.pieces[0]
+        assert isinstance(foot, Box)  # as wide as the rim
+        self._half_width = foot.size[0] / 2
 
     def _facing(self, lean: Rotation) -> Rotation:
         return lean * DOWNWARD  # the hand's orientation, not the peg's

@@ -1,6 +1,7 @@
 """Measures how the pads hold each task's part: `python -m tests.agents.held_parts` prints the table of docs/sensor.md."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -58,7 +59,7 @@ class HeldPart:
         self.kind = kind
         name = f"ManiFeel-{kind.task}-v1"
         self._wrapped = gym.make(name, obs_mode="none", render_backend="none", sim_backend="physx_cpu")
-        self.env = self._wrapped.unwrapped
+        self.env: Any = self._wrapped.unwrapped
 
     def close(self) -> None:
         self._wrapped.close()
@@ -103,12 +104,13 @@ class HeldPart:
         return torque
 
     def creep(self, torque: float) -> float:
-        """Rotation in the hand, in rad, in a second under a steady torque, after it has been laid on."""
+        """Rotation in the hand, in rad, in a second under a steady torque, after it has been laid on and taken up."""
         for step in range(round(RAMP * self.rate)):
             self.run(1 / self.rate, torque * step / (RAMP * self.rate))
+        self.run(REST, torque)
         before = self.turned
         self.run(CREEP_TIME, torque)
-        return self.turned - before
+        return abs(self.turned - before)
 
     def push(self) -> tuple[float, float, float, float]:
         """Push the part near its end with an edge until it has slipped, and take the edge away.
