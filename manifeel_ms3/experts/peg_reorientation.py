@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.geometry.part import Box
 from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
@@ -48,6 +49,10 @@ class PegReorientationConfig(LeaningConfig):
     stand_up_push: tuple[float, float, float] = (3e-4, 3e-4, -3e-4)
     in_hole: float = 0.003
     """Depth of the peg's end in the hole, in m, at which what angle is left turns in the hole. Tuned."""
+    straight: float = float(np.deg2rad(0.7))
+    """Angle in the hand, in rad, at which the peg in the hole is pressed down. Tuned."""
+    straighten_steps: int = 20
+    """Number of steps after which it is pressed down at any angle. Tuned."""
     turns: int = 4
     """Number of pushes after which the peg is inserted as it is. Tuned."""
 
@@ -69,7 +74,9 @@ class PegReorientationExpert(LeaningInsertionExpert):
 
     def __init__(self, env: PegReorientationEnv, seed: int):
         super().__init__(env, seed)
-        self._half_width = max(abs(p.centre[0]) + p.size[0] / 2 for p in env.fit.socket.pieces)
+        foot = env.fit.socket.pieces[0]
+        assert isinstance(foot, Box)  # as wide as the rim
+        self._half_width = foot.size[0] / 2
 
     def _facing(self, lean: Rotation) -> Rotation:
         return lean * DOWNWARD  # the hand's orientation, not the peg's
@@ -87,12 +94,21 @@ class PegReorientationExpert(LeaningInsertionExpert):
                 break
             yield from self._turn_peg(np.sign(angle))
         yield from super()._enter()
+        yield from self._straighten()
+
+    def _straighten(self) -> Actions:
+        """Turn what angle is left in the hand, which the hole's walls do when the hand moves sideways."""
+        for _ in range(self.config.straighten_steps):
+            angle = self._in_hand_angle()
+            in_hole = self._place(self._end)[2] < self._rim - self.config.entered
+            if abs(angle) < self.config.straight or not in_hole:
+                return
+            yield self._slide(np.sign(angle) * self.config.push_step / 2, 0.0)
 
     def _is_outside(self, stuck: int) -> bool:
-        slipped = (
-            abs(self._in_hand_angle()) > self.config.slipped and self._place(self._end)[2] > self._rim - self.config.in_hole
-        )
-        return slipped or super()._is_outside(stuck)
+        slipped = abs(self._in_hand_angle()) > self.config.slipped
+        shallow = self._place(self._end)[2] > self._rim - self.config.in_hole
+        return bool(slipped and (shallow or stuck > self.config.patience)) or super()._is_outside(stuck)
 
     def _turn_peg(self, towards: float) -> Actions:
         """Push the peg upright, its end towards +x (1.0) or -x (-1.0) of the hand, against the rim's outside."""

@@ -65,6 +65,24 @@ def test_variants_of_the_real_robot_are_demonstrated(make_env, task, variant):
     assert env.action_space.shape == ((5,) if variant.get("start") == "holder" else env.unwrapped.action_space.shape)
 
 
+def test_reorientation_turns_the_peg_in_the_hand(make_env):
+    """The hand goes upright and stays so, but for the lean that feels for the hole; the peg turns in it."""
+    task = "ManiFeel-PegReorientation-v1"
+    env = make_env(task, obs_mode="none", render_backend="none", randomization=dict(start_xy=0.02, start_z=0.0))
+    env.reset(seed=5)
+    tilts, angles = [], [float(env.unwrapped.measure()["in_hand"])]
+    for action in make_expert(task, env.unwrapped, 5).actions():
+        *_, terminated, truncated, info = env.step(action)
+        tilts.append(float(info["hand_tilt"]))
+        angles.append(float(info["in_hand"]))
+        if terminated or truncated:
+            break
+    assert info["success"].all()
+    assert np.rad2deg(angles[0]) > 15
+    assert np.rad2deg(angles[-1]) < 3
+    assert np.rad2deg(max(tilts)) < 12
+
+
 def test_screwing_regrasps_and_stops_when_it_is_tight(make_env):
     """The bulb is let go of, and turned until the pads feel the torque, not for a set number of turns."""
     task = "ManiFeel-BulbInstallation-v1"

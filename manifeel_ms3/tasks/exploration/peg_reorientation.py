@@ -40,7 +40,7 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     revision=2,
-    demo_steps=120,
+    demo_steps=139,
 )
 class PegReorientationEnv(InsertionEnv):
     """Turn a tilted peg in the hand against a rim that the camera cannot see, and put it in.
