@@ -40,7 +40,8 @@ class TaskSpec:
     category: str
     """Category of the paper: "insertion", "screwing" or "exploration"."""
     max_episode_steps: int
-    """Time limit of an episode, in control steps."""
+    """Time limit of an episode, in control steps: about twice the mean length of demonstrations, and at least 1.5 times that of
+    the longest."""
     paper_demos: int
     """Number of demonstrations that the paper recorded; what `manifeel dataset` records."""
     paper_tables: tuple[str, ...] = ()
@@ -49,6 +50,9 @@ class TaskSpec:
     """Raised by one whenever the task's outcomes change; results of different revisions cannot be compared."""
     demo_megabytes: float = 13.0
     """Size of one demonstration with every observation, in MB, rounded up; to see whether the disk has room."""
+    force_limit: float | None = None
+    """Largest contact force of a gentle success, in N: twice the median over demonstrations of their largest force. None if not
+    known."""
     demo_steps: float | None = None
     """Mean number of control steps of a demonstration, measured over seeds 0 to 99 (docs/tasks.md); None if not known."""
     demonstrator: Callable[[Any, int], Any] | None = None
