@@ -124,7 +124,9 @@ def _faults_of_the_simulator(result: dict[str, Any]) -> list[str]:
 def _faults_of_the_numbers(result: dict[str, Any]) -> list[str]:
     """Numbers of a result that contradict each other, or are not possible."""
     episodes, spec = result["episodes"], task_spec(result["env_id"])
-    faults = [] if not result["stop_at_success"] else ["its episodes end at success; evaluate without --stop-at-success"]
+    faults = ["its episodes end at success; evaluate without --stop-at-success"] if result["stop_at_success"] else []
+    if len(lengths := {episode["episode_len"] for episode in episodes if not episode["error"]}) > 1:
+        faults.append(f"its episodes without an error have from {min(lengths)} to {max(lengths)} steps, but one time limit")
     for name, expected in summary_of(episodes, spec.force_limit).items():
         given = result.get(name)
         if isinstance(expected, dict):
@@ -139,7 +141,7 @@ def _faults_of_the_numbers(result: dict[str, Any]) -> list[str]:
 def _faults_of_an_episode(episode: dict[str, Any], spec: TaskSpec) -> list[str]:
     faults, place = [], f"episode of seed {episode['seed']}"
     length, first, force = (episode[name] for name in ("episode_len", "first_success", "force_until_success"))
-    if length > spec.max_episode_steps or (length < spec.max_episode_steps and not episode["error"]):
+    if length > spec.max_episode_steps:
         faults.append(f"{place}: {length} steps, the task ends after {spec.max_episode_steps}")
     for what in ("success", "fail"):
         if episode.get(f"{what}_at_end") and not episode[f"{what}_once"]:

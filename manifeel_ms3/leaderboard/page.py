@@ -121,9 +121,9 @@ def leaderboard_table(rows: list[Row]) -> str:
     head = (
         f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
         f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
-        '95 %; where there are fewer, "of" says how many. A success is gentle where the contact force stayed within the task\'s '
-        'limit until then ([limits](../docs/evaluation.md)). "Run again" is the number of episodes that the leaderboard ran again '
-        "with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
+        '95 %; where there are fewer, "of" says how many. A success is gentle where the contact force stayed within the limit '
+        'of the task until then ([limits](../docs/evaluation.md)). "Run again" is the number of episodes that the leaderboard '
+        "ran again with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
     )
     cells = []
     for row in rows:

@@ -283,10 +283,8 @@ def _differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
     for name in COMPARED:
         tolerance = FORCE_TOLERANCE if name in FORCES else 0
         before, now = episode.get(name), again.get(name)
-        if before is None or now is None:
-            differs = before is not now
-        else:
-            differs = abs(before - now) > tolerance
+        unknown = before is None or now is None
+        differs = before is not now if unknown else abs(before - now) > tolerance
         if differs:
             found.append(f"{name} says {before}, run again it is {now}")
     return found

@@ -100,6 +100,9 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
                 f"give one of them another id. Registered are {list(_SPECS)}"
             )
         register_env(env_id, max_episode_steps=max_episode_steps, override=known is not None)(env_class)
+        # by the class's name instead of ManiSkill's function, which knows the task only where it was imported: processes that
+        # gymnasium spawns import nothing else
+        gym.registry[env_id].entry_point = f"{env_class.__module__}:{env_class.__qualname__}"
         _SPECS[env_id] = TaskSpec(env_id, env_class, max_episode_steps=max_episode_steps, **about)
         return env_class
 

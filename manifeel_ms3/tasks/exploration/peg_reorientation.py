@@ -28,11 +28,12 @@ class PegReorientationRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-PegReorientation-v1",
-    max_episode_steps=300,
+    max_episode_steps=150,
     category="exploration",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=74,
+    force_limit=25.0,
 )
 class PegReorientationEnv(InsertionEnv):
     """Stand a tilted peg up in a rim that the camera cannot see.

@@ -9,7 +9,13 @@ from .base import InsertionEnv
 
 
 @register_task(
-    "ManiFeel-PegInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",), demo_steps=83
+    "ManiFeel-PegInsertion-v1",
+    max_episode_steps=220,
+    category="insertion",
+    paper_demos=50,
+    paper_tables=("I",),
+    demo_steps=83,
+    force_limit=28.0,
 )
 class PegInsertionEnv(InsertionEnv):
     """Insert a rectangular peg into a socket with little clearance.

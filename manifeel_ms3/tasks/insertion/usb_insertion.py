@@ -10,7 +10,13 @@ NOT_INSERTED = 0.1
 
 
 @register_task(
-    "ManiFeel-USBInsertion-v1", max_episode_steps=300, category="insertion", paper_demos=50, paper_tables=("I",), demo_steps=78
+    "ManiFeel-USBInsertion-v1",
+    max_episode_steps=160,
+    category="insertion",
+    paper_demos=50,
+    paper_tables=("I",),
+    demo_steps=78,
+    force_limit=30.0,
 )
 class USBInsertionEnv(InsertionEnv):
     """Insert a USB-A plug into a port that looks up.
