@@ -51,6 +51,8 @@ class _Caller:
     """A simulating process."""
 
     connection: Connection
+    knows_policy: bool = False
+    """Whether it was told what the policy is."""
     question: Question | None = None
     """The question that waits for its answer."""
     asked_at: float = 0.0
@@ -139,6 +141,7 @@ class PolicyProcess:
             if self._busy and time.monotonic() > self._deadline:
                 self._process.kill()
                 self._policy_ended(f"no answer within {self._timeout:g} s")
+            self._tell_callers()
             self._ask_next_batch()
 
     @property
@@ -153,8 +156,6 @@ class PolicyProcess:
     def _accept(self) -> None:
         connection = Connection(self._listener.accept()[0].detach())
         self._callers[connection] = _Caller(connection)
-        if self._ready is not None:
-            _send(connection, self._ready)
 
     def _hear_caller(self, caller: _Caller) -> None:
         try:
@@ -173,8 +174,6 @@ class PolicyProcess:
             return
         if self._ready is None:
             self._ready = message
-            for connection in self._callers:
-                _send(connection, message)
             return
         self._answered += 1
         busy, self._busy = self._busy, []
@@ -186,8 +185,6 @@ class PolicyProcess:
         self._stop()
         if self._ready is None:
             self._ready = WorkFailedError(f"{reason}, before the policy was loaded; as happens where memory runs out")
-            for connection in self._callers:
-                _send(connection, self._ready)
             return
         busy, self._busy = self._busy, []
         for caller in busy:
@@ -201,6 +198,15 @@ class PolicyProcess:
         waited = max(self._begun - caller.asked_at, 0.0)
         caller.question = None
         _send(caller.connection, (answer, waited))
+
+    def _tell_callers(self) -> None:
+        """Tell new callers what the policy is, and all who wait if it cannot be loaded any more."""
+        for caller in self._callers.values() if self._ready is not None else ():
+            if not caller.knows_policy:
+                caller.knows_policy = True
+                _send(caller.connection, self._ready)
+            elif caller.question is not None and isinstance(self._ready, Exception):
+                self._reply(caller, self._ready)
 
     def _ask_next_batch(self) -> None:
         if self._busy or not isinstance(self._ready, Ready):
@@ -309,7 +315,7 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
         connection.send(Ready(None))
         return
     connection.send(Ready(policy.make_episode_part, policy.batch_size))
-    with contextlib.suppress(EOFError):
+    with contextlib.suppress(EOFError, OSError):
         while True:
             connection.send(_answers(policy, connection.recv()))
 

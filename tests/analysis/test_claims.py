@@ -9,8 +9,8 @@ import pytest
 from manifeel_ms3.analysis import claims, results_page
 from manifeel_ms3.analysis.protocol import Estimate, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
+from tests.outcomes import made_up
 
 
 def write_run(folder, mode: str, rate: float, seed: int, policy="diffusion_policy", network="resnet18") -> None:
@@ -20,7 +20,7 @@ def write_run(folder, mode: str, rate: float, seed: int, policy="diffusion_polic
         config = dict(policy_name=policy, obs_mode=mode, seed=seed, step=step, num_demos=50)
         config |= dict(policy=dict(encoder=dict(image=network)))
         won = rng.random(50) < rate
-        outcomes = [EpisodeOutcome(k, bool(win), bool(win), 9, 1.0, 1.0) for k, win in enumerate(won)]
+        outcomes = [made_up(k, bool(win)) for k, win in enumerate(won)]
         path = folder / policy / network / mode / str(seed) / f"evaluations/{step:08d}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(result_of(PEG, dict(cameras=["wrist"]), config, outcomes)))

@@ -7,8 +7,8 @@ import pytest
 
 from manifeel_ms3.analysis.protocol import Condition, ConditionResults, collect, condition_of, difference, mean_success
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from tests.conftest import PEG
+from tests.outcomes import made_up
 
 RNG = np.random.default_rng(0)
 
@@ -20,7 +20,7 @@ def runs(rate: float, seeds: int = 3, episodes: int = 50) -> ConditionResults:
 def write(folder, seed: int, step: int, won: list[bool], **changes) -> None:
     config = dict(policy_name="diffusion_policy", obs_mode="rgb+tacrgb", seed=seed, step=step, num_demos=50)
     config |= dict(policy=dict(encoder=dict(image="resnet18", tacrgb="t3")))
-    outcomes = [EpisodeOutcome(100 + k, win, win, 9, 1.0, 1.0) for k, win in enumerate(won)]
+    outcomes = [made_up(100 + k, win) for k, win in enumerate(won)]
     result = result_of(PEG, dict(cameras=["wrist"]), config, outcomes) | changes
     path = folder / f"{seed}/{step:08d}.json"
     path.parent.mkdir(exist_ok=True, parents=True)
@@ -42,7 +42,7 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
 def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     config = dict(policy_name="diffusion_policy", obs_mode="tacff")
     plain, rendered, changed = (
-        condition_of(result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
+        condition_of(result_of(PEG, env_kwargs, config, [made_up(1, True)]))
         for env_kwargs in (
             dict(sim_backend="physx_cpu"),
             dict(render_backend="none", sensor_configs=dict(width=128), tactile_sensors=["left"]),

@@ -121,7 +121,7 @@ def test_actions_turn_with_the_scene(policy, g, monkeypatch):
 
     def act(pose, pictures, noise):
         monkeypatch.setattr(policy, "noise", lambda *_: noise)  # what generation begins with turns, too
-        seen = [policy.sample(observation(policy, pose, picture), 10, torch.Generator()) for picture in pictures]
+        seen = [policy.sample(observation(policy, pose, picture), 10, [torch.Generator()]) for picture in pictures]
         return torch.cat(seen)
 
     pictures = [smooth_picture(48, seed) for seed in PICTURES]
