@@ -33,6 +33,9 @@ from .rollout import PolicyFault, begin_episode
 
 FIRST_ANSWER = 120.0
 """Time in s that the first answer of a process may take beyond the usual limit: libraries prepare themselves."""
+ENDED = "the process that holds the policy has ended; run the command again"
+LONGEST_FOLDER = 60
+"""Number of characters of the folder for temporary files beyond which /tmp is used: the path of a socket has 107 at most."""
 LEAST_WAIT = 0.05
 """Time in s between two looks at a limit."""
 
@@ -41,8 +44,9 @@ LEAST_WAIT = 0.05
 class Ready:
     """A policy's process has made its policy."""
 
-    make_episode_part: Callable[..., Policy] | None
-    """What `BatchPolicy.make_episode_part` is; None for a policy that answers one episode only."""
+    make_episode_part: bytes | None
+    """`BatchPolicy.make_episode_part`, pickled, which the main process passes on as it is; None for a policy that answers one
+    episode only."""
     batch_size: int = 1
 
 
@@ -70,7 +74,9 @@ class PolicyProcess:
 
     def __init__(self, source: PolicySource, answer_timeout: float):
         self._source, self._timeout = source, answer_timeout
-        self._folder = tempfile.TemporaryDirectory(prefix="manifeel-")  # only this user may enter it
+        short = len(tempfile.gettempdir()) <= LONGEST_FOLDER
+        # only this user may enter it
+        self._folder = tempfile.TemporaryDirectory(prefix="manifeel-", dir=None if short else "/tmp")
         self.address = str(Path(self._folder.name) / "policy")
         """Path of the socket at which simulating processes ask."""
         self._callers: dict[Connection, _Caller] = {}
@@ -251,12 +257,16 @@ class SharedPolicy:
     """
 
     def __init__(self, address: str, make: Callable[[], Policy]):
-        connection = socket.socket(socket.AF_UNIX)
-        connection.connect(address)
-        self._connection = Connection(connection.detach())
-        ready: Ready = _raised(self._connection.recv())  # once the policy is loaded
-        self._part: Any = make() if ready.make_episode_part is None else ready.make_episode_part(self._ask)
-        self.limits_itself = ready.make_episode_part is not None
+        try:
+            connection = socket.socket(socket.AF_UNIX)
+            connection.connect(address)
+            self._connection = Connection(connection.detach())
+            ready: Ready = _raised(self._connection.recv())  # once the policy is loaded
+        except (EOFError, ConnectionError, FileNotFoundError) as error:
+            raise PolicyUnavailableError(ENDED) from error
+        part = ready.make_episode_part
+        self._part: Any = make() if part is None else pickle.loads(part)(self._ask)
+        self.limits_itself = part is not None
         """Whether the time for an answer is limited elsewhere, so that waiting for other episodes does not count."""
         self.waited = 0.0
 
@@ -286,7 +296,7 @@ class SharedPolicy:
             self._connection.send(question)
             answer, self.waited = self._connection.recv()
         except (EOFError, OSError) as error:
-            raise PolicyUnavailableError("the process that holds the policy has ended; run the command again") from error
+            raise PolicyUnavailableError(ENDED) from error
         return _raised(answer)
 
 
@@ -314,7 +324,7 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
     if not hasattr(policy, "answer"):
         connection.send(Ready(None))
         return
-    connection.send(Ready(policy.make_episode_part, policy.batch_size))
+    connection.send(Ready(pickle.dumps(policy.make_episode_part), policy.batch_size))
     with contextlib.suppress(EOFError, OSError):
         while True:
             connection.send(_answers(policy, connection.recv()))

@@ -22,7 +22,7 @@ from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import make_env
 
 from .gentle import success_under_force
-from .policy import load_policy
+from .policy import checked_device, load_policy
 from .result import read_result
 
 with missing_extras_named():
@@ -120,17 +120,23 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
+def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
+    """The device and the batch size of an evaluation, with which an episode goes as it went there."""
+    return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
+
+
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
     Raises:
         ResultError: The run's evaluation.json is missing or broken.
         CheckpointError: The run's last checkpoint is missing or broken.
+        MachineError: This machine does not have the device of the evaluation.
     """
     result = read_result(args.run_dir / "evaluation.json")
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
-    policy = load_policy(args.run_dir / "checkpoints/last", **result["inference"])
+    policy = load_policy(args.run_dir / "checkpoints/last", **_inference_of(result))
     outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(

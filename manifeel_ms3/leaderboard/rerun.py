@@ -36,7 +36,7 @@ INVENTED = 0.1
 CHANCE = 0.01
 """Largest chance of such a row not to be found out."""
 COINCIDENCE = 0.1
-"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success, length, and
+"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success and
 force within 0.01 N: of the 50 episodes of either result in this repository, at most 3 have forces so near to any one value. A
 success that the policy does not have never agrees."""
 FORCE_TOLERANCE = 0.01
