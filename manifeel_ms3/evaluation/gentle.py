@@ -16,7 +16,8 @@ def is_gentle(episode: dict[str, Any], force: float) -> bool:
         episode: Episode of a result file.
         force: Largest force allowed, in N.
     """
-    return episode["success_once"] and episode["force_until_success"] <= force
+    needed = episode["force_until_success"]  # None without success
+    return needed is not None and needed <= force
 
 
 def success_under_force(episodes: Iterable[dict[str, Any]], forces: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -161,14 +161,23 @@ def test_noise_depends_on_the_seed_of_the_episode_and_on_the_step(checkpoint):
     np.testing.assert_array_equal(answers[0], answers[3])
 
 
-def test_the_number_of_workers_changes_no_outcome(checkpoint):
-    seeds, found = [100_000, 100_001, 100_005], []
-    for workers, batch_size in ((1, 2), (2, 2), (3, 2)):
-        evaluation = Evaluation(PolicySource(checkpoint, device="cpu", batch_size=batch_size), PEG, BARE, {})
-        found.append([replace(outcome, inference_ms=0.0) for outcome in run_episodes(evaluation, seeds, workers)])
-    assert found[0] == found[1] == found[2]
-    assert all(outcome.error is None and outcome.episode_len == 6 for outcome in found[0])
-    assert len({outcome.return_ for outcome in found[0]}) == 3
+def outcomes_with(checkpoint, workers):
+    source = PolicySource(checkpoint, device="cpu", batch_size=2)
+    outcomes = run_episodes(Evaluation(source, PEG, BARE, {}), [100_000, 100_001, 100_005], workers)
+    return [replace(outcome, inference_ms=0.0) for outcome in outcomes]
+
+
+@pytest.fixture(scope="module")
+def outcomes_with_one_worker(checkpoint):
+    return outcomes_with(checkpoint, 1)
+
+
+@pytest.mark.parametrize("workers", [3, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_number_of_workers_changes_no_outcome(checkpoint, outcomes_with_one_worker, workers):
+    expected = outcomes_with_one_worker
+    assert outcomes_with(checkpoint, workers) == expected
+    assert all(outcome.error is None and outcome.episode_len == 6 for outcome in expected)
+    assert len({outcome.return_ for outcome in expected}) == 3
 
 
 class Watched:

@@ -75,8 +75,8 @@ def change(folder: Path, edit) -> None:
         (lambda r: r["episodes"][0].update(success_at_end=True), "success at the end, but never"),
         (lambda r: r["episodes"][0].update(success_once=True, error="no idea"), "with the error no idea"),
         (lambda r: r["episodes"][0].update(peak_contact_force=1e4), "more than the arm can press with"),
-        (lambda r: r["episodes"][0].update(episode_len=7), "from 7 to 150 steps, but one time limit"),
-        (lambda r: r["episodes"][-1].update(first_success=3), "its first success is at step 3 of 150, with None N"),
+        (lambda r: r["episodes"][0].update(episode_len=7), "from 3 to 7 steps, but one time limit"),
+        (lambda r: r["episodes"][-1].update(first_success=3), "its first success is at step 3 of 3, with None N"),
         (
             lambda r: r["episodes"][0].update(force_until_success=400.0),
             "400.0 N until its first success",
