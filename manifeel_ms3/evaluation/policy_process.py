@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -109,6 +110,7 @@ class PolicyProcess:
         context = multiprocessing.get_context("spawn")
         self._policy, theirs = context.Pipe()
         self._process = context.Process(target=answer_batches, args=(self._source, theirs), daemon=True)
+        resource_tracker.ensure_running()  # started together with the process, it would let Ctrl-C through again
         with _without_ctrl_c():
             self._process.start()
         theirs.close()

@@ -2,6 +2,12 @@
 
 import json
 import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -32,6 +38,7 @@ from tests.evaluation.batch_policies import (
     Single,
     source_of,
 )
+from tests.trust.test_evaluation import alive, wait_for_episodes
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 BARE = dict(obs_mode="tacff", render_backend="none", max_episode_steps=6, sim_backend="physx_cpu")
@@ -219,6 +226,7 @@ def test_images_that_the_policy_does_not_look_at_are_not_rendered_and_change_not
 def config_with(checkpoint, tmp_path, **changes):
     folder = tmp_path / "checkpoint"
     folder.mkdir()
+    shutil.copy(checkpoint / "model.safetensors", folder)
     config = json.loads((checkpoint / "config.json").read_text()) | dict(env_id=PEG) | changes
     (folder / "config.json").write_text(json.dumps(config))
     return folder
@@ -249,6 +257,26 @@ def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_oth
         evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "tight", "lighting": "dim"}'))
     assert evaluation.env_kwargs["fit"] == "tight"
     assert caplog.messages == ["--env-kwargs: fit is 'tight' here, but 'loose' in the demonstrations of the policy"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_an_evaluation_and_the_policys_process_at_once(checkpoint, tmp_path, figure):
+    out, journal = tmp_path / "evaluation.json", tmp_path / "evaluation.episodes.jsonl"
+    kwargs = json.dumps(dict(render_backend="none", max_episode_steps=8))
+    command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--episodes", "40", "--env-kwargs", kwargs]
+    command += ["--checkpoint", str(config_with(checkpoint, tmp_path)), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for_episodes(journal, 1)
+    begin = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    figure("seconds from Ctrl-C to the end of an evaluation with a policy's process", time.monotonic() - begin, at_most=2.0)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert "episodes are finished and kept in" in errors
+    while alive(process.pid):
+        assert time.monotonic() < begin + 60, "a process is left"
+        time.sleep(0.1)
 
 
 # ------------------------------------------------------------------------------- vectorised environments
