@@ -147,11 +147,11 @@ _this_worker: _Worker | None = None
 def _start(worker: _Worker) -> None:
     global _this_worker
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     _this_worker = worker
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
     """End this process when the one that made it has ended, even if that was killed and could not tell."""
     parent = multiprocessing.parent_process()
     assert parent is not None

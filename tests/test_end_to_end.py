@@ -42,7 +42,7 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     again = json.loads(
         evaluate.main(evaluate.Args(checkpoint, out=tmp_path / "again.json", episodes=1, env_kwargs=TASK_ARGS)).read_text()
     )
-    for name in ("success_once", "length", "peak_contact_force"):
+    for name in ("success_once", "episode_len", "peak_contact_force"):
         assert again["episodes"][0][name] == result["episodes"][0][name]
     page = report.main(report.Args(tmp_path)).read_text()
     for needed in ("data:video/mp4;base64,", "data:image/png;base64,", "Wilson", "socket_xy", "TacFF", "plotly"):

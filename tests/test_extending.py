@@ -149,7 +149,7 @@ def test_a_policy_learns(site, monkeypatch):
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.1 * losses[0]
-    assert policy.sample(obs, 1, torch.Generator()).shape == (3, 8, 6)
+    assert policy.sample(obs, 1, [torch.Generator()] * 3).shape == (3, 8, 6)
 
 
 # -------------------------------------------------------------------- bad plug-ins

@@ -1,24 +1,29 @@
 """A trained policy in the form that evaluation needs: it takes an environment's observation and returns one action."""
 
 import typing
-from collections import deque
+import warnings
 from dataclasses import fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from mani_skill.utils import common
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.policy import Question
 
+from .action_chunks import ActionChunks
 from .checkpoint import WEIGHTS, load_weights, read_tensors, require_fit
-from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec, prepare
+from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec
 from .policy import VisuotactilePolicy
 
 MAX_SETTING = 1_000_000
 """Largest number that a policy's settings may hold; the paper's largest is 2048, so that a checkpoint's config asks for no
 tables of any size."""
+
+TRIAL_STEPS = 3
+"""Number of generation steps, and of calls, in which the trace of a network must agree with the network."""
 
 
 def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
@@ -57,14 +62,19 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
 
 
 class PolicyAgent:
-    """Executes `action_horizon` actions of a prediction, then predicts again from the last `obs_horizon` observations.
+    """A trained policy: it answers several episodes at once, each from its last observations, or is the policy of one.
+
+    An answer depends on its question alone. The noise is drawn from the seed of the episode and the step. The network always
+    computes a full batch, in which an episode has the place that its seed says, since matrix products round differently in
+    batches of another size and at other places; what stands at the other places changes nothing.
 
     Args:
         checkpoint: Folder with config.json and model.safetensors.
         policy_class: Class of the policy.
         inference_steps: Number of generation steps; that of the training settings if None.
-        seed: Seed of the sampled noise; `reset` seeds it again, so that an episode depends on its observations alone.
-        device: Device of the policy.
+        seed: Seed of the noise, together with that of the episode.
+        device: Device of the policy; the CPU if None.
+        batch_size: Number of episodes that are answered together; 1 if None.
 
     Raises:
         CheckpointError: The checkpoint is missing, broken, or not one of this policy.
@@ -76,7 +86,8 @@ class PolicyAgent:
         policy_class: type[VisuotactilePolicy],
         inference_steps: int | None = None,
         seed: int = 0,
-        device: str = "cpu",
+        device: str | None = None,
+        batch_size: int | None = None,
     ):
         self.config = checkpoint_config(checkpoint)
         weights = read_tensors(Path(checkpoint) / WEIGHTS)
@@ -86,37 +97,94 @@ class PolicyAgent:
         except CheckpointError as error:
             raise CheckpointError(f"{checkpoint}: {error}") from error
         require_fit(described, weights, checkpoint)
-        self.policy = build_policy(self.config, policy_class).to(device).eval()
+        self.device, self.seed, self.batch_size = torch.device(device or "cpu"), seed, batch_size or 1
+        self.policy = build_policy(self.config, policy_class).to(self.device).eval()
         load_weights(self.policy, weights, checkpoint)
-        self.device, self.seed = torch.device(device), seed
         steps = inference_steps or self.config.get("inference_steps")
         if not isinstance(steps, int) or steps < 1:
             raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a positive whole number")
         self.inference_steps = steps
-        self.reset()
+        self.make_episode_part = partial(ActionChunks, self.policy.spec, self.policy.config.obs_horizon)
+        self._part = self.make_episode_part(lambda question: self.answer([question])[0])
+        self._compiled = False
+
+    # ------------------------------------------------------------ as the policy of one episode
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next action needs the cameras' images."""
+        return self._part.looks
 
     def reset(self) -> None:
-        """Forget past observations before an episode."""
-        self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.policy.config.obs_horizon)
-        self._queue: deque[np.ndarray] = deque()
-        self._generator = torch.Generator(self.device).manual_seed(self.seed)
+        """Begin an episode with the seed 0."""
+        self._part.reset()
+
+    def begin_episode(self, seed: int) -> None:
+        """Begin an episode."""
+        self._part.begin_episode(seed)
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         """The action (A,) for the observation of an environment with `num_envs=1`."""
-        self._window.append(self._prepared(obs))
-        if not self._queue:
-            window = [self._window[0]] * (self.policy.config.obs_horizon - len(self._window)) + list(self._window)
-            batch = {
-                key: torch.as_tensor(np.stack([step[key] for step in window])[None], device=self.device) for key in window[0]
-            }
-            self._queue.extend(self.policy.sample(batch, self.inference_steps, self._generator)[0].cpu().numpy())
-        return self._queue.popleft().clip(-1.0, 1.0)
+        return self._part.act(obs)
 
-    def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
-        prepared = {}
-        for key in self.policy.spec.keys:
-            value: Any = obs
-            for part in key.split("/"):
-                value = value[part]
-            prepared[key] = prepare(key, common.to_numpy(value), self.policy.spec)[0]
-        return prepared
+    # ------------------------------------------------------------ as the policy of many
+
+    def answer(self, questions: list[Question]) -> list[np.ndarray]:
+        """The actions (action_horizon, A) to execute next, for each question."""
+        answers: dict[int, np.ndarray] = {}
+        left = list(range(len(questions)))
+        while left:
+            places: dict[int, int] = {}
+            for index in left:
+                places.setdefault(questions[index].seed % self.batch_size, index)
+            actions = self._predict({place: questions[index] for place, index in places.items()})
+            answers |= {index: actions[place] for place, index in places.items()}
+            left = [index for index in left if index not in answers]
+        return [answers[index] for index in range(len(questions))]
+
+    @torch.inference_mode()
+    def _predict(self, questions: dict[int, Question]) -> np.ndarray:
+        """Actions (batch_size, action_horizon, A), of which those at the places of questions count."""
+        filling = next(iter(questions.values()))
+        rows = [questions.get(place, filling) for place in range(self.batch_size)]
+        batch = {
+            key: torch.as_tensor(np.stack([row.observation[key] for row in rows])).to(self.device)
+            for key in filling.observation
+        }
+        if not self._compiled:
+            self._compiled = True
+            self._compile(batch)
+        generators = [_generator_of(self.seed, row.seed, row.step) for row in rows]
+        return self.policy.sample(batch, self.inference_steps, generators).cpu().numpy()
+
+    def _compile(self, batch: dict[str, torch.Tensor]) -> None:
+        """Replace the network over actions by its trace: on a CPU, half of the time of a small network is Python's.
+
+        The trace is used where it computes the same bits.
+        """
+        if self.device.type != "cpu":
+            return
+
+        def sample() -> torch.Tensor:
+            generators = [_generator_of(self.seed, place) for place in range(self.batch_size)]
+            return self.policy.sample(batch, TRIAL_STEPS, generators)
+
+        network, given = self.policy.unet, []
+        handle = network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
+        expected = sample()
+        handle.remove()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # torch warns of shapes in Python, which are always the same here
+                self.policy.unet = torch.jit.freeze(torch.jit.trace(network, given[0], check_trace=False))
+            same = all(torch.equal(sample(), expected) for _ in range(TRIAL_STEPS))  # the first calls optimise it
+        except (RuntimeError, AttributeError):  # not every network can be traced
+            same = False
+        if not same:
+            self.policy.unet = network
+
+
+def _generator_of(*numbers: int) -> torch.Generator:
+    """A generator on the CPU, whose noise is the same on every device, seeded by some numbers."""
+    (state,) = np.random.SeedSequence(numbers).generate_state(1, np.uint64)
+    return torch.Generator().manual_seed(int(state) % 2**63)

@@ -21,11 +21,13 @@ class BackgroundEvaluation:
         episodes: Number of episodes for each checkpoint.
         workers: Number of processes of an evaluation.
         env_kwargs: Arguments of the task, as a json object.
+        device: Device of the policy; a GPU if there is one and this is not given.
     """
 
-    def __init__(self, folder: Path, episodes: int, workers: int, env_kwargs: str):
+    def __init__(self, folder: Path, episodes: int, workers: int, env_kwargs: str, device: str | None = None):
         self.folder = folder
         self._arguments = ["--episodes", str(episodes), "--workers", str(workers), "--env-kwargs", env_kwargs]
+        self._arguments += [] if device is None else ["--device", device]
         self._waiting: deque[Path] = deque()
         self._running: tuple[Path, subprocess.Popen] | None = None
 

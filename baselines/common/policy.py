@@ -1,5 +1,6 @@
 """The base of all policies: an observation encoder, normalisers, and the way from a prediction to actions."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, cast
 
@@ -77,8 +78,8 @@ class VisuotactilePolicy(nn.Module):
         """The loss, a scalar, of normalised actions (B, pred_horizon, A) given conditions (B, ...)."""
         raise NotImplementedError
 
-    def generate(self, condition: torch.Tensor, steps: int, generator: torch.Generator) -> torch.Tensor:
-        """Normalised actions (B, pred_horizon, A), generated in `steps` steps given conditions (B, ...)."""
+    def generate(self, condition: torch.Tensor, steps: int, generators: list[torch.Generator]) -> torch.Tensor:
+        """Normalised actions (B, pred_horizon, A), generated in `steps` steps given conditions (B, ...) and B generators."""
         raise NotImplementedError
 
     def fit_normalizers(self, observations: dict[str, torch.Tensor], actions: torch.Tensor) -> None:
@@ -108,16 +109,29 @@ class VisuotactilePolicy(nn.Module):
         return self.generation_loss(self.action_normalizer.normalize(actions).repeat_interleave(draws, dim=0), condition)
 
     @torch.no_grad()
-    def sample(self, obs: dict[str, torch.Tensor], inference_steps: int, generator: torch.Generator) -> torch.Tensor:
-        """The actions (B, action_horizon, A) to execute next."""
-        actions = self.generate(self.condition(obs), inference_steps, generator)
+    def sample(self, obs: dict[str, torch.Tensor], inference_steps: int, generators: list[torch.Generator]) -> torch.Tensor:
+        """The actions (B, action_horizon, A) to execute next, with noise from B generators."""
+        actions = self.generate(self.condition(obs), inference_steps, generators)
         first = self.config.obs_horizon - 1
         return self.action_normalizer.restore(actions)[:, first : first + self.config.action_horizon]
 
-    def noise(self, condition: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def noise(self, condition: torch.Tensor, generators: list[torch.Generator]) -> torch.Tensor:
         """The noise (B, pred_horizon, A) from which generation starts."""
-        shape = (len(condition), self.config.pred_horizon, self.action_dim)
-        return torch.randn(shape, generator=generator, device=condition.device)
+        return draw_rows(torch.randn, (self.config.pred_horizon, self.action_dim), generators, condition.device)
+
+
+def draw_rows(
+    draw: Callable[..., torch.Tensor], shape: tuple[int, ...], generators: list[torch.Generator], device: torch.device
+) -> torch.Tensor:
+    """Random numbers (B, *shape), with a generator for each row, so that a row does not depend on those beside it.
+
+    Args:
+        draw: `torch.randn` or `torch.rand`.
+        shape: Shape of a row.
+        generators: One generator on the CPU for each row.
+        device: Device of the result.
+    """
+    return torch.stack([draw(shape, generator=generator) for generator in generators]).to(device)
 
 
 def unet_settings(config: PolicyConfig) -> dict[str, Any]:

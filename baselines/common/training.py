@@ -136,7 +136,7 @@ class Trainer:
 
         self.model = self.processes.with_mean_gradients(self.policy).train()
         self.evaluation = BackgroundEvaluation(
-            self.run_dir / EVALUATIONS, args.eval_episodes, args.eval_workers, args.eval_env_kwargs
+            self.run_dir / EVALUATIONS, args.eval_episodes, args.eval_workers, args.eval_env_kwargs, args.device
         )
         self.log = self._open_log() if processes.first else None
 

@@ -48,13 +48,13 @@ class DiffusionPolicy(VisuotactilePolicy):
         predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
         return F.mse_loss(predicted, noise if self.config.prediction == "epsilon" else clean)
 
-    def generate(self, condition, steps, generator):
-        actions = self.noise(condition, generator)
+    def generate(self, condition, steps, generators):
+        actions = self.noise(condition, generators)
         full = self.config.sampler == "ddpm" and steps >= self.config.diffusion_steps
         scheduler: Any = self.ddpm if full else self.ddim
         scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
         for step in scheduler.timesteps:
             predicted = self.unet(actions, step.expand(len(actions)), condition)
-            extra = dict(generator=generator) if full else {}
+            extra = dict(generator=generators) if full else {}
             actions = scheduler.step(predicted, step, actions, **extra).prev_sample
         return actions

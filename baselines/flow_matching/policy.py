@@ -83,8 +83,8 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         agreement = ((velocity - later_velocity) ** 2 * _column(later < end)).mean()
         return F.mse_loss(reached, target) + self.config.velocity_weight * agreement
 
-    def generate(self, condition, steps, generator):
-        actions = self.noise(condition, generator)
+    def generate(self, condition, steps, generators):
+        actions = self.noise(condition, generators)
         for k in range(steps):  # Euler integration
             time = torch.full((len(actions),), k / steps, device=actions.device)
             actions = actions + self.velocity(actions, time, condition) / steps

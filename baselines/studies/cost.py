@@ -211,7 +211,7 @@ def inference(policy: str, *flags: str) -> float:
     """
     network, args, obs, _ = _made_up(policy, (*flags, "--batch-size", "1", "--device", "cpu"))
     network.eval()
-    return _seconds(lambda: network.sample(obs, args.inference_steps, torch.Generator()), 1)
+    return _seconds(lambda: network.sample(obs, args.inference_steps, [torch.Generator()]), 1)
 
 
 def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:

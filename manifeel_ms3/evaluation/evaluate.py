@@ -16,33 +16,32 @@ goes on with the other episodes.
 import json
 import logging
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
-from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.registry import evaluation_seeds, make_env, task_spec
-from manifeel_ms3.workers import WorkerDiedError, WorkerPool
+from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
 
 from .checkpoint_config import CheckpointError, checkpoint_config
+from .engine import Evaluation, run_episodes
 from .journal import Journal
-from .policy import Policy, PolicySource
-from .redaction import redacted, secrets_in, without_secrets
+from .policy import BATCH_SIZES, PolicySource, checked_device
+from .redaction import redacted
 from .result import as_published, provenance, published_config, result_of, write_result
-from .rollout import EpisodeOutcome, evaluate_episode
+from .rollout import EpisodeOutcome, failed_outcome
 
 log = logging.getLogger(__name__)
 SENSING = ("obs_mode", "cameras", "tactile_sensors")
-"""Arguments of the environment that a checkpoint's configuration holds."""
+"""Arguments of the environment that a checkpoint's configuration holds by themselves; those of the demonstrations are in its
+entry env_kwargs."""
+BACKEND = dict(sim_backend="physx_cpu")
+"""Backend of the simulation, the one that demonstrations are recorded with."""
 
 
 @dataclass
@@ -73,9 +72,17 @@ class Args:
     episodes: int = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     workers: int = 1
-    """Number of processes that run episodes side by side."""
+    """Number of processes that simulate episodes side by side; one more process holds the policy of a checkpoint."""
     inference_steps: int | None = None
     """Number of denoising or integration steps for one action chunk; the checkpoint's own number if not given."""
+    device: str | None = None
+    """Device that computes a checkpoint's policy, such as cpu or cuda; a GPU if there is one and this is not given."""
+    batch_size: int | None = None
+    """Number of episodes that a checkpoint's policy answers together; 1 on the CPU and 16 on a GPU if not given. Actions of
+    other batch sizes differ in the last bits."""
+    stop_at_success: bool = False
+    """End an episode at success or failure, which is cheaper; the result then lacks success_at_end and fail_at_end. Without
+    this flag every episode runs to the time limit of the task, as in ManiSkill's evaluation."""
     step_timeout: float = 60.0
     """Longest time that the policy may take for one action, in s."""
     env_kwargs: str = "{}"
@@ -83,20 +90,6 @@ class Args:
     videos: tuple[int, ...] = ()
     """Numbers of the episodes, counted from 0, that are recorded as videos with all cameras and touch; the videos go into the
     folder videos beside the result."""
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """A policy, and the task that it is evaluated on."""
-
-    source: PolicySource
-    """Place that the policy comes from."""
-    env_id: str
-    """Id of the task."""
-    env_kwargs: dict[str, Any]
-    """Arguments of `gym.make` for the task."""
-    config: dict[str, Any]
-    """Configuration of the policy; the result holds it without paths, passwords and tokens."""
 
 
 def main(args: Args) -> Path:
@@ -116,11 +109,11 @@ def main(args: Args) -> Path:
     out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
     _check_outputs(args, evaluation, seeds, out)
     with owned(out):
-        journal = Journal(out, _identity(evaluation, args.step_timeout), seeds, args.overwrite)
+        journal = Journal(out, _identity(evaluation), seeds, args.overwrite)
         if journal.outcomes:
             log.info("%s has %d finished episodes; the evaluation goes on", journal.path, len(journal.outcomes))
         with journal.kept():
-            run_episodes(evaluation, journal.remaining, args.workers, args.step_timeout, journal.add)
+            run_episodes(evaluation, journal.remaining, args.workers, journal.add)
             write_result(_result(evaluation, journal.in_order), out)
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
@@ -146,10 +139,10 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
     if args.videos:
         with missing_extras_named():
             from . import video  # noqa: F401  (only to see whether it can be imported)
-    as_published(_result(evaluation, [EpisodeOutcome(seeds[0], False, False, 0, 0.0, 0.0)]), out)
+    as_published(_result(evaluation, [failed_outcome(seeds[0], None, args.stop_at_success)]), out)
 
 
-def _identity(evaluation: Evaluation, step_timeout: float) -> dict[str, Any]:
+def _identity(evaluation: Evaluation) -> dict[str, Any]:
     """Everything that outcomes depend on, as far as it can be known."""
     return dict(
         env_id=evaluation.env_id,
@@ -157,13 +150,17 @@ def _identity(evaluation: Evaluation, step_timeout: float) -> dict[str, Any]:
         policy_hash=evaluation.source.fingerprint(),
         policy_kwargs=redacted(json.loads(evaluation.source.kwargs)),
         config=published_config(evaluation.config),
-        step_timeout=step_timeout,
+        step_timeout=evaluation.step_timeout,
+        stop_at_success=evaluation.stop_at_success,
+        inference=dict(device=evaluation.source.device, batch_size=evaluation.source.batch_size),
         **provenance(evaluation.env_id),
     )
 
 
 def _result(evaluation: Evaluation, outcomes: list[EpisodeOutcome]) -> dict[str, Any]:
-    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes)
+    source = evaluation.source
+    inference = dict(device=source.device, batch_size=source.batch_size)
+    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes, inference)
 
 
 def evaluation_from_args(args: Args) -> Evaluation:
@@ -176,80 +173,51 @@ def evaluation_from_args(args: Args) -> Evaluation:
     """
     if (args.checkpoint is None) == (args.policy is None):
         raise InvalidArgumentError("give either --checkpoint, or --policy with --env-id and --obs-mode")
-    extra = dict(sim_backend="physx_cpu") | json_object("--env-kwargs", args.env_kwargs)
+    given = json_object("--env-kwargs", args.env_kwargs)
     policy_kwargs = json_object("--policy-kwargs", args.policy_kwargs)
     if args.checkpoint is not None:
-        return _of_checkpoint(args.checkpoint, policy_kwargs | dict(inference_steps=args.inference_steps), extra)
+        return _of_checkpoint(args, policy_kwargs | dict(inference_steps=args.inference_steps), given)
     if args.env_id is None or args.obs_mode is None:
         raise InvalidArgumentError("a --policy of your own needs --env-id and --obs-mode")
+    if unused := [name for name in ("device", "batch_size") if getattr(args, name) is not None]:
+        raise InvalidArgumentError(f"{_flags(unused)} are for a --checkpoint; tell a --policy of your own by --policy-kwargs")
     env_id = task_spec(args.env_id).env_id
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
-    return Evaluation(source, env_id, {n: v for n, v in sensing.items() if v is not None} | extra, config)
+    env_kwargs = {n: v for n, v in sensing.items() if v is not None} | BACKEND | given
+    return Evaluation(source, env_id, env_kwargs, config, args.stop_at_success, args.step_timeout)
 
 
-def _of_checkpoint(checkpoint: Path, kwargs: dict[str, Any], extra: dict[str, Any]) -> Evaluation:
+def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) -> Evaluation:
+    checkpoint = args.checkpoint
+    assert checkpoint is not None
     config = checkpoint_config(checkpoint)
     if missing := [name for name in ("env_id", *SENSING) if name not in config]:
         raise CheckpointError(f"{checkpoint}: its config.json lacks {missing}; train the policy again")
     config |= {name: value for name, value in kwargs.items() if name == "inference_steps" and value}  # what the policy does
-    source = PolicySource(checkpoint.resolve(), kwargs=json.dumps(kwargs))  # training may move the link `last` meanwhile
+    env_id = task_spec(config["env_id"]).env_id
+    trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
     sensing = {name: config[name] for name in SENSING}
-    return Evaluation(source, task_spec(config["env_id"]).env_id, sensing | extra, config)
+    _name_differences(trained | sensing, given)
+    device = checked_device(args.device)
+    if args.batch_size is not None and args.batch_size < 1:
+        raise InvalidArgumentError(f"--batch-size {args.batch_size} is less than 1; leave it out, or give 1 or more")
+    batch_size = args.batch_size or BATCH_SIZES.get(device.partition(":")[0], 1)
+    # not the link `last`, which training may move meanwhile
+    source = PolicySource(checkpoint.resolve(), None, json.dumps(kwargs), device, batch_size)
+    return Evaluation(source, env_id, trained | sensing | BACKEND | given, config, args.stop_at_success, args.step_timeout)
 
 
-def run_episodes(
-    evaluation: Evaluation,
-    seeds: list[int],
-    workers: int,
-    step_timeout: float,
-    on_outcome: Callable[[EpisodeOutcome], None] | None = None,
-) -> list[EpisodeOutcome]:
-    """Run episodes in worker processes; an episode whose process dies has failed.
-
-    Args:
-        evaluation: The policy, and the task.
-        seeds: Seeds of the episodes.
-        workers: Number of processes.
-        step_timeout: Longest time that the policy may take for one action, in s.
-        on_outcome: Function that is called with every outcome as soon as the episode ends.
-
-    Returns:
-        Outcomes in the order of the seeds.
-
-    Raises:
-        PolicyUnavailableError: The policy cannot be asked.
-    """
-    outcomes: dict[int, EpisodeOutcome] = {}
-    secrets = [*secrets_in(evaluation.source.policy), *secrets_in(json.loads(evaluation.source.kwargs))]
-    with progress_bar() as bar, WorkerPool(workers, partial(_make_env_and_policy, evaluation)) as pool:
-        task = bar.add_task("evaluating", total=len(seeds))
-        for seed in seeds:
-            pool.submit(partial(_run_seed, step_timeout=step_timeout), seed)
-        for finished in pool.as_finished():
-            try:
-                outcome = finished.result()
-            except WorkerDiedError as error:
-                reason = f"the policy's process ended with exit code {error.exit_code}: it crashed, or hung for good"
-                outcome = EpisodeOutcome(finished.task, False, False, 0, 0.0, 0.0, reason)
-            outcome = replace(outcome, error=outcome.error and without_secrets(outcome.error, secrets))
-            outcomes[finished.task] = outcome
-            if on_outcome is not None:
-                on_outcome(outcome)
-            successes = sum(outcome.success_once for outcome in outcomes.values())
-            bar.update(task, advance=1, description=f"evaluating, {successes} of {len(outcomes)} succeed")
-    return [outcomes[seed] for seed in seeds]
+def _name_differences(trained: dict[str, Any], given: dict[str, Any]) -> None:
+    """Warn of arguments of the task that differ from those of the demonstrations that a policy was trained on."""
+    for name, value in given.items():
+        if name in trained and json.dumps(trained[name]) != json.dumps(value):
+            log.warning("--env-kwargs: %s is %r here, but %r in the demonstrations of the policy", name, value, trained[name])
 
 
-def _make_env_and_policy(evaluation: Evaluation) -> tuple[gym.Env, Policy]:
-    """In a worker process: what it keeps from one episode to the next."""
-    return make_env(evaluation.env_id, **evaluation.env_kwargs), evaluation.source.make()
-
-
-def _run_seed(env_and_policy: tuple[gym.Env, Policy], seed: int, step_timeout: float) -> EpisodeOutcome:
-    env, policy = env_and_policy
-    return evaluate_episode(env, policy, seed, step_timeout=step_timeout)
+def _flags(names: list[str]) -> str:
+    return " and ".join(f"--{name.replace('_', '-')}" for name in names)
 
 
 def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:

@@ -10,7 +10,6 @@ import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, write_text
 
 from .result import not_finite, result_schema
-from .rollout import EpisodeOutcome
+from .rollout import EpisodeOutcome, outcome_as_json, outcome_from_json
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +107,7 @@ class Journal:
                 "again with --overwrite, or give another --out"
             ) from error
         self._check_same(evaluation, len(episodes))
-        return {episode["seed"]: EpisodeOutcome(**episode) for episode in episodes if episode["seed"] in self.seeds}
+        return {episode["seed"]: outcome_from_json(episode) for episode in episodes if episode["seed"] in self.seeds}
 
     def _check_same(self, evaluation: Any, episodes: int) -> None:
         now, before = json.loads(self._first_line), evaluation if isinstance(evaluation, dict) else {}
@@ -120,4 +119,4 @@ class Journal:
 
 
 def _line_of(outcome: EpisodeOutcome) -> str:
-    return json.dumps(asdict(outcome), allow_nan=False)
+    return json.dumps(outcome_as_json(outcome), allow_nan=False)

@@ -3,21 +3,28 @@
 import importlib
 import importlib.util
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, ServerError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
 
 from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash, file_hash
 from .redaction import redacted
 
 
 class Policy(Protocol):
-    """Any object with these two methods can be evaluated."""
+    """Any object with these two methods can be evaluated.
+
+    A policy may have more: `begin_episode(seed)`, which is then called instead of `reset`, with the seed of the episode;
+    `looks`, whether the next call of `act` needs the cameras' images, which are otherwise left out of its observation; and
+    `waited`, the time in s that the last call of `act` waited for other episodes.
+    """
 
     def reset(self) -> None:
         """Begin a new episode: forget everything, and seed all randomness anew."""
@@ -25,6 +32,39 @@ class Policy(Protocol):
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         """Action (A,) in [-1, 1] for the environment's observation (`num_envs=1`, tensors with a leading 1)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Question:
+    """What one episode asks of a policy that answers several episodes at once."""
+
+    seed: int
+    """Seed of the episode."""
+    step: int
+    """Number of control steps before this one."""
+    observation: dict[str, np.ndarray]
+    """Arrays by name, as the policy takes them."""
+
+
+Ask = Callable[[Question], np.ndarray]
+"""Function that returns the answer to a question; what an answer is, the policy and its part beside the episode agree on."""
+
+
+class BatchPolicy(Protocol):
+    """A policy of which one object answers all episodes, in batches: one network on one device.
+
+    It keeps nothing of an episode. What an episode must remember is kept by its part beside the episode, which
+    `make_episode_part` makes in the process that simulates. A registered policy (`manifeel.policies`) may be one.
+    """
+
+    make_episode_part: Callable[[Ask], Policy]
+    """Makes the part of the policy that runs beside an episode, a `Policy`, from the function that it asks. It is pickled."""
+    batch_size: int
+    """Number of questions that are answered together."""
+
+    def answer(self, questions: list[Question]) -> list[np.ndarray]:
+        """One answer for each question; it depends on the question alone, not on those beside it."""
         ...
 
 
@@ -51,6 +91,16 @@ class PolicySource:
     kwargs: str = "{}"
     """Keyword arguments of the policy, as json."""
 
+    device: str | None = None
+    """Device that computes a checkpoint's policy, such as "cpu" or "cuda"."""
+    batch_size: int | None = None
+    """Number of episodes that a checkpoint's policy answers together."""
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether one object may answer all episodes, as a registered policy may; each process makes one of the user's own."""
+        return self.checkpoint is not None
+
     def make(self) -> Policy:
         """Make the policy.
 
@@ -60,7 +110,7 @@ class PolicySource:
         """
         kwargs = json.loads(self.kwargs)
         if self.checkpoint is not None:
-            return load_policy(self.checkpoint, **kwargs)
+            return load_policy(self.checkpoint, device=self.device, batch_size=self.batch_size, **kwargs)
         name = str(self.policy)
         try:
             if self.is_server:
@@ -94,12 +144,39 @@ class PolicySource:
             return None
 
 
+BATCH_SIZES = dict(cpu=1, cuda=16)
+"""Numbers of episodes that a policy answers together if none is given. On one CPU core, larger batches of the paper's networks
+take longer in the same proportion; a GPU computes 16 in the time of one."""
+
+
+def checked_device(name: str | None) -> str:
+    """A device of torch that this machine has: the given one, or a GPU if there is one and none is given.
+
+    Raises:
+        InvalidArgumentError: It is not the name of a device.
+        MachineError: This machine does not have it.
+    """
+    if name is None:
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError) as error:
+        raise InvalidArgumentError(f"--device {name!r} is no device of torch; give cpu, cuda or cuda:1") from error
+    try:
+        torch.zeros(1, device=device)
+    except Exception as error:  # torch's backends raise errors of many types
+        reason = str(error).splitlines()[0]
+        raise MachineError(f"--device {name} is not there ({reason}); give --device cpu, or install a torch for it") from error
+    return name
+
+
 def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:
     """The policy of a checkpoint folder, whose config.json names it as it is registered in `manifeel.policies`.
 
     Args:
         checkpoint: Folder with config.json and weights.
-        kwargs: Arguments of the policy that replace the checkpoint's own, such as `inference_steps`.
+        kwargs: Arguments of the policy: `device` and `batch_size`, and what replaces the checkpoint's own settings, such as
+            `inference_steps`.
 
     Raises:
         CheckpointError: The folder is not a checkpoint, or names no registered policy.

@@ -21,7 +21,8 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import make_env
 
-from .policy import load_policy
+from .gentle import success_under_force
+from .policy import checked_device, load_policy
 from .result import read_result
 
 with missing_extras_named():
@@ -37,7 +38,17 @@ STRIP_FRAMES = 8
 STRIP_SIDE = 160
 """Width and height of an image in the strip, in pixels; report.html.j2 has the same height for the names of the rows."""
 CURVE_HEIGHT = 340
-"""Height of the figure with the training loss, in pixels."""
+"""Height of a figure, in pixels."""
+FORCE_MARGIN, FORCE_POINTS = 1.2, 601
+"""End of the axis of forces over the largest force on it, and number of its points."""
+RATES = {
+    "success_once": "success at any step",
+    "success_at_end": "success at the end",
+    "gentle_success": "gentle success",
+    "fail_once": "failure at any step",
+    "fail_at_end": "failure at the end",
+}
+"""Rates of a result, and what the page calls them."""
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 
 
@@ -66,8 +77,27 @@ def _square(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image[top : top + side, left : left + side], (STRIP_SIDE, STRIP_SIDE), interpolation=cv2.INTER_AREA)
 
 
+def force_curve(result: dict[str, Any]) -> str:
+    """HTML of a plotly figure with the success against the contact force allowed, and the task's limit."""
+    limit, episodes = result.get("force_limit"), result["episodes"]
+    reached = [episode["force_until_success"] for episode in episodes if episode["success_once"]]
+    forces = np.linspace(0.0, FORCE_MARGIN * max([*reached, limit or 0.0, 1.0]), FORCE_POINTS)
+    curve = go.Scatter(x=forces, y=100 * success_under_force(episodes, forces), mode="lines", line_shape="hv")
+    figure = go.Figure(curve)
+    if limit:
+        figure.add_vline(x=limit, line_dash="dash", annotation_text=f"limit of the task, {limit:g} N")
+    figure.update_layout(
+        xaxis_title="contact force allowed, N",
+        yaxis_title="success, %",
+        yaxis_range=[0, 100],
+        height=CURVE_HEIGHT,
+        margin=dict(l=60, r=20, t=20, b=50),
+    )
+    return figure.to_html(full_html=False, include_plotlyjs=True)
+
+
 def training_curve(log_file: Path) -> str:
-    """HTML of a plotly figure with the loss over gradient steps; it needs no network."""
+    """HTML of a plotly figure with the loss over gradient steps; plotly itself must be on the page already."""
     entries = [entry for line in log_file.read_text().splitlines() if "loss" in (entry := json.loads(line))]
     figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e["loss"] for e in entries], mode="lines"))
     figure.update_layout(
@@ -77,7 +107,7 @@ def training_curve(log_file: Path) -> str:
         height=CURVE_HEIGHT,
         margin=dict(l=60, r=20, t=20, b=50),
     )
-    return figure.to_html(full_html=False, include_plotlyjs=True)
+    return figure.to_html(full_html=False, include_plotlyjs=False)
 
 
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
@@ -90,22 +120,30 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
+def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
+    """The device and the batch size of an evaluation, with which an episode goes as it went there."""
+    return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
+
+
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
     Raises:
         ResultError: The run's evaluation.json is missing or broken.
         CheckpointError: The run's last checkpoint is missing or broken.
+        MachineError: This machine does not have the device of the evaluation.
     """
     result = read_result(args.run_dir / "evaluation.json")
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
-    policy = load_policy(args.run_dir / "checkpoints/last")
+    policy = load_policy(args.run_dir / "checkpoints/last", **_inference_of(result))
     outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
         result=result,
         outcome=outcome,
+        rates={label: result[name] for name, label in RATES.items() if name in result},
+        force_curve=Markup(force_curve(result)),
         randomization=randomization_of(result),
         rows=rows,
         strip=base64.b64encode(strip).decode(),

@@ -2,7 +2,6 @@
 
 import json
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,19 +13,25 @@ from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
+from .gentle import is_gentle
 from .provenance import git_commit, machine, package_versions
 from .redaction import redacted
-from .rollout import EpisodeOutcome
+from .rollout import ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
 from .statistics import wilson_interval
 
-SCHEMA = "manifeel-evaluation-2"
+SCHEMA = "manifeel-evaluation-3"
 """Version of the form of result files; data/evaluation_schema.json defines it."""
-SCHEMA_BEFORE = "manifeel-evaluation-1"
-"""Version that identified a task by a hash of its code, which cannot be translated into a revision of the task."""
+EARLIER = {
+    "manifeel-evaluation-1": "does not say the revision of the task",
+    "manifeel-evaluation-2": "is of episodes that ended at success, with other time limits",
+}
+"""Earlier versions, and why results of them cannot be compared with those of today."""
 PATHS = ("demos", "run_dir", "tacrgb_weights")
 """Entries of a policy's configuration that are paths on the machine where it was trained."""
 PRIVATE = ("policy_name", "policy_kwargs")
 """Entries of a policy's configuration that come from the command line, and may hold passwords and tokens."""
+MEANS = ("return", "reward", "episode_len")
+"""Numbers of an episode whose means a result holds."""
 LONGEST_MESSAGE = 300
 """Characters of a message of jsonschema that are shown; the rest repeats the faulty data."""
 
@@ -48,7 +53,11 @@ def provenance(env_id: str) -> dict[str, Any]:
 
 
 def result_of(
-    env_id: str, env_kwargs: dict[str, Any], config: dict[str, Any], outcomes: list[EpisodeOutcome]
+    env_id: str,
+    env_kwargs: dict[str, Any],
+    config: dict[str, Any],
+    outcomes: list[EpisodeOutcome],
+    inference: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of a result file.
 
@@ -57,13 +66,9 @@ def result_of(
         env_kwargs: Arguments of `gym.make`.
         config: Configuration of the policy; `published_config` says what is left out of it, since results are published.
         outcomes: Outcomes of all episodes.
+        inference: Device and batch size of the policy, where they are known.
     """
-    config = published_config(config)
-    rates = {}
-    for name in ("success_once", "success_at_end"):
-        won = sum(getattr(outcome, name) for outcome in outcomes)
-        low, high = wilson_interval(won, len(outcomes))
-        rates[name] = dict(rate=won / len(outcomes), low=round(low, 4), high=round(high, 4))
+    config, episodes = published_config(config), [outcome_as_json(outcome) for outcome in outcomes]
     return dict(
         schema=SCHEMA,
         env_id=env_id,
@@ -72,11 +77,33 @@ def result_of(
         policy=config["policy_name"],
         training_seed=config.get("seed"),
         config=config,
+        inference=inference or dict(device=None, batch_size=None),
         **provenance(env_id),
-        **rates,
-        mean_length=float(np.mean([outcome.length for outcome in outcomes])),
-        episodes=[asdict(outcome) for outcome in outcomes],
+        **summary_of(episodes, task_spec(env_id).force_limit),
+        episodes=episodes,
     )
+
+
+def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dict[str, Any]:
+    """The rates and means of a result file.
+
+    Args:
+        episodes: Episodes as result files hold them.
+        force_limit: The task's limit of the contact force for gentle success, in N; None without one.
+    """
+    to_the_end = all(name in episode for name in ONLY_TO_THE_END for episode in episodes)
+    summary: dict[str, Any] = dict(stop_at_success=not to_the_end)
+    for name in ("success_once", "fail_once", *(ONLY_TO_THE_END if to_the_end else ())):
+        summary[name] = _rate([episode[name] for episode in episodes])
+    if force_limit is not None:
+        gentle = [is_gentle(episode, force_limit) for episode in episodes]
+        summary |= dict(force_limit=force_limit, gentle_success=_rate(gentle))
+    return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), 6) for name in MEANS}
+
+
+def _rate(happened: list[bool]) -> dict[str, float]:
+    low, high = wilson_interval(sum(happened), len(happened))
+    return dict(rate=sum(happened) / len(happened), low=round(low, 4), high=round(high, 4))
 
 
 def write_result(result: dict[str, Any], path: Path) -> None:
@@ -144,10 +171,10 @@ def check_result(result: Any, source: Path) -> None:
         ResultError: It does not have the form; the message names the place.
     """
     given = result.get("schema") if isinstance(result, dict) else None
-    if given == SCHEMA_BEFORE:
+    if given in EARLIER:
         raise ResultError(
-            f"{source} has the schema {given!r}, which does not say the revision of the task; this version reads {SCHEMA!r}: "
-            "evaluate the policy again, after training it again if its checkpoint is refused, too"
+            f"{source} has the schema {given!r}, which {EARLIER[given]}; this version reads {SCHEMA!r}: evaluate the policy "
+            "again, after training it again if its checkpoint is refused, too"
         )
     if given != SCHEMA:
         raise ResultError(

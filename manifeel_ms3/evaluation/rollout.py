@@ -6,7 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -21,24 +21,60 @@ HANGS_FOR_GOOD = 10.0
 """Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
 
 
-@dataclass
+@dataclass(frozen=True, kw_only=True)
 class EpisodeOutcome:
-    """Outcome of one episode."""
+    """Outcome of one episode. Success, failure, return, reward and length are defined as in ManiSkill's `CPUGymWrapper`.
+
+    `data/evaluation_schema.json` describes the same fields in a result file, where `return_` is "return".
+    """
 
     seed: int
     """Seed of the episode, which sets its initial state."""
-    success_once: bool
+    success_once: bool = False
     """Whether the task succeeded at any step."""
-    success_at_end: bool
-    """Whether the task had succeeded at the last step."""
-    length: int
+    success_at_end: bool | None = None
+    """Whether the task had succeeded at the last step; None if the episode was stopped at success or failure."""
+    fail_once: bool = False
+    """Whether the task could not be won any more at any step."""
+    fail_at_end: bool | None = None
+    """Whether the task could not be won any more at the last step; None if the episode was stopped at success or failure."""
+    first_success: int | None = None
+    """Number of control steps until the first success; None without success."""
+    return_: float = 0.0
+    """Sum of the rewards of all steps."""
+    reward: float = 0.0
+    """Mean reward of a step."""
+    episode_len: int = 0
     """Number of control steps."""
-    peak_contact_force: float
+    peak_contact_force: float = 0.0
     """Largest contact force of the episode, in N."""
-    inference_ms: float
-    """Mean time of `Policy.act`, in ms."""
+    force_until_success: float | None = None
+    """Largest contact force up to the first success, in N; None without success."""
+    inference_ms: float = 0.0
+    """Mean time of `Policy.act`, in ms, without the time that it waited for other episodes."""
     error: str | None = None
     """What the policy did wrong, if anything; the episode then counts as failed."""
+
+
+ONLY_TO_THE_END = ("success_at_end", "fail_at_end")
+"""Fields of an outcome that exist only where episodes run to the time limit."""
+
+
+def failed_outcome(seed: int, error: str | None, stop_at_success: bool) -> EpisodeOutcome:
+    """The outcome of an episode of which nothing could be measured."""
+    at_end = None if stop_at_success else False
+    return EpisodeOutcome(seed=seed, success_at_end=at_end, fail_at_end=at_end, error=error)
+
+
+def outcome_as_json(outcome: EpisodeOutcome) -> dict[str, Any]:
+    """An outcome as result files hold it; what was not measured has no entry."""
+    entries = {name.rstrip("_"): value for name, value in asdict(outcome).items()}
+    return {name: value for name, value in entries.items() if value is not None or name not in ONLY_TO_THE_END}
+
+
+def outcome_from_json(entries: dict[str, Any]) -> EpisodeOutcome:
+    """The outcome that `outcome_as_json` wrote."""
+    return EpisodeOutcome(**{"return_" if name == "return" else name: value for name, value in entries.items()})
 
 
 class PolicyFault(Exception):  # noqa: N818  (a fault of the policy, which the outcome records, and no error of this program)
@@ -51,8 +87,11 @@ def evaluate_episode(
     seed: int,
     on_step: Callable[[dict[str, Any]], None] | None = None,
     step_timeout: float | None = None,
+    stop_at_success: bool = False,
 ) -> EpisodeOutcome:
-    """Run one episode until success, failure, the time limit of the task, or a fault of the policy.
+    """Run one episode until the time limit of the task, or until a fault of the policy.
+
+    Success and failure do not end it, as in ManiSkill's evaluation (`ignore_terminations=True`).
 
     Args:
         env: Environment with one episode at a time (`num_envs=1`).
@@ -61,6 +100,7 @@ def evaluate_episode(
         on_step: Function that is called with every observation, the last one included.
         step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
             in the main thread of a process.
+        stop_at_success: End the episode at success or failure.
 
     Raises:
         PolicyUnavailableError: The policy cannot be asked, so that the episode has no outcome.
@@ -68,39 +108,86 @@ def evaluate_episode(
     obs, _ = env.reset(seed=seed)
     task: Any = env.unwrapped
     shape = task.single_action_space.shape
-    once, at_end, peak, thinking, length, over, fault = False, False, 0.0, 0.0, 0, False, None
+    metrics, over, fault = _Metrics(seed), False, None
     try:
-        _answer(policy.reset, step_timeout)
+        _answer(lambda: begin_episode(policy, seed), step_timeout)
         while not over:
             if on_step is not None:
                 on_step(obs)
             begin = time.perf_counter()
             action = _checked(_answer(lambda obs=obs: policy.act(obs), step_timeout), shape)
-            thinking += time.perf_counter() - begin
-            obs, _, terminated, truncated, info = env.step(action)
-            length += 1
-            at_end = bool(info["success"])
-            once |= at_end
-            peak = max(peak, _finite_force(info))
-            over = bool(terminated) or bool(truncated)
+            metrics.thinking += time.perf_counter() - begin - getattr(policy, "waited", 0.0)
+            task.renders_cameras = on_step is not None or getattr(policy, "looks", True)
+            obs, reward, terminated, truncated, info = env.step(action)
+            metrics.add(float(reward), info)
+            over = bool(truncated) or (stop_at_success and bool(terminated))
     except PolicyFault as error:
-        once, at_end, fault = False, False, f"step {length}: {error}"
+        fault = f"step {metrics.steps}: {error}"
+    finally:
+        task.renders_cameras = True
     if on_step is not None:
         on_step(obs)
-    mean = 1e3 * thinking / max(length, 1)
-    return EpisodeOutcome(seed, once, at_end, length, round(peak, 3), round(mean, 3), fault)
+    return metrics.outcome(to_the_end=not stop_at_success, error=fault)
 
 
-def _finite_force(info: dict[str, Any]) -> float:
-    """The contact force of a step, in N.
+@dataclass
+class _Metrics:
+    """What is measured while an episode runs."""
 
-    Raises:
-        PolicyFault: It is NaN or infinite: the actions have made the simulation diverge.
-    """
-    force = float(info["contact_force"])
-    if not math.isfinite(force):
-        raise PolicyFault(f"the simulation has diverged: the contact force is {force}")
-    return force
+    seed: int
+    steps: int = 0
+    thinking: float = 0.0
+    """Time in s that the policy took."""
+    returned: float = 0.0
+    peak: float = 0.0
+    force_until_success: float | None = None
+    first_success: int | None = None
+    success: bool = False
+    """At the last step, as `fail`."""
+    fail: bool = False
+    fail_once: bool = False
+
+    def add(self, reward: float, info: dict[str, Any]) -> None:
+        """Add a step.
+
+        Raises:
+            PolicyFault: The contact force is NaN or infinite: the actions have made the simulation diverge.
+        """
+        self.steps += 1
+        force = float(info["contact_force"])
+        if not math.isfinite(force) or not math.isfinite(reward):
+            raise PolicyFault(f"the simulation has diverged: the contact force is {force}, the reward {reward}")
+        self.returned += reward
+        self.peak = max(self.peak, force)
+        self.success, self.fail = bool(info["success"]), bool(info["fail"])
+        self.fail_once |= self.fail
+        if self.success and self.first_success is None:
+            self.first_success, self.force_until_success = self.steps, round(self.peak, 3)
+
+    def outcome(self, to_the_end: bool, error: str | None) -> EpisodeOutcome:
+        """The outcome; with an error the episode has failed, whatever was reached before."""
+        won = error is None and self.first_success is not None
+        return EpisodeOutcome(
+            seed=self.seed,
+            success_once=won,
+            success_at_end=won and self.success if to_the_end else None,
+            fail_once=self.fail_once,
+            fail_at_end=self.fail if to_the_end else None,
+            first_success=self.first_success if won else None,
+            return_=round(self.returned, 6),
+            reward=round(self.returned / max(self.steps, 1), 6),
+            episode_len=self.steps,
+            peak_contact_force=round(self.peak, 3),
+            force_until_success=self.force_until_success if won else None,
+            inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), 3),
+            error=error,
+        )
+
+
+def begin_episode(policy: Policy, seed: int) -> None:
+    """Tell the policy that an episode begins, and its seed if it wants to know."""
+    begin = getattr(policy, "begin_episode", None)
+    policy.reset() if begin is None else begin(seed)
 
 
 def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:

@@ -215,36 +215,56 @@ def bevelled_box(box: Box, bevels: dict[str, float]) -> Hulls:
     return Hulls((np.array(points),))
 
 
-def block_with_holes(
-    outer: tuple[float, float],
-    depth: float,
-    holes: list[tuple[tuple[float, float], tuple[float, float]]],
-    bottom: float = 0.0,
-    chamfer: float = 0.0,
-) -> tuple[Piece, ...]:
-    """Convex pieces of a slab with rectangular through holes.
+Holes = list[tuple[tuple[float, float], tuple[float, float]]]
+"""((size x, size y), (centre x, centre y)) of each hole of a slab, in m; they must not overlap along x."""
+
+
+def block_with_holes(outer: tuple[float, float], depth: float, holes: Holes, bottom: float = 0.0) -> tuple[Box, ...]:
+    """Boxes of a slab with rectangular through holes.
 
     Args:
         outer: Size of the slab along x and y, in m.
         depth: Size along z, in m.
-        holes: ((size x, size y), (centre x, centre y)) of each hole, in m; they must not overlap along x.
+        holes: The holes.
         bottom: Height of the underside, in m.
-        chamfer: Width, in m, of the chamfer of 45 degrees around the upper mouth of each hole; 0 for none.
 
     Raises:
         ValueError: Holes overlap or reach beyond the slab.
     """
-    holes = sorted(holes, key=lambda hole: hole[1][0])
-    z, pieces, left, cut = bottom + depth / 2, [], -outer[0] / 2, dict[str, float]()
-    for (size_x, size_y), (x, y) in holes:
+    return tuple(box for box, _ in _walls(outer, depth, holes, bottom, 0.0))
+
+
+def block_with_chamfered_holes(
+    outer: tuple[float, float], depth: float, holes: Holes, bottom: float, chamfer: float
+) -> tuple[Hulls, ...]:
+    """Convex pieces of a slab as `block_with_holes` makes it, each hole with a chamfer of 45 degrees around its upper mouth.
+
+    Args:
+        outer: Size of the slab along x and y, in m.
+        depth: Size along z, in m.
+        holes: The holes.
+        bottom: Height of the underside, in m.
+        chamfer: Width of the chamfer, in m.
+
+    Raises:
+        ValueError: Holes overlap or reach beyond the slab.
+    """
+    return tuple(bevelled_box(box, bevels) for box, bevels in _walls(outer, depth, holes, bottom, chamfer))
+
+
+def _walls(
+    outer: tuple[float, float], depth: float, holes: Holes, bottom: float, chamfer: float
+) -> list[tuple[Box, dict[str, float]]]:
+    """Boxes of a slab around its holes, and the bevels of each, by side."""
+    z, walls, left, cut = bottom + depth / 2, [], -outer[0] / 2, dict[str, float]()
+    for (size_x, size_y), (x, y) in sorted(holes, key=lambda hole: hole[1][0]):
         if x - size_x / 2 <= left or x + size_x / 2 >= outer[0] / 2 or abs(y) + size_y / 2 >= outer[1] / 2:
             raise ValueError(f"hole {size_x} x {size_y} m at ({x}, {y}) overlaps another or the rim of a slab of {outer} m")
         strip = Box((x - size_x / 2 - left, outer[1], depth), ((x - size_x / 2 + left) / 2, 0.0, z))
-        pieces.append((strip, cut | {"+x": chamfer}))
+        walls.append((strip, cut | {"+x": chamfer}))
         for low, high, side in ((-outer[1] / 2, y - size_y / 2, "+y"), (y + size_y / 2, outer[1] / 2, "-y")):
             # as wide as the chamfers beside it, so that they end at the hole's corners
             wall = Box((size_x + 2 * chamfer, high - low, depth), (x, (low + high) / 2, z))
-            pieces.append((wall, {side: chamfer}))
+            walls.append((wall, {side: chamfer}))
         left, cut = x + size_x / 2, {"-x": chamfer}
-    pieces.append((Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut))
-    return tuple(bevelled_box(box, bevels) if chamfer else box for box, bevels in pieces)
+    return [*walls, (Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from . import materials
 from .fits import Fit, Lead
-from .part import Box, Cylinder, Hulls, Part, Piece, bevelled_box, block_with_holes
+from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, block_with_holes
 
 METAL, BRASS, DARK, WHITE = (0.72, 0.74, 0.78), (0.80, 0.62, 0.20), (0.14, 0.14, 0.16), (0.85, 0.85, 0.82)
 ARC_POINTS = 8
@@ -148,7 +148,9 @@ def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
     """Slab with the ground hole and, at one x, two blade holes: one wide hole, and a bar between the blades in it."""
     (x, y), rim = sizes.blade_hole, sizes.block[2]
     at, middle = -sizes.offset / 2, rim - sizes.depth / 2
-    holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]
-    slab = block_with_holes(sizes.block[:2], sizes.depth, holes, bottom=rim - sizes.depth, chamfer=sizes.chamfer)
+    holes: Holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]
     bar = Box((x + 2 * sizes.chamfer, sizes.spacing - y, sizes.depth), (at, 0.0, middle))
-    return (*slab, bevelled_box(bar, {"-y": sizes.chamfer, "+y": sizes.chamfer}) if sizes.chamfer else bar)
+    if not sizes.chamfer:
+        return (*block_with_holes(sizes.block[:2], sizes.depth, holes, rim - sizes.depth), bar)
+    slab = block_with_chamfered_holes(sizes.block[:2], sizes.depth, holes, rim - sizes.depth, sizes.chamfer)
+    return (*slab, bevelled_box(bar, {"-y": sizes.chamfer, "+y": sizes.chamfer}))

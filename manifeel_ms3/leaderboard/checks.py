@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
-from manifeel_ms3.evaluation.statistics import wilson_interval
-from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds, task_spec
+from manifeel_ms3.evaluation.result import summary_of
+from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
 
-from .rerun import FORCE_TOLERANCE, INVENTED
+from .rerun import COMPARED, FORCE_TOLERANCE, FORCES, INVENTED
 from .submission import Submission, SubmissionError
 from .untrusted import quoted
 
@@ -25,9 +25,9 @@ RATE_TOLERANCE = 1e-3
 """Difference between numbers that count as the same, where a result rounds them to four digits."""
 SHOWN = 5
 """Number of wrong seeds that a message lists."""
-SAME_OUTCOME = np.array([0, 0, 0, 2 * FORCE_TOLERANCE])
-"""Differences of success at any step, success at the end, length and force (N) up to which two episodes are the same: running
-one of them again would confirm the other."""
+SAME_OUTCOME = np.array([2 * FORCE_TOLERANCE if name in FORCES else 0 for name in COMPARED])
+"""Differences of the compared entries up to which two episodes are the same: running one of them again would confirm the
+other."""
 
 
 def check(submission: Submission, to_take: bool = True) -> None:
@@ -79,8 +79,10 @@ def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
 
 
 def _outcomes(result: dict[str, Any]) -> list[list[float]]:
-    names = ("success_once", "success_at_end", "length", "peak_contact_force")
-    return [[episode[name] for name in names] for episode in result["episodes"]]
+    never = -1.0
+    return [
+        [never if (value := episode.get(name)) is None else float(value) for name in COMPARED] for episode in result["episodes"]
+    ]
 
 
 def _faults(result: dict[str, Any]) -> list[str]:
@@ -121,28 +123,35 @@ def _faults_of_the_simulator(result: dict[str, Any]) -> list[str]:
 
 def _faults_of_the_numbers(result: dict[str, Any]) -> list[str]:
     """Numbers of a result that contradict each other, or are not possible."""
-    faults, episodes = [], result["episodes"]
-    for name in ("success_once", "success_at_end"):
-        succeeded = sum(episode[name] for episode in episodes)
-        expected = (succeeded / len(episodes), *wilson_interval(succeeded, len(episodes)))
-        given = tuple(result[name][key] for key in ("rate", "low", "high"))
-        if not np.allclose(given, expected, atol=RATE_TOLERANCE):
-            faults.append(f"{name} says {given}, its episodes come to {tuple(round(x, 4) for x in expected)}")
-    mean = float(np.mean([episode["length"] for episode in episodes]))
-    if abs(mean - result["mean_length"]) > RATE_TOLERANCE:
-        faults.append(f"mean_length says {result['mean_length']}, its episodes come to {mean:.3f}")
-    limit = task_spec(result["env_id"]).max_episode_steps
-    return faults + [fault for episode in episodes for fault in _faults_of_an_episode(episode, limit)]
+    episodes, spec = result["episodes"], task_spec(result["env_id"])
+    faults = ["its episodes end at success; evaluate without --stop-at-success"] if result["stop_at_success"] else []
+    if len(lengths := {episode["episode_len"] for episode in episodes if not episode["error"]}) > 1:
+        faults.append(f"its episodes without an error have from {min(lengths)} to {max(lengths)} steps, but one time limit")
+    for name, expected in summary_of(episodes, spec.force_limit).items():
+        given = result.get(name)
+        if isinstance(expected, dict):
+            agrees = isinstance(given, dict) and all(abs(given[part] - expected[part]) <= RATE_TOLERANCE for part in expected)
+        else:
+            agrees = given is not None and abs(given - expected) <= RATE_TOLERANCE
+        if not agrees:
+            faults.append(f"{name} says {given}, its episodes come to {expected}")
+    return faults + [fault for episode in episodes for fault in _faults_of_an_episode(episode, spec)]
 
 
-def _faults_of_an_episode(episode: dict[str, Any], limit: int) -> list[str]:
+def _faults_of_an_episode(episode: dict[str, Any], spec: TaskSpec) -> list[str]:
     faults, place = [], f"episode of seed {episode['seed']}"
-    if episode["length"] > limit:
-        faults.append(f"{place}: {episode['length']} steps, the task ends after {limit}")
-    if episode["success_at_end"] and not episode["success_once"]:
-        faults.append(f"{place}: succeeds at the end, but never")
-    if episode["success_once"] and (episode["error"] or episode["length"] == 0):
-        faults.append(f"{place}: succeeds after {episode['length']} steps, with the error {episode['error']}")
-    if episode["peak_contact_force"] > MOST_FORCE:
+    length, first, force = (episode[name] for name in ("episode_len", "first_success", "force_until_success"))
+    if length > spec.max_episode_steps:
+        faults.append(f"{place}: {length} steps, the task ends after {spec.max_episode_steps}")
+    for what in ("success", "fail"):
+        if episode.get(f"{what}_at_end") and not episode[f"{what}_once"]:
+            faults.append(f"{place}: {what} at the end, but never")
+    if episode["success_once"] and (episode["error"] or length == 0):
+        faults.append(f"{place}: succeeds after {length} steps, with the error {episode['error']}")
+    if (first is not None, force is not None) != (episode["success_once"],) * 2 or (first or 0) > length:
+        faults.append(f"{place}: its first success is at step {first} of {length}, with {force} N until then")
+    if max(force or 0.0, episode["peak_contact_force"]) > MOST_FORCE:
         faults.append(f"{place}: {episode['peak_contact_force']} N, more than the arm can press with")
+    if (force or 0.0) > episode["peak_contact_force"]:
+        faults.append(f"{place}: {force} N until its first success, more than in the whole episode")
     return faults

@@ -19,7 +19,9 @@ from manifeel_ms3.analysis.presets import setup_of
 from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.files import write_text
+from manifeel_ms3.tasks.registry import task_spec
 
 from .checks import EPISODES, check
 from .rerun import episodes_to_run_again, rerun_of
@@ -50,6 +52,8 @@ class Row:
     """Median over episodes of the mean time of an inference, in ms."""
     force: float
     """Median over episodes of the largest contact force, in N."""
+    gentle: float | None
+    """Share of the episodes that succeed gently; None for a task without a limit of force."""
     rerun: tuple[int, int]
     """Numbers of episodes that the leaderboard ran again, and of all episodes."""
 
@@ -79,8 +83,9 @@ def rows_of(submission: Submission) -> list[Row]:
         episodes = [episode for path in paths for episode in submission.results[path]["episodes"]]
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
-        rerun = rerun_of(submission, paths)
-        rows.append(Row(submission, condition, mean_success(results), results, latency, force, rerun))
+        limit, rerun = task_spec(condition.env_id).force_limit, rerun_of(submission, paths)
+        gentle = None if limit is None else float(success_under_force(episodes, [limit])[0])
+        rows.append(Row(submission, condition, mean_success(results), results, latency, force, gentle, rerun))
     return rows
 
 
@@ -111,19 +116,21 @@ def leaderboard_table(rows: list[Row]) -> str:
     head = (
         f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
         f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
-        '95 %; where there are fewer, "of" says how many. "Run again" is the number of episodes that the leaderboard ran again '
-        "with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
+        '95 %; where there are fewer, "of" says how many. A success is gentle where the contact force stayed within the limit '
+        'of the task until then ([limits](../docs/evaluation.md)). "Run again" is the number of episodes that the leaderboard '
+        "ran again with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
     )
     cells = []
     for row in rows:
         about, condition = row.submission.about, row.condition
         name = markdown_text(about.name)
         task = f"{condition.task} {condition.variant}".strip()
+        gentle = "" if row.gentle is None else f"{row.gentle:.0%}"
         what = (task, condition.sensing, condition.policy, str(setup_of(condition)), condition.encoder)
-        numbers = (condition.num_demos, row.success, row.results.size, row.rerun_text)
+        numbers = (condition.num_demos, row.success, gentle, row.results.size, row.rerun_text)
         cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
     what = ("task", "sensing", "policy", "settings", "TacRGB encoder", "demonstrations")
-    return head + markdown_table((*what, "success", "of", "run again", "submission"), cells)
+    return head + markdown_table((*what, "success", "gentle success", "of", "run again", "submission"), cells)
 
 
 def write_page(rows: list[Row], board: Path) -> Path:
@@ -160,6 +167,7 @@ def _for_page(row: Row) -> dict[str, Any]:
         confirmed=row.is_confirmed,
         latency=row.inference_ms,
         force=row.force,
+        gentle=row.gentle,
         link=about.link,
         config=json.dumps(dict(sorted(results[-1]["config"].items())), indent=1),
         curves=json.dumps(_curves(results)),

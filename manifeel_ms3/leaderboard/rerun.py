@@ -10,6 +10,7 @@ import math
 import random
 import secrets
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -21,10 +22,10 @@ from scipy.stats import hypergeom
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
-from manifeel_ms3.evaluation.evaluate import Evaluation, run_episodes
-from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
+from manifeel_ms3.evaluation.policy import PolicySource, checked_device
 from manifeel_ms3.evaluation.provenance import package_versions
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome, outcome_as_json
 
 from .submission import ABOUT, Rerun, RerunFile, Submission, SubmissionError
 from .untrusted import quoted
@@ -35,7 +36,7 @@ INVENTED = 0.1
 CHANCE = 0.01
 """Largest chance of such a row not to be found out."""
 COINCIDENCE = 0.1
-"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success, length, and
+"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success and
 force within 0.01 N: of the 50 episodes of either result in this repository, at most 3 have forces so near to any one value. A
 success that the policy does not have never agrees."""
 FORCE_TOLERANCE = 0.01
@@ -45,8 +46,9 @@ NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num
 HASHED = ("model.safetensors", "config.json")
 """Files of a checkpoint whose contents, one after the other, its hash is of."""
 CHUNK = 2**20
-STEP_TIMEOUT = 60.0
-"""Longest time that a policy may take for one action, in s; the default of an evaluation."""
+FORCES = ("peak_contact_force", "force_until_success")
+COMPARED = ("success_once", "success_at_end", "fail_once", "fail_at_end", "first_success", "episode_len", *FORCES)
+"""Entries of an episode that must agree when it is run again."""
 
 
 @cache
@@ -237,14 +239,27 @@ def run_again(
     for path, numbers in drawn.items():
         result = submission.results[path]
         submitted = [result["episodes"][k] for k in numbers]
-        evaluation = Evaluation(sources[path], result["env_id"], result["env_kwargs"], result["config"])
+        source = _computed_as(sources[path], result["inference"])
+        stop = result["stop_at_success"]
+        evaluation = Evaluation(source, result["env_id"], result["env_kwargs"], result["config"], stop)
         seeds = [episode["seed"] for episode in submitted]
-        outcomes = run_episodes(evaluation, seeds, workers, step_timeout=STEP_TIMEOUT)
+        outcomes = run_episodes(evaluation, seeds, workers)
         faults += _faults_of_a_result(path, result, submitted, outcomes)
         files[path.as_posix()] = RerunFile(hashlib.sha256(submission.files[path]).hexdigest(), seeds)
     if faults:
         raise SubmissionError(submission.folder, faults)
     return Rerun(seed, package_versions(), files)
+
+
+def _computed_as(source: PolicySource, inference: dict[str, Any]) -> PolicySource:
+    """The policy on the device and in the batches of a result, on which the last bits of its actions depend.
+
+    Raises:
+        MachineError: This machine does not have the device.
+    """
+    if source.checkpoint is None:
+        return source
+    return replace(source, device=checked_device(inference["device"]), batch_size=inference["batch_size"])
 
 
 def _faults_of_a_result(
@@ -264,11 +279,13 @@ def _faults_of_a_result(
 
 
 def _differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
-    found = []
-    for name in ("success_once", "success_at_end", "length", "peak_contact_force"):
-        tolerance = FORCE_TOLERANCE if name == "peak_contact_force" else 0
-        before, now = episode[name], getattr(outcome, name)
-        if abs(before - now) > tolerance:
+    found, again = [], outcome_as_json(outcome)
+    for name in COMPARED:
+        tolerance = FORCE_TOLERANCE if name in FORCES else 0
+        before, now = episode.get(name), again.get(name)
+        unknown = before is None or now is None
+        differs = before is not now if unknown else abs(before - now) > tolerance
+        if differs:
             found.append(f"{name} says {before}, run again it is {now}")
     return found
 

@@ -41,7 +41,8 @@ class TaskSpec:
     category: str
     """Category of the paper: "insertion", "screwing" or "exploration"."""
     max_episode_steps: int
-    """Time limit of an episode, in control steps."""
+    """Time limit of an episode, in control steps: about twice the mean length of demonstrations, and at least 1.5 times that of
+    the longest."""
     paper_demos: int
     """Number of demonstrations that the paper recorded; what `manifeel dataset` records."""
     paper_tables: tuple[str, ...] = ()
@@ -50,6 +51,9 @@ class TaskSpec:
     """Raised by one whenever the task's outcomes change; results of different revisions cannot be compared."""
     demo_megabytes: float = 13.0
     """Size of one demonstration with every observation, in MB, rounded up; to see whether the disk has room."""
+    force_limit: float | None = None
+    """Largest contact force of a gentle success, in N: twice the median over demonstrations of their largest force. None if not
+    known."""
     demo_steps: float | None = None
     """Mean number of control steps of a demonstration, measured over seeds 0 to 99 (docs/tasks.md); None if not known."""
     demonstrator: Callable[[Any, int], Any] | None = None
@@ -97,6 +101,9 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
                 f"give one of them another id. Registered are {list(_SPECS)}"
             )
         register_env(env_id, max_episode_steps=max_episode_steps, override=known is not None)(env_class)
+        # by the class's name instead of ManiSkill's function, which knows the task only where it was imported: processes that
+        # gymnasium spawns import nothing else
+        gym.registry[env_id].entry_point = f"{env_class.__module__}:{env_class.__qualname__}"
         _SPECS[env_id] = TaskSpec(env_id, env_class, max_episode_steps=max_episode_steps, **about)
         return env_class
 

@@ -28,6 +28,8 @@ class SensingEnv(BaseEnv):
     """Configurations of the observed pads by sensor name."""
     _touch_is_fresh: bool
     """Whether the pads have been read in the present state. They are read once per state, since shear has a history."""
+    renders_cameras = True
+    """Whether observations hold the cameras' images. They are left out while a policy does not look, which saves their time."""
 
     def _make_tactile_sensors(self) -> None:
         # not in _setup_sensors, which runs only with a renderer: touch works without one
@@ -57,7 +59,8 @@ class SensingEnv(BaseEnv):
 
     def _sense(self, textures: dict[str, bool], apply_texture_transforms: bool = True) -> dict:
         """Observations of the cameras (these textures) and the pads in the present state; nothing else is rendered."""
-        cameras = {name: s for name, s in self._sensors.items() if isinstance(s, Camera)} if any(textures.values()) else {}
+        wanted = self.renders_cameras and any(textures.values())
+        cameras = {name: s for name, s in self._sensors.items() if isinstance(s, Camera)} if wanted else {}
         if cameras or any(sensor.needs_render for sensor in self._tactile_sensors.values()):
             self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         for camera in cameras.values():

@@ -10,8 +10,8 @@ import numpy as np
 from baselines.common.checkpoint import as_json
 from baselines.registry import policy_spec
 from manifeel_ms3.evaluation.result import result_of
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.tasks.registry import evaluation_seeds, full_id, task_spec
+from tests.outcomes import made_up
 
 TOTAL_STEPS = 50_000
 
@@ -55,7 +55,7 @@ def write_run(
     for step in np.linspace(last_step / checkpoints, last_step, checkpoints).astype(int).tolist():
         won = rng.permutation(episodes) < rate * episodes
         seeds = evaluation_seeds(episodes)
-        outcomes = [EpisodeOutcome(one, bool(win), bool(win), 9, 1.0, 1.0) for one, win in zip(seeds, won, strict=True)]
+        outcomes = [made_up(one, bool(win)) for one, win in zip(seeds, won, strict=True)]
         path = folder / str(rng.integers(1 << 62)) / f"evaluations/{step:08d}.json"
         path.parent.mkdir(parents=True)
         path.write_text(json.dumps(result_of(full_id(task), kwargs, config | dict(step=step), outcomes)))

@@ -9,9 +9,9 @@ from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of
 from manifeel_ms3.analysis.estimates import difference, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
+from tests.outcomes import made_up
 
 from .made_up import config_of
 
@@ -25,7 +25,7 @@ def runs(rate: float, seeds: int = 3, episodes: int = 50) -> ConditionResults:
 def write(folder, seed: int, step: int, won: list[bool], **changes) -> None:
     config = dict(policy_name="diffusion_policy", obs_mode="rgb+tacrgb", seed=seed, step=step, num_demos=50)
     config |= dict(policy=dict(encoder=dict(image="resnet18", tacrgb="t3")))
-    outcomes = [EpisodeOutcome(100 + k, win, win, 9, 1.0, 1.0) for k, win in enumerate(won)]
+    outcomes = [made_up(100 + k, win) for k, win in enumerate(won)]
     result = result_of(PEG, dict(cameras=["wrist"]), config, outcomes) | changes
     path = folder / f"{seed}/{step:08d}.json"
     path.parent.mkdir(exist_ok=True, parents=True)
@@ -49,7 +49,7 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
 def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     config = dict(policy_name="diffusion_policy", obs_mode="tacff")
     plain, rendered, changed = (
-        condition_of(result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
+        condition_of(result_of(PEG, env_kwargs, config, [made_up(1, True)]))
         for env_kwargs in (
             dict(sim_backend="physx_cpu"),
             dict(render_backend="none", lighting="normal"),  # a default that is spelled out
@@ -60,14 +60,14 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     assert plain.variant == ""
     assert changed.variant == '{"fit": "tight"}'
     sensed = [dict(tactile_sensors=["left"]), dict(sensor_configs=dict(width=128)), dict(tactile=dict(units="tacsl"))]
-    results = (result_of(PEG, env_kwargs, config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]) for env_kwargs in sensed)
+    results = (result_of(PEG, env_kwargs, config, [made_up(1, True)]) for env_kwargs in sensed)
     assert len({plain.key, changed.key, *(condition_of(result).key for result in results)}) == 5
 
 
 def test_demonstrations_of_another_variant_make_another_policy():
     def trained_on(**recorded) -> Condition:
         config = dict(policy_name="diffusion_policy", obs_mode="rgb", env_kwargs=recorded)
-        return condition_of(result_of(PEG, dict(lighting="dim"), config, [EpisodeOutcome(1, True, True, 9, 1.0, 1.0)]))
+        return condition_of(result_of(PEG, dict(lighting="dim"), config, [made_up(1, True)]))
 
     assert trained_on(lighting="dim").settings == ()
     assert trained_on().settings == (("trained on", ""),)

@@ -159,7 +159,7 @@ def turned_actions(actions: torch.Tensor, g: int) -> torch.Tensor:
 def act(policy, monkeypatch, pose, pictures, noise) -> torch.Tensor:
     """Actions for observations that share a pose, each with a picture of the front camera and one of the wrist camera."""
     monkeypatch.setattr(policy, "noise", lambda *_: noise)
-    return torch.cat([policy.sample(observation(pose, *pair), 10, torch.Generator()) for pair in pictures])
+    return torch.cat([policy.sample(observation(pose, *pair), 10, [torch.Generator()]) for pair in pictures])
 
 
 @pytest.mark.parametrize("g", [1, 2, 4])

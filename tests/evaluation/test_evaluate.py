@@ -32,7 +32,7 @@ def evaluated(policy: str, out: Path, **changes) -> dict:
 def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     result = evaluated("StandStill", tmp_path)
     assert [episode["seed"] for episode in result["episodes"]] == evaluation_seeds(2)
-    assert [(e["length"], e["success_once"], e["error"]) for e in result["episodes"]] == [(12, False, None)] * 2
+    assert [(e["episode_len"], e["success_once"], e["error"]) for e in result["episodes"]] == [(12, False, None)] * 2
     assert result["policy"] == "tests.evaluation.policies:StandStill"
     assert result["success_once"]["rate"] == 0.0
     assert result["env_kwargs"]["obs_mode"] == "tacff"
@@ -116,7 +116,7 @@ def server():
 
 def test_a_policy_in_another_process_is_asked(server, tmp_path):
     result = evaluated(server.address, tmp_path, episodes=1)
-    assert result["episodes"][0]["length"] == 12
+    assert result["episodes"][0]["episode_len"] == 12
     assert result["episodes"][0]["error"] is None
     assert result["policy"] == server.address
 
@@ -144,10 +144,11 @@ def test_results_that_are_not_of_the_published_form_are_refused(result_file):
     good = json.loads(result_file.read_text())
     for broken, word in (
         (good | dict(schema="manifeel-evaluation-9"), "has the schema 'manifeel-evaluation-9'.*update"),
+        (good | dict(schema="manifeel-evaluation-2"), "episodes that ended at success, with other .*evaluate the policy again"),
         (good | dict(schema="manifeel-evaluation-1"), "does not say the revision of the task.*evaluate the policy again"),
         (good | dict(success_once=dict(rate=1.5, low=0, high=1)), "success_once/rate"),
         ({name: value for name, value in good.items() if name != "episodes"}, "'episodes' is a required property"),
-        (good | dict(episodes=[good["episodes"][0] | dict(length="long")]), "episodes/0/length"),
+        (good | dict(episodes=[good["episodes"][0] | dict(episode_len="long")]), "episodes/0/episode_len"),
         ([1], "has the schema None"),
     ):
         result_file.write_text(json.dumps(broken))

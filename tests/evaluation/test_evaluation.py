@@ -1,28 +1,39 @@
 """Evaluation: fixed seeds, honest intervals, identical outcomes, a page that opens."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.evaluation import evaluate_episode
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.gentle import success_under_force
+from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
 from manifeel_ms3.evaluation.policy import load_policy
+from manifeel_ms3.evaluation.result import summary_of
+from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
-from manifeel_ms3.tasks.registry import evaluation_seeds
+from manifeel_ms3.paths import data_dir
+from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
 from tests.conftest import PEG
+from tests.outcomes import made_up
 
 
 class ExpertPolicy:
     """The demonstrator behind the policy interface: the loop around it is what is tested."""
 
-    def __init__(self, env, seed):
-        self.env, self.seed = env, seed
+    def __init__(self, env, seed, steps=1000, then=(0.0,) * 6):
+        self.env, self.seed, self.steps, self.then = env, seed, steps, np.array(then)
 
     def reset(self):
         self.actions = make_expert(PEG, self.env.unwrapped, self.seed).actions()
+        self.said = []
 
     def act(self, obs):
-        return next(self.actions)
+        self.said.append(next(self.actions) if len(self.said) < self.steps else self.then)
+        return self.said[-1]
 
 
 class StandStill:
@@ -33,26 +44,99 @@ class StandStill:
         return np.zeros(6)
 
 
-def test_outcome_of_a_success_and_of_a_failure(make_env):
-    env = make_env(obs_mode="none", render_backend="none", fit="paper")
-    won = evaluate_episode(env, ExpertPolicy(env, 1), seed=1)
-    assert won.success_once
-    assert won.success_at_end
-    assert won.length < 150
-    assert 5 < won.peak_contact_force < 60
-    lost = evaluate_episode(env, StandStill(), seed=1)
-    assert not lost.success_once
-    assert lost.length == 300
+LIMIT = 120
+BARE = dict(obs_mode="none", render_backend="none", fit="paper", max_episode_steps=LIMIT)
+UP = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def pulled_out(make_env):
+    """An episode whose peg is pulled out after the success, and the actions."""
+    env = make_env(**BARE)
+    policy = ExpertPolicy(env, 1, steps=70, then=UP)
+    return evaluate_episode(env, policy, seed=1), policy.said
+
+
+def test_an_episode_runs_to_the_time_limit_and_its_end_is_not_its_success(pulled_out):
+    outcome, _ = pulled_out
+    assert outcome.success_once
+    assert not outcome.success_at_end
+    assert (outcome.fail_once, outcome.fail_at_end) == (False, False)
+    assert outcome.episode_len == LIMIT
+    assert 20 < outcome.first_success < LIMIT
+    assert 5 < outcome.force_until_success <= outcome.peak_contact_force < 60
+
+
+def test_the_metrics_are_those_of_maniskill(make_env, pulled_out):
+    outcome, actions = pulled_out
+    env = CPUGymWrapper(make_env(**BARE), ignore_terminations=True, record_metrics=True)
+    env.reset(seed=1)
+    infos = [env.step(action)[-1] for action in actions]
+    theirs = infos[-1]["episode"]
+    ours = outcome_as_json(outcome)
+    for name in ("success_once", "success_at_end", "fail_once", "fail_at_end", "episode_len"):
+        assert ours[name] == theirs[name]
+    for name in ("return", "reward"):
+        assert ours[name] == pytest.approx(float(theirs[name]), rel=1e-5)
+    assert outcome.first_success == 1 + [bool(info["success"]) for info in infos].index(True)
+    forces = [float(info["contact_force"]) for info in infos]
+    assert outcome.force_until_success == pytest.approx(max(forces[: outcome.first_success]), abs=1e-3)
+
+
+def test_an_episode_that_stops_at_success_does_not_know_its_end(make_env, pulled_out):
+    env = make_env(**BARE)
+    stopped = evaluate_episode(env, ExpertPolicy(env, 1), seed=1, stop_at_success=True)
+    assert stopped.episode_len == stopped.first_success == pulled_out[0].first_success
+    assert stopped.force_until_success == pulled_out[0].force_until_success
+    entries = outcome_as_json(stopped)
+    assert "success_at_end" not in entries
+    assert "fail_at_end" not in entries
+    assert outcome_from_json(entries) == stopped
+    summary = summary_of([entries], force_limit=1.0)
+    assert summary["stop_at_success"]
+    assert not {"success_at_end", "fail_at_end"} & set(summary)
+    assert (summary["success_once"]["rate"], summary["gentle_success"]["rate"]) == (1.0, 0.0)
+
+
+def test_a_policy_that_stands_still_never_succeeds(make_env):
+    lost = evaluate_episode(make_env(**BARE), StandStill(), seed=1)
+    assert (lost.success_once, lost.success_at_end, lost.first_success, lost.force_until_success) == (False, False, None, None)
+    assert lost.episode_len == LIMIT
 
 
 def test_same_policy_and_seed_give_the_same_outcome(make_env):
-    env = make_env(obs_mode="none", render_backend="none", fit="paper")
+    env = make_env(**BARE)
     first = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
     evaluate_episode(env, ExpertPolicy(env, 3), seed=3)
     again = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
     assert first.error is None
-    assert first.length > 0
-    assert (first.length, first.peak_contact_force) == (again.length, again.peak_contact_force)
+    assert replace(first, inference_ms=0.0) == replace(again, inference_ms=0.0)
+
+
+def test_the_success_under_a_force_counts_the_force_until_the_first_success():
+    episodes = [
+        outcome_as_json(made_up(seed, won, force=force)) for seed, won, force in ((1, True, 5), (2, True, 9), (3, False, 1))
+    ]
+    episodes[0]["peak_contact_force"] = 50.0  # after the success
+    assert success_under_force(episodes, [0, 5, 8.9, 9, 100]).tolist() == [0, 1 / 3, 1 / 3, 2 / 3, 2 / 3]
+    summary = summary_of(episodes, force_limit=6.0)
+    assert summary["force_limit"] == 6.0
+    assert summary["gentle_success"]["rate"] == 1 / 3
+    assert "gentle_success" not in summary_of(episodes, None)
+
+
+@pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
+def test_limits_follow_from_demonstrations(spec):
+    sample = limits_of_file(data_dir() / "sample" / spec.env_id / "states.h5")
+    assert spec.max_episode_steps >= LONGEST_FACTOR * sample.longest
+    assert spec.max_episode_steps >= MEAN_FACTOR * spec.demo_steps - STEPS
+    assert spec.max_episode_steps <= max(1.5 * MEAN_FACTOR * spec.demo_steps, sample.max_episode_steps)
+    assert spec.force_limit == pytest.approx(sample.force_limit, rel=0.35)  # of two demonstrations
+
+
+def test_limits_are_twice_the_mean_or_more_where_one_demonstration_is_long():
+    assert limits_of([80, 90, 100], [10.0, 30.0, 12.0]) == Limits(180, 24.0, 90.0, 100)
+    assert limits_of([50, 50, 101], [10.0]).max_episode_steps == 160
 
 
 def test_wilson_interval_matches_published_values():

@@ -6,15 +6,15 @@ import pytest
 
 from manifeel_ms3.evaluation.provenance import git_commit, machine, package_versions
 from manifeel_ms3.evaluation.result import ResultError, read_result, result_of, write_result
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
+from tests.outcomes import made_up
 
 
 @pytest.fixture
 def result():
     config = dict(policy_name="diffusion_policy", obs_mode="rgb", run_dir="/home/me/runs/x")
-    return result_of(PEG, dict(cameras=["wrist"]), config, [EpisodeOutcome(100_000, True, True, 9, 1.0, 1.0)])
+    return result_of(PEG, dict(cameras=["wrist"]), config, [made_up(100_000, True)])
 
 
 def test_a_result_carries_versions_commit_and_the_revision_of_its_task(result, monkeypatch):
@@ -23,7 +23,7 @@ def test_a_result_carries_versions_commit_and_the_revision_of_its_task(result, m
     assert result["git_commit"] == git_commit()
     assert result["revision"] == task_spec(PEG).revision
     monkeypatch.setattr(task_spec(PEG), "revision", 7)
-    again = result_of(PEG, {}, result["config"], [EpisodeOutcome(100_000, True, True, 9, 1.0, 1.0)])
+    again = result_of(PEG, {}, result["config"], [made_up(100_000, True)])
     assert again["revision"] == 7
 
 

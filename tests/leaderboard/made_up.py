@@ -8,14 +8,15 @@ import numpy as np
 from manifeel_ms3.evaluation.result import result_of, write_result
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.tasks.registry import evaluation_seeds
+from tests.outcomes import made_up as made_up_outcome
 
 EPISODES = evaluation_seeds(50)
 
 
 def outcomes_of(won: int, rng: np.random.Generator) -> list[EpisodeOutcome]:
     """50 episodes of which the first ones succeed."""
-    lengths, forces = rng.integers(5, 200, 50), rng.uniform(5, 40, 50).round(3)
-    return [EpisodeOutcome(seed, k < won, k < won, int(lengths[k]), float(forces[k]), 1.0) for k, seed in enumerate(EPISODES)]
+    forces = rng.uniform(5, 40, 50).round(3)
+    return [made_up_outcome(seed, k < won, 150, float(forces[k])) for k, seed in enumerate(EPISODES)]
 
 
 def made_up(folder: Path, name: str, task: str, mode: str, won: int, seeds: int = 2, steps: int = 2) -> Path:

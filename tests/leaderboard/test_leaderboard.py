@@ -71,11 +71,19 @@ def change(folder: Path, edit) -> None:
         (lambda r: r.update(revision=99), "is of revision 99 of .* but the task has revision 1 here; evaluate again"),
         (lambda r: r["versions"].update(sapien="2.2.0"), "run with sapien 2.2.0, the leaderboard takes 3"),
         (lambda r: r["success_once"].update(rate=0.9), "success_once says"),
-        (lambda r: r["episodes"][0].update(length=301), "301 steps, the task ends after 300"),
-        (lambda r: r["episodes"][0].update(success_at_end=True), "succeeds at the end, but never"),
+        (lambda r: r["episodes"][0].update(episode_len=900), "900 steps, the task ends after"),
+        (lambda r: r["episodes"][0].update(success_at_end=True), "success at the end, but never"),
         (lambda r: r["episodes"][0].update(success_once=True, error="no idea"), "with the error no idea"),
         (lambda r: r["episodes"][0].update(peak_contact_force=1e4), "more than the arm can press with"),
-        (lambda r: r.update(mean_length=5.0), "mean_length says 5.0"),
+        (lambda r: r["episodes"][0].update(episode_len=7), "from 3 to 7 steps, but one time limit"),
+        (lambda r: r["episodes"][-1].update(first_success=3), "its first success is at step 3 of 3, with None N"),
+        (
+            lambda r: r["episodes"][0].update(force_until_success=400.0),
+            "400.0 N until its first success",
+        ),
+        (lambda r: r["gentle_success"].update(rate=1.0), "gentle_success says"),
+        (lambda r: r.update(stop_at_success=True), "evaluate without --stop-at-success"),
+        (lambda r: r.update(episode_len=5.0), "episode_len says 5.0"),
         (lambda r: r.update(env_id="ManiFeel-Knitting-v1"), "is no task of this leaderboard"),
     ],
 )
@@ -88,8 +96,8 @@ def test_what_is_wrong_with_a_result_is_said(submission, edit, word):
 def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
     def lie(result):
         for episode in result["episodes"]:
-            episode["length"] = 2
-        result["mean_length"] = 2.0
+            episode["episode_len"] = 2
+        result["episode_len"] = 2.0
 
     change(submission, lie)
     with pytest.raises(SubmissionError, match="length says 2, run again it is 3"):

@@ -30,6 +30,7 @@ from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.conftest import PEG
 from tests.evaluation.policies import STUCK
+from tests.outcomes import made_up
 
 REPOSITORY = Path(__file__).parents[2]
 TASK = json.dumps(dict(render_backend="none", max_episode_steps=3))
@@ -51,7 +52,7 @@ def command_of(args: Args) -> list[str]:
 
 
 def outcome(seed: int) -> EpisodeOutcome:
-    return EpisodeOutcome(seed, seed % 2 == 0, False, 9, 1.5, 2.5)
+    return made_up(seed, seed % 2 == 0, force=1.5)
 
 
 def result(**config) -> dict:
@@ -381,7 +382,7 @@ def test_a18_nan_never_gets_into_a_result(tmp_path):
     path = tmp_path / "result.json"
     for bad in (float("nan"), float("inf"), -float("inf")):
         for broken in (
-            result() | dict(mean_length=bad),
+            result() | dict(episode_len=bad),
             result() | dict(success_once=dict(rate=bad, low=0, high=1)),
             result() | dict(episodes=[result()["episodes"][0] | dict(peak_contact_force=bad)]),
             result(lr=[bad]),

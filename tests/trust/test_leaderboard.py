@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from manifeel_ms3.analysis.protocol import collect
 from manifeel_ms3.errors import FileExistsAlreadyError, InUseError, InvalidFileError
-from manifeel_ms3.evaluation.result import ResultError
+from manifeel_ms3.evaluation.result import ResultError, summary_of
 from manifeel_ms3.leaderboard import untrusted
 from manifeel_ms3.leaderboard.__main__ import Build, Hash, Submit, main
 from manifeel_ms3.leaderboard.checks import check
@@ -313,9 +313,12 @@ def retold(source: Path, target: Path, jitter: float, changed: int) -> None:
     theirs, rng = json.loads(source.read_text()), np.random.default_rng(1)
 
     def edit(result):
-        result |= {name: theirs[name] for name in ("episodes", "success_once", "success_at_end", "mean_length")}
+        result["episodes"] = theirs["episodes"]
         for k, episode in enumerate(result["episodes"]):
-            episode["peak_contact_force"] += float(rng.uniform(0.1, 1) if k < changed else rng.uniform(-jitter, jitter))
+            other = float(rng.uniform(0.1, 1) if k < changed else rng.uniform(-jitter, jitter))
+            episode["peak_contact_force"] += other
+            episode["force_until_success"] = episode["peak_contact_force"] if episode["success_once"] else None
+        result |= summary_of(result["episodes"], result["force_limit"])
 
     change(target, edit)
 
@@ -478,7 +481,7 @@ def test_a17_build_names_a_broken_submission_and_shows_the_others(folder, tmp_pa
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e400", "-1e999"])
-@pytest.mark.parametrize("place", ["peak_contact_force", "inference_ms", "mean_length", "rate", "num_demos"])
+@pytest.mark.parametrize("place", ["peak_contact_force", "inference_ms", "episode_len", "rate", "num_demos"])
 def test_a18_numbers_are_finite(folder, number, place):
     text = (folder / FIRST).read_text()
     (folder / FIRST).write_text(re.sub(rf'"{place}": [\d.]+', f'"{place}": {number}', text, count=1))
@@ -532,8 +535,11 @@ PLACES = {
         ("config", "policy", "encoder", "image"),
         *(("env_kwargs", name) for name in ("cameras", "fit", "obs_mode")),
         ("success_once", "rate"),
-        ("mean_length",),
-        *(("episodes", 3, name) for name in ("seed", "success_once", "length", "peak_contact_force", "inference_ms", "error")),
+        ("episode_len",),
+        *(
+            ("episodes", 3, name)
+            for name in ("seed", "success_once", "first_success", "episode_len", "force_until_success", "error")
+        ),
     ],
 }
 edits = st.sampled_from([(file, place) for file, places in PLACES.items() for place in places])

@@ -9,18 +9,18 @@ from baselines.common.observation import observation_spec
 from baselines.diffusion_policy.train import SPEC
 
 
-def save_tiny_checkpoint(folder: Path) -> Path:
+def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = ()) -> Path:
     """Write it, and return its folder."""
     config = dataclasses.replace(
         SPEC.presets["paper"].args.policy,
-        encoder=EncoderConfig(force_field="small"),
+        encoder=EncoderConfig(image="small_cnn", force_field="small"),
         down_dims=(8, 16),
         diffusion_step_embed_dim=8,
         diffusion_steps=20,
     )
-    observed = dict(obs_mode="tacff", cameras=[], tactile_sensors=["right"], image_size=32)
+    observed = dict(obs_mode=obs_mode, cameras=list(cameras), tactile_sensors=["right"], image_size=32)
     observed |= dict(tactile_image_size=32, pose="quaternion")
-    policy = SPEC.policy_class(config, observation_spec("tacff", (), ("right",), 32), 6)
+    policy = SPEC.policy_class(config, observation_spec(obs_mode, cameras, ("right",), 32), 6)
     about = dict(policy_name=SPEC.name, policy=as_json(config), action_dim=6, inference_steps=20, step=1) | observed
     save_checkpoint(folder, about, policy.state_dict(), {})
     return folder

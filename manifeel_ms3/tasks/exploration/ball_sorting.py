@@ -54,12 +54,13 @@ class BallSortingRewardConfig:
 
 @register_task(
     "ManiFeel-BallSorting-v1",
-    max_episode_steps=400,
+    max_episode_steps=180,
     category="exploration",
     paper_demos=80,
     paper_tables=("II", "III"),
     demo_steps=84,
     revision=2,
+    force_limit=10.0,
 )
 class BallSortingEnv(VisuotactileEnv):
     """Tell a golf ball from a table-tennis ball by touch, and lift it.
@@ -169,12 +170,13 @@ class BallSortingEnv(VisuotactileEnv):
 
 @register_task(
     "ManiFeel-BallSortingDim-v1",
-    max_episode_steps=400,
+    max_episode_steps=180,
     category="exploration",
     paper_demos=80,
     paper_tables=("I", "II", "III"),
     demo_steps=84,
     revision=2,
+    force_limit=10.0,
 )
 class BallSortingDimEnv(BallSortingEnv):
     """BallSorting at 5 % of the light."""

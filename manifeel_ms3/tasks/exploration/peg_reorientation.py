@@ -35,12 +35,13 @@ class PegReorientationRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-PegReorientation-v1",
-    max_episode_steps=300,
+    max_episode_steps=360,
     category="exploration",
     paper_demos=50,
     paper_tables=("I",),
     revision=2,
     demo_steps=139,
+    force_limit=25.0,
 )
 class PegReorientationEnv(InsertionEnv):
     """Turn a tilted peg in the hand against a rim that the camera cannot see, and put it in.
@@ -73,7 +74,7 @@ class PegReorientationEnv(InsertionEnv):
     lift = 0.07
 
     @staticmethod
-    def make_fit(name):
+    def make_fit(fit):
         return reorientation_fit()
 
     def _largest_ranges(self):

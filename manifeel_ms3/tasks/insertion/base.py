@@ -94,7 +94,7 @@ class InsertionEnv(VisuotactileEnv):
         super().__init__(*args, **kwargs)
 
     @staticmethod
-    def make_fit(name: str) -> Fit:
+    def make_fit(fit: str) -> Fit:
         """The shapes of plug and socket in the sizes of that name."""
         raise NotImplementedError
 

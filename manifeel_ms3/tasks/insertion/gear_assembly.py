@@ -36,6 +36,7 @@ class GearRandomization(InsertionRandomization):
     paper_tables=("I", "II", "III"),
     demo_steps=106,
     revision=2,
+    force_limit=25.0,
 )
 class GearAssemblyEnv(InsertionEnv):
     """Put a gear onto its shaft between two others, with which its teeth mesh.

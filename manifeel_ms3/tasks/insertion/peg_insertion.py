@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PegInsertion-v1",
-    max_episode_steps=300,
+    max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=83,
     revision=2,
+    force_limit=28.0,
 )
 class PegInsertionEnv(InsertionEnv):
     """Insert a rectangular peg into a socket.

@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PowerPlugInsertion-v1",
-    max_episode_steps=300,
+    max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=92,
     revision=2,
+    force_limit=24.0,
 )
 class PowerPlugInsertionEnv(InsertionEnv):
     """Insert a NEMA 5-15 plug into a socket that looks up.

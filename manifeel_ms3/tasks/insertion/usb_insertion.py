@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-USBInsertion-v1",
-    max_episode_steps=300,
+    max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=78,
     revision=2,
+    force_limit=30.0,
 )
 class USBInsertionEnv(InsertionEnv):
     """Insert a USB-A plug into a port that looks up.

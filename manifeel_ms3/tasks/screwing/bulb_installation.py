@@ -41,13 +41,14 @@ class BulbRandomization(ScrewingRandomization):
 
 @register_task(
     "ManiFeel-BulbInstallation-v1",
-    max_episode_steps=500,
+    max_episode_steps=820,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
     demo_steps=410,
     revision=2,
+    force_limit=29.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
     """Screw a light bulb into its holder.

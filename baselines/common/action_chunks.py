@@ -1,0 +1,62 @@
+"""What runs beside an episode of a policy that predicts several actions at once: past observations, and the actions to come."""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+from mani_skill.utils import common
+
+from manifeel_ms3.evaluation.policy import Ask, Question
+
+from .observation import ObservationSpec, prepare
+
+
+class ActionChunks:
+    """Executes the actions of a prediction, then asks for the next from the last `obs_horizon` observations.
+
+    This module loads no network, so that a process that simulates starts quickly.
+
+    Args:
+        spec: Observations of the policy.
+        obs_horizon: Number of observations of a prediction.
+        ask: Function that returns the actions (n, A) of a prediction.
+    """
+
+    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask):
+        self.spec, self.obs_horizon, self._ask = spec, obs_horizon, ask
+        self.reset()
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next observation is part of a prediction."""
+        return len(self._actions) < self.obs_horizon
+
+    def reset(self) -> None:
+        """Begin an episode with the seed 0."""
+        self.begin_episode(0)
+
+    def begin_episode(self, seed: int) -> None:
+        """Begin an episode."""
+        self._seed, self._step = seed, 0
+        self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.obs_horizon)
+        self._actions: deque[np.ndarray] = deque()
+
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        """The action (A,) for the observation of an environment with `num_envs=1`."""
+        if self.looks:
+            self._window.append(self._prepared(obs))
+        if not self._actions:
+            window = [self._window[0]] * (self.obs_horizon - len(self._window)) + list(self._window)
+            observation = {key: np.stack([step[key] for step in window]) for key in window[0]}
+            self._actions.extend(self._ask(Question(self._seed, self._step, observation)))
+        self._step += 1
+        return self._actions.popleft().clip(-1.0, 1.0)
+
+    def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
+        prepared = {}
+        for key in self.spec.keys:
+            value: Any = obs
+            for part in key.split("/"):
+                value = value[part]
+            prepared[key] = prepare(key, common.to_numpy(value), self.spec)[0]
+        return prepared

@@ -1,0 +1,31 @@
+"""Gentle success: a task is solved, and no larger force acted on the held object until then than a limit.
+
+The limit of each task is `TaskSpec.force_limit`, twice the median over demonstrations of their largest contact force.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+
+def is_gentle(episode: dict[str, Any], force: float) -> bool:
+    """Whether an episode succeeded, and its contact force had stayed within a limit up to the first success.
+
+    Args:
+        episode: Episode of a result file.
+        force: Largest force allowed, in N.
+    """
+    needed = episode["force_until_success"]  # None without success
+    return needed is not None and needed <= force
+
+
+def success_under_force(episodes: Iterable[dict[str, Any]], forces: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The curve of success against the force allowed: the share of episodes that are gentle under each limit.
+
+    Args:
+        episodes: Episodes of one or several result files.
+        forces: Limits, in N.
+    """
+    episodes = list(episodes)
+    return np.array([np.mean([is_gentle(episode, force) for episode in episodes]) for force in forces])

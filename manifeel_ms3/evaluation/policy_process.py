@@ -1,0 +1,353 @@
+"""One process that holds a policy and answers all episodes in batches, whichever processes simulate them.
+
+    simulating processes                    main process                     policy's process
+    SharedPolicy.act  --- Question --->  PolicyProcess (a thread)  --- batch --->  answer_batches
+                      <--- answer ---                             <--- answers ---
+
+The main process passes questions on, so that it knows which of them a policy that crashes or hangs was busy with. These are
+asked again one by one in a new process, and only the question that ends it alone fails its episode.
+"""
+
+import contextlib
+import multiprocessing
+import pickle
+import signal
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from manifeel_ms3.errors import WorkFailedError
+from manifeel_ms3.workers import end_with_parent
+
+from .policy import Policy, PolicySource, PolicyUnavailableError, Question
+from .rollout import PolicyFault, begin_episode
+
+FIRST_ANSWER = 120.0
+"""Time in s that the first answer of a process may take beyond the usual limit: libraries prepare themselves."""
+ENDED = "the process that holds the policy has ended; run the command again"
+LONGEST_FOLDER = 60
+"""Number of characters of the folder for temporary files beyond which /tmp is used: the path of a socket has 107 at most."""
+LEAST_WAIT = 0.05
+"""Time in s between two looks at a limit."""
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A policy's process has made its policy."""
+
+    make_episode_part: bytes | None
+    """`BatchPolicy.make_episode_part`, pickled, which the main process passes on as it is; None for a policy that answers one
+    episode only."""
+    batch_size: int = 1
+
+
+@dataclass
+class _Caller:
+    """A simulating process."""
+
+    connection: Connection
+    knows_policy: bool = False
+    """Whether it was told what the policy is."""
+    question: Question | None = None
+    """The question that waits for its answer."""
+    asked_at: float = 0.0
+    alone: bool = False
+    """Whether the question must be asked alone, since one of those beside it may have ended the policy's process."""
+
+
+class PolicyProcess:
+    """The policy's process, seen from the main process. It is used as a context, and starts at its beginning.
+
+    Args:
+        source: Place that the policy comes from.
+        answer_timeout: Longest time in s that the policy may take for one batch.
+    """
+
+    def __init__(self, source: PolicySource, answer_timeout: float):
+        self._source, self._timeout = source, answer_timeout
+        short = len(tempfile.gettempdir()) <= LONGEST_FOLDER
+        # only this user may enter it
+        self._folder = tempfile.TemporaryDirectory(prefix="manifeel-", dir=None if short else "/tmp")
+        self.address = str(Path(self._folder.name) / "policy")
+        """Path of the socket at which simulating processes ask."""
+        self._callers: dict[Connection, _Caller] = {}
+        self._busy: list[_Caller] = []
+        self._deadline = 0.0
+        self._ready: Ready | Exception | None = None
+        self._answered, self._begun = 0, 0.0
+        self._end_reading, self._end_writing = multiprocessing.Pipe(duplex=False)
+
+    def __enter__(self) -> "PolicyProcess":
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(self.address)
+        self._listener.listen(128)
+        self._start()
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        with _without_ctrl_c():
+            self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end_writing.send(None)
+        self._thread.join()
+        self._stop()
+        self._folder.cleanup()
+
+    # ---------------------------------------------------------------- the policy's process
+
+    def _start(self) -> None:
+        self._ready, self._answered = None, 0
+        context = multiprocessing.get_context("spawn")
+        self._policy, theirs = context.Pipe()
+        self._process = context.Process(target=answer_batches, args=(self._source, theirs), daemon=True)
+        resource_tracker.ensure_running()  # started together with the process, it would let Ctrl-C through again
+        with _without_ctrl_c():
+            self._process.start()
+        theirs.close()
+
+    def _stop(self) -> int | None:
+        """End the process, and return its exit code."""
+        self._policy.close()
+        self._process.join(LEAST_WAIT)
+        self._process.kill()
+        self._process.join()
+        return self._process.exitcode
+
+    # ---------------------------------------------------------------- the thread
+
+    def _serve(self) -> None:
+        try:
+            self._pass_on()
+        finally:  # callers then know that nobody answers
+            self._listener.close()
+            for connection in self._callers:
+                connection.close()
+
+    def _pass_on(self) -> None:
+        while True:
+            sources = [self._listener, self._end_reading, *self._callers]
+            sources += [self._policy] if self._is_alive else []
+            for source in wait(sources, self._time_left()):
+                if source is self._end_reading:
+                    return
+                if source is self._listener:
+                    self._accept()
+                elif source is self._policy:
+                    self._hear_policy()
+                else:
+                    self._hear_caller(self._callers[source])  # pyright: ignore[reportArgumentType]
+            if self._busy and time.monotonic() > self._deadline:
+                self._process.kill()
+                self._policy_ended(f"no answer within {self._timeout:g} s")
+            self._tell_callers()
+            self._ask_next_batch()
+
+    @property
+    def _is_alive(self) -> bool:
+        """Whether there is a process that loads or holds the policy."""
+        ready = self._ready
+        return ready is None or (isinstance(ready, Ready) and ready.make_episode_part is not None)
+
+    def _time_left(self) -> float | None:
+        return max(self._deadline - time.monotonic(), 0.0) + LEAST_WAIT if self._busy else None
+
+    def _accept(self) -> None:
+        connection = Connection(self._listener.accept()[0].detach())
+        self._callers[connection] = _Caller(connection)
+
+    def _hear_caller(self, caller: _Caller) -> None:
+        try:
+            caller.question, caller.asked_at, caller.alone = caller.connection.recv(), time.monotonic(), False
+        except (EOFError, OSError):  # the process has ended
+            del self._callers[caller.connection]
+            caller.connection.close()
+            caller.question = None
+
+    def _hear_policy(self) -> None:
+        try:
+            message = self._policy.recv()
+        except (EOFError, OSError):
+            self._process.join()
+            self._policy_ended(f"the policy's process ended with exit code {self._process.exitcode}: it crashed")
+            return
+        if self._ready is None:
+            self._ready = message
+            return
+        self._answered += 1
+        busy, self._busy = self._busy, []
+        for caller, answer in zip(busy, message, strict=True):
+            self._reply(caller, answer)
+
+    def _policy_ended(self, reason: str) -> None:
+        """Start the process again; a question that was asked alone fails, others are asked again, alone."""
+        self._stop()
+        if self._ready is None:
+            self._ready = WorkFailedError(f"{reason}, before the policy was loaded; as happens where memory runs out")
+            return
+        busy, self._busy = self._busy, []
+        for caller in busy:
+            if len(busy) == 1:
+                self._reply(caller, PolicyFault(reason))
+            else:
+                caller.alone = True
+        self._start()
+
+    def _reply(self, caller: _Caller, answer: Any) -> None:
+        waited = max(self._begun - caller.asked_at, 0.0)
+        caller.question = None
+        _send(caller.connection, (answer, waited))
+
+    def _tell_callers(self) -> None:
+        """Tell new callers what the policy is, and all who wait if it cannot be loaded any more."""
+        for caller in self._callers.values() if self._ready is not None else ():
+            if not caller.knows_policy:
+                caller.knows_policy = True
+                _send(caller.connection, self._ready)
+            elif caller.question is not None and isinstance(self._ready, Exception):
+                self._reply(caller, self._ready)
+
+    def _ask_next_batch(self) -> None:
+        if self._busy or not isinstance(self._ready, Ready):
+            return
+        waiting = sorted((c for c in self._callers.values() if c.question is not None), key=lambda c: c.asked_at)
+        alone = [caller for caller in waiting if caller.alone][:1]
+        batch = alone or waiting[: self._ready.batch_size]
+        if not batch:
+            return
+        self._busy, self._begun = batch, time.monotonic()
+        self._deadline = self._begun + self._timeout + (0.0 if self._answered else FIRST_ANSWER)
+        _send(self._policy, [caller.question for caller in batch])
+
+
+def _send(connection: Connection, message: Any) -> None:
+    with contextlib.suppress(OSError):  # whoever has ended is noticed where messages are received
+        connection.send(message)
+
+
+@contextlib.contextmanager
+def _without_ctrl_c() -> Iterator[None]:
+    """Processes and threads that start now never see Ctrl-C, which is for the main thread."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+# -------------------------------------------------------------------- in a simulating process
+
+
+class SharedPolicy:
+    """The policy of a `PolicyProcess`, as an episode in this process sees it.
+
+    Args:
+        address: Address of the `PolicyProcess`.
+        make: Makes a policy for this process alone, where the policy answers one episode only.
+
+    Raises:
+        Exception: What the policy raised when it was made.
+    """
+
+    def __init__(self, address: str, make: Callable[[], Policy]):
+        try:
+            connection = socket.socket(socket.AF_UNIX)
+            connection.connect(address)
+            self._connection = Connection(connection.detach())
+            ready: Ready = _raised(self._connection.recv())  # once the policy is loaded
+        except (EOFError, ConnectionError, FileNotFoundError) as error:
+            raise PolicyUnavailableError(ENDED) from error
+        part = ready.make_episode_part
+        self._part: Any = make() if part is None else pickle.loads(part)(self._ask)
+        self.limits_itself = part is not None
+        """Whether the time for an answer is limited elsewhere, so that waiting for other episodes does not count."""
+        self.waited = 0.0
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next action needs the cameras' images."""
+        return getattr(self._part, "looks", True)
+
+    def reset(self) -> None:
+        self._part.reset()
+
+    def begin_episode(self, seed: int) -> None:
+        begin_episode(self._part, seed)
+
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        self.waited = 0.0
+        return self._part.act(obs)
+
+    def _ask(self, question: Question) -> np.ndarray:
+        """The policy's answer to a question.
+
+        Raises:
+            PolicyFault: The policy raised an error, crashed, or did not answer in time.
+            PolicyUnavailableError: The policy cannot be asked any more.
+        """
+        try:
+            self._connection.send(question)
+            answer, self.waited = self._connection.recv()
+        except (EOFError, OSError) as error:
+            raise PolicyUnavailableError(ENDED) from error
+        return _raised(answer)
+
+
+def _raised(message: Any) -> Any:
+    if isinstance(message, Exception):
+        raise message
+    return message
+
+
+# -------------------------------------------------------------------- in the policy's process
+
+
+def answer_batches(source: PolicySource, connection: Connection) -> None:
+    """Make the policy, and answer batches of questions until the other end of the connection is closed.
+
+    Each answer is an array, or the exception that the policy raised.
+    """
+    torch.set_num_threads(1)  # sums, and so the episodes, depend on the number of threads
+    threading.Thread(target=end_with_parent, daemon=True).start()
+    try:
+        policy: Any = source.make()
+    except Exception as error:
+        connection.send(_portable(error))
+        return
+    if not hasattr(policy, "answer"):
+        connection.send(Ready(None))
+        return
+    connection.send(Ready(pickle.dumps(policy.make_episode_part), policy.batch_size))
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            connection.send(_answers(policy, connection.recv()))
+
+
+def _answers(policy: Any, questions: list[Question]) -> list[np.ndarray | Exception]:
+    try:
+        answers = policy.answer(questions)
+        if len(answers) != len(questions):
+            raise PolicyFault(f"it gave {len(answers)} answers to {len(questions)} questions")
+        return list(answers)
+    except Exception as error:  # a policy is anybody's code
+        if len(questions) > 1:
+            return [answer for question in questions for answer in _answers(policy, [question])]
+        known = isinstance(error, PolicyFault | PolicyUnavailableError)
+        return [error if known else PolicyFault(f"{type(error).__name__}: {error}")]
+
+
+def _portable(error: Exception) -> Exception:
+    """The error, or one with its message where the error cannot be sent to another process."""
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:
+        return WorkFailedError(f"the policy cannot be made ({type(error).__name__}: {error})")

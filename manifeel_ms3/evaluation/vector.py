@@ -1,0 +1,66 @@
+"""Vectorised environments for evaluation, made as ManiSkill's baselines make theirs (`make_eval_envs`)."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from mani_skill.utils.wrappers import CPUGymWrapper, FrameStack, RecordEpisode
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+from manifeel_ms3.tasks.registry import make_env, task_spec
+
+Wrapper = Callable[[gym.Env], gym.Env]
+
+
+def make_eval_envs(
+    env_id: str,
+    num_envs: int,
+    sim_backend: str = "physx_cpu",
+    env_kwargs: dict[str, Any] | None = None,
+    other_kwargs: dict[str, Any] | None = None,
+    video_dir: str | Path | None = None,
+    wrappers: Sequence[Wrapper] = (),
+) -> VectorEnv | ManiSkillVectorEnv:
+    """Environments that run to the time limit, and whose `info["final_info"]["episode"]` holds ManiSkill's metrics.
+
+    The arguments are those of `make_eval_envs` of ManiSkill's baselines.
+
+    Args:
+        env_id: Id of the task.
+        num_envs: Number of environments. On the CPU each has a process of its own, which is spawned, since a renderer does
+            not survive a fork; a script then needs `if __name__ == "__main__":`.
+        sim_backend: Backend of the simulation, "physx_cpu" or "physx_cuda".
+        env_kwargs: Arguments of `gym.make`.
+        other_kwargs: `obs_horizon`, the number of observations that are stacked by ManiSkill's `FrameStack`, which takes flat
+            observations only (`obs_mode="state"`, or a wrapper that flattens); they are not stacked if not given.
+        video_dir: Folder of videos of the first environment, which then needs `render_mode="rgb_array"`; none if not given.
+        wrappers: Wrappers that are applied first; they must be picklable on the CPU.
+    """
+    env_id, kwargs = task_spec(env_id).env_id, env_kwargs or {}
+    horizon = (other_kwargs or {}).get("obs_horizon")
+    wrappers = [*wrappers, *([partial(FrameStack, num_stack=horizon)] if horizon else [])]
+    if sim_backend == "physx_cpu":
+        made = [
+            partial(_make_on_cpu, env_id, kwargs, wrappers, str(video_dir) if video_dir and index == 0 else None)
+            for index in range(num_envs)
+        ]
+        return SyncVectorEnv(made) if num_envs == 1 else AsyncVectorEnv(made, context="spawn")
+    env = make_env(env_id, num_envs=num_envs, sim_backend=sim_backend, reconfiguration_freq=1, **kwargs)
+    env = _wrapped(env, wrappers, video_dir and str(video_dir))
+    return ManiSkillVectorEnv(env, ignore_terminations=True, record_metrics=True)
+
+
+def _make_on_cpu(env_id: str, env_kwargs: dict[str, Any], wrappers: Sequence[Wrapper], video_dir: str | None) -> gym.Env:
+    env = make_env(env_id, sim_backend="physx_cpu", reconfiguration_freq=1, **env_kwargs)
+    return CPUGymWrapper(_wrapped(env, wrappers, video_dir), ignore_terminations=True, record_metrics=True)
+
+
+def _wrapped(env: gym.Env, wrappers: Sequence[Wrapper], video_dir: str | None) -> gym.Env:
+    for wrapper in wrappers:
+        env = wrapper(env)
+    if video_dir:
+        env = RecordEpisode(env, output_dir=video_dir, save_trajectory=False, info_on_video=True)
+    return env

@@ -1,0 +1,76 @@
+"""Policies that answer several episodes at once, good and bad; the policy's process imports them by name."""
+
+import os
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from manifeel_ms3.evaluation.policy import PolicySource, Question
+
+FINE, RAISES, CRASHES, HANGS, MISCOUNTS = 10, 20, 30, 40, 50
+"""Seeds of episodes from each of which on the policy behaves so."""
+
+
+class Part:
+    """Asks at every step."""
+
+    def __init__(self, ask):
+        self.ask = ask
+
+    def begin_episode(self, seed):
+        self.seed, self.step = seed, 0
+
+    def act(self, obs):
+        self.step += 1
+        return self.ask(Question(self.seed, self.step - 1, dict(pose=np.array([self.step]))))
+
+
+class Moody:
+    """Answers with seed, step and the number of questions beside it; what it does depends on the seed."""
+
+    make_episode_part = Part
+    batch_size = 4
+
+    def answer(self, questions):
+        seeds = [question.seed // 10 * 10 for question in questions]
+        if RAISES in seeds:
+            raise RuntimeError("out of ideas")
+        if CRASHES in seeds:
+            os._exit(7)
+        if HANGS in seeds:
+            time.sleep(1000)
+        time.sleep(0.2)  # so that questions gather
+        answers = [np.array([question.seed, question.step, len(questions)]) for question in questions]
+        return answers[1:] if MISCOUNTS in seeds else answers
+
+
+class Single:
+    def reset(self):
+        pass
+
+    def act(self, obs):
+        return np.zeros(6)
+
+
+class CannotBeMade:
+    def __init__(self):
+        raise OSError("no weights")
+
+
+class DiesWhenMade:
+    def __init__(self):
+        os._exit(9)
+
+
+@dataclass(frozen=True)
+class SharedSource(PolicySource):
+    """A policy of this module, of which one object answers all episodes."""
+
+    @property
+    def is_shared(self):
+        return True
+
+
+def source_of(policy: type) -> SharedSource:
+    return SharedSource(policy=f"{__name__}:{policy.__name__}")

@@ -1,0 +1,307 @@
+"""The policy's process: one policy answers all episodes, whatever the others do and whoever simulates them."""
+
+import json
+import logging
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.wrappers import CPUGymWrapper
+
+from baselines.diffusion_policy.train import SPEC
+from manifeel_ms3.errors import MachineError, WorkFailedError
+from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
+from manifeel_ms3.evaluation.evaluate import Args, evaluation_from_args
+from manifeel_ms3.evaluation.policy import PolicyError, PolicySource, PolicyUnavailableError, Question
+from manifeel_ms3.evaluation.policy_process import PolicyProcess, SharedPolicy
+from manifeel_ms3.evaluation.rollout import PolicyFault, evaluate_episode
+from manifeel_ms3.evaluation.vector import make_eval_envs
+from tests.conftest import PEG, needs_renderer
+from tests.evaluation.batch_policies import (
+    CRASHES,
+    FINE,
+    HANGS,
+    MISCOUNTS,
+    RAISES,
+    CannotBeMade,
+    DiesWhenMade,
+    Moody,
+    Single,
+    source_of,
+)
+from tests.trust.test_evaluation import alive, wait_for_episodes
+from tests.trust.tiny_checkpoint import save_tiny_checkpoint
+
+BARE = dict(obs_mode="tacff", render_backend="none", max_episode_steps=6, sim_backend="physx_cpu")
+
+
+def nothing():
+    raise AssertionError("the policy is shared")
+
+
+# ------------------------------------------------------------------------------- the process
+
+
+@pytest.fixture(scope="module")
+def process():
+    with PolicyProcess(source_of(Moody), answer_timeout=2.0) as process:
+        assert answer_to(process, FINE) == [FINE, 0, 1]  # the first answer may take longer than the limit
+        yield process
+
+
+def answer_to(process, seed):
+    policy = SharedPolicy(process.address, nothing)
+    policy.begin_episode(seed)
+    try:
+        return policy.act({}).tolist()
+    except PolicyFault as fault:
+        return str(fault)
+
+
+def answers_to(process, *seeds):
+    """The answers to questions that are asked at the same time."""
+    with ThreadPoolExecutor(len(seeds)) as threads:
+        return list(threads.map(lambda seed: answer_to(process, seed), seeds))
+
+
+def test_questions_of_all_episodes_are_answered_in_batches_each_with_its_own_answer(process):
+    answers = answers_to(process, *range(FINE, FINE + 8))
+    assert [answer[:2] for answer in answers] == [[seed, 0] for seed in range(FINE, FINE + 8)]
+    assert max(answer[2] for answer in answers) > 1
+    assert max(answer[2] for answer in answers) <= Moody.batch_size
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        (RAISES, "RuntimeError: out of ideas"),
+        (MISCOUNTS, "0 answers to 1 questions"),
+        (CRASHES, "exit code 7"),
+        (HANGS, "no answer within 2 s"),
+    ],
+)
+def test_an_episode_that_ends_the_policy_fails_alone(process, bad, reason):
+    answers = answers_to(process, FINE, FINE + 1, bad, FINE + 2)
+    assert [answer[:2] for answer in answers[:2] + answers[3:]] == [[FINE, 0], [FINE + 1, 0], [FINE + 2, 0]]
+    assert reason in answers[2]
+    assert answer_to(process, FINE) == [FINE, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("policy", "kind", "reason"),
+    [(CannotBeMade, PolicyError, "OSError: no weights"), (DiesWhenMade, WorkFailedError, "exit code 9.*before the policy")],
+)
+def test_a_policy_that_cannot_be_made_ends_the_evaluation_with_the_reason(policy, kind, reason):
+    with pytest.raises(kind, match=reason):
+        run_episodes(Evaluation(source_of(policy), PEG, BARE, {}), [1], workers=1)
+
+
+def test_a_policy_that_answers_one_episode_is_made_where_it_is_asked():
+    with PolicyProcess(source_of(Single), 2.0) as process:
+        policies = [SharedPolicy(process.address, Single) for _ in range(2)]
+        assert [policy.act({}).tolist() for policy in policies] == [[0.0] * 6] * 2
+        assert not policies[0].limits_itself
+
+
+def test_whoever_asks_a_process_that_has_ended_is_told():
+    with PolicyProcess(source_of(Moody), 2.0) as process:
+        policy = SharedPolicy(process.address, nothing)
+        policy.begin_episode(FINE)
+    with pytest.raises(PolicyUnavailableError, match="has ended; run the command again"):
+        policy.act({})
+
+
+# ------------------------------------------------------------------------------- what a policy answers
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "00000001")
+
+
+def questions(count: int) -> list[Question]:
+    chance = np.random.default_rng(0)
+    return [
+        Question(
+            100_000 + k,
+            2 * k,
+            {
+                "sensor_data/tactile_right/force_field": chance.random((2, 10, 14, 3), np.float32),
+                "extra/tcp_pose": chance.random((2, 9), np.float32),
+            },
+        )
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize("steps", [20, 4])  # DDPM, which draws noise at every step, and DDIM
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_an_answer_does_not_depend_on_the_questions_beside_it(checkpoint, batch_size, steps):
+    agent, asked = SPEC.load(checkpoint, batch_size=batch_size, inference_steps=steps), questions(6)
+    together = agent.answer(asked)
+    assert len({answer.tobytes() for answer in together}) == 6
+    for order in ([5, 3, 1], [2], [4, 0], [0, 4, 2, 1, 3, 5]):
+        for index, answer in zip(order, agent.answer([asked[index] for index in order]), strict=True):
+            np.testing.assert_array_equal(answer, together[index])
+
+
+def test_batch_sizes_differ_by_rounding_alone(checkpoint):
+    asked = questions(6)
+    answers = [np.stack(SPEC.load(checkpoint, batch_size=size).answer(asked)) for size in (1, 3, 4)]
+    for other in answers[1:]:
+        np.testing.assert_allclose(other, answers[0], atol=1e-5)
+
+
+def test_noise_depends_on_the_seed_of_the_episode_and_on_the_step(checkpoint):
+    agent, (first, *_) = SPEC.load(checkpoint), questions(1)
+    answers = agent.answer([first, replace(first, seed=7), replace(first, step=7), first])
+    assert len({answer.tobytes() for answer in answers}) == 3
+    np.testing.assert_array_equal(answers[0], answers[3])
+
+
+def outcomes_with(checkpoint, workers):
+    source = PolicySource(checkpoint, device="cpu", batch_size=2)
+    outcomes = run_episodes(Evaluation(source, PEG, BARE, {}), [100_000, 100_001, 100_005], workers)
+    return [replace(outcome, inference_ms=0.0) for outcome in outcomes]
+
+
+@pytest.fixture(scope="module")
+def outcomes_with_one_worker(checkpoint):
+    return outcomes_with(checkpoint, 1)
+
+
+@pytest.mark.parametrize("workers", [3, pytest.param(2, marks=pytest.mark.slow)])
+def test_the_number_of_workers_changes_no_outcome(checkpoint, outcomes_with_one_worker, workers):
+    expected = outcomes_with_one_worker
+    assert outcomes_with(checkpoint, workers) == expected
+    assert all(outcome.error is None and outcome.episode_len == 6 for outcome in expected)
+    assert len({outcome.return_ for outcome in expected}) == 3
+
+
+class Watched:
+    """A policy whose actions are written down; it looks always, or when the policy does."""
+
+    def __init__(self, agent, always):
+        self.agent, self.always, self.actions, self.seen = agent, always, [], []
+
+    @property
+    def looks(self):
+        return self.always or self.agent.looks
+
+    def reset(self):
+        self.agent.begin_episode(5)
+
+    def act(self, obs):
+        self.seen.append("wrist" in obs["sensor_data"])
+        self.actions.append(self.agent.act(obs))
+        return self.actions[-1]
+
+
+@needs_renderer
+def test_images_that_the_policy_does_not_look_at_are_not_rendered_and_change_nothing(tmp_path, make_env):
+    agent = SPEC.load(save_tiny_checkpoint(tmp_path / "1", obs_mode="rgb+tacff", cameras=("wrist",)))
+    env = make_env(obs_mode="rgb+tacff", cameras=("wrist",), max_episode_steps=18)
+    always, sometimes = Watched(agent, True), Watched(agent, False)
+    for policy in (always, sometimes):
+        assert evaluate_episode(env, policy, seed=5).error is None
+    np.testing.assert_array_equal(always.actions, sometimes.actions)
+    assert always.seen == [True] * 18
+    # predictions are made at steps 0, 8 and 16 from two observations each
+    assert [step for step, saw in enumerate(sometimes.seen) if saw] == [0, 7, 8, 15, 16]
+    assert "wrist" in env.unwrapped.get_obs()["sensor_data"]
+
+
+# ------------------------------------------------------------------------------- what is evaluated
+
+
+def config_with(checkpoint, tmp_path, **changes):
+    folder = tmp_path / "checkpoint"
+    folder.mkdir()
+    shutil.copy(checkpoint / "model.safetensors", folder)
+    config = json.loads((checkpoint / "config.json").read_text()) | dict(env_id=PEG) | changes
+    (folder / "config.json").write_text(json.dumps(config))
+    return folder
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")
+def test_a_device_that_is_not_there_is_named_before_anything_starts(checkpoint, tmp_path):
+    folder = config_with(checkpoint, tmp_path)
+    assert evaluation_from_args(Args(folder)).source.device == "cpu"
+    with pytest.raises(MachineError, match=r"--device cuda is not there .*give --device cpu"):
+        evaluation_from_args(Args(folder, device="cuda"))
+    with pytest.raises(ValueError, match="'toaster' is no device"):
+        evaluation_from_args(Args(folder, device="toaster"))
+    with pytest.raises(ValueError, match="--batch-size 0 is less than 1"):
+        evaluation_from_args(Args(folder, batch_size=0))
+    with pytest.raises(ValueError, match="--device are for a --checkpoint"):
+        evaluation_from_args(Args(policy="a:B", env_id=PEG, obs_mode="tacff", device="cpu"))
+
+
+def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_otherwise(checkpoint, tmp_path, caplog):
+    trained = dict(fit="tight", lighting="dim", max_episode_steps=999)
+    folder = config_with(checkpoint, tmp_path, env_kwargs=trained)
+    with caplog.at_level(logging.WARNING):
+        evaluation = evaluation_from_args(Args(folder))
+        assert (evaluation.env_kwargs["fit"], evaluation.env_kwargs["lighting"]) == ("tight", "dim")
+        assert "max_episode_steps" not in evaluation.env_kwargs
+        assert not caplog.messages
+        evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "tight", "lighting": "dim"}'))
+    assert evaluation.env_kwargs["fit"] == "tight"
+    assert caplog.messages == ["--env-kwargs: fit is 'tight' here, but 'loose' in the demonstrations of the policy"]
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_an_evaluation_and_the_policys_process_at_once(checkpoint, tmp_path, figure):
+    out, journal = tmp_path / "evaluation.json", tmp_path / "evaluation.episodes.jsonl"
+    kwargs = json.dumps(dict(render_backend="none", max_episode_steps=8))
+    command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--episodes", "40", "--env-kwargs", kwargs]
+    command += ["--checkpoint", str(config_with(checkpoint, tmp_path)), "--out", str(out)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for_episodes(journal, 1)
+    begin = time.monotonic()
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    figure("seconds from Ctrl-C to the end of an evaluation with a policy's process", time.monotonic() - begin, at_most=2.0)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert "episodes are finished and kept in" in errors
+    while alive(process.pid):
+        assert time.monotonic() < begin + 60, "a process is left"
+        time.sleep(0.1)
+
+
+# ------------------------------------------------------------------------------- vectorised environments
+
+
+def test_evaluation_environments_are_made_as_in_maniskills_baselines():
+    kwargs = dict(obs_mode="state", render_backend="none", max_episode_steps=2)
+    envs = make_eval_envs(PEG, 2, env_kwargs=kwargs, other_kwargs=dict(obs_horizon=2))
+    obs, _ = envs.reset(seed=[1, 2])
+    assert obs.shape[:2] == (2, 2)
+    for _ in range(2):
+        *_, truncated, info = envs.step(np.zeros((2, 6), np.float32))
+    envs.close()
+    assert truncated.all()
+    assert info["episode"]["episode_len"].tolist() == [2, 2]
+    assert info["episode"]["success_at_end"].tolist() == [False, False]
+    assert {"success_once", "fail_once", "fail_at_end", "return", "reward"} <= set(info["episode"])
+
+
+@pytest.mark.parametrize("wrappers", [[], [CPUGymWrapper]], ids=["plain", "CPUGymWrapper"])
+def test_gymnasium_makes_a_vector_of_spawned_processes(wrappers):
+    kwargs = dict(obs_mode="tacff", render_backend="none")
+    envs = gym.make_vec(PEG, 2, vectorization_mode="async", vector_kwargs=dict(context="spawn"), wrappers=wrappers, **kwargs)
+    obs, _ = envs.reset(seed=0)
+    assert obs["sensor_data"]["tactile_right"]["force_field"].shape[0] == 2
+    _, rewards, *_ = envs.step(envs.action_space.sample())
+    envs.close()
+    assert np.isfinite(rewards).all()
