@@ -205,7 +205,8 @@ def progress(study: Study, jobs: list[Job], root: Path) -> Group:
     """A table with the numbers of jobs by their status, and one of the jobs that are running."""
     running = [job for job in jobs if is_running(job, root)]
     counts = Table("job", "done", "running", "failed", "all", "CPU hours left")
-    for kind in (kind for kind in KINDS if any(job.kind == kind for job in jobs)):
+    kinds: list[Kind] = [kind for kind in KINDS if any(job.kind == kind for job in jobs)]
+    for kind in kinds:
         counts.add_row(kind, *_counts(study, kind, jobs, running, root))
     names = Table("running", "for, min")
     for job in running[:SHOWN]:

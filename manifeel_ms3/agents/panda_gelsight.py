@@ -23,11 +23,12 @@ from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseControllerConfig
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
-GEL_STIFFNESS = 8000.0
-"""Stiffness of the gel, in N/m per contact point. PhysX averages it with the other body's 0: 4 kN/m acts, which is 0.3 mm at
-20 N on a face (16 points) and 2 mm under a ball (4 points); the gel layer of the touch model gives 0.3 and 1.8 mm."""
-GEL_FRICTION = 1.0
-"""Coulomb's coefficient of the gel."""
+GEL_STIFFNESS = 16000.0
+"""Stiffness of the gel, in N/m per contact point. PhysX averages it with the other body's 0: 8 kN/m acts, which is 0.6 mm at
+20 N on a face."""
+GEL_FRICTION = 0.5
+"""Coulomb's coefficient of the gel (public code of the paper); PhysX averages it with the other body's. A gel's own is higher,
+but PhysX takes the friction of a face at two far corners, with twice the torque of an even pressure (docs/sensor.md)."""
 HOUSING_FRICTION = 0.3
 """Coulomb's coefficient of the fingers' housings."""
 ARM_STIFFNESS, ARM_DAMPING, ARM_FORCE_LIMIT = 1e3, 1e2, 100.0

@@ -14,7 +14,6 @@ the untouched face, x along image rows (across the finger), y along image column
 import hashlib
 import tempfile
 import xml.etree.ElementTree as ET
-from itertools import product
 from pathlib import Path
 
 import fast_simplification
@@ -26,13 +25,6 @@ from manifeel_ms3.paths import cache_dir, writable_cache
 
 FINGER_SIZE = (0.030, 0.023, 0.100)  # m: across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
 GEL_SIZE = (0.024, 0.032, 0.003)  # m: across, along the finger, thick
-GEL_GAP = 0.008
-"""Width, in m, of the cross-shaped gap between the four boxes that a gel collides as.
-
-The engine has one contact point between a sphere and a box, which then spins freely, and takes friction of a face at two of its
-far corners, which hold it with up to twice the torque of an even pressure. Four boxes that bear at about the mean radius of the
-pad hold both as a gel does (docs/sensor.md has the torques). Tuned.
-"""
 GEL_CENTRE = 0.082  # m along the finger: the gel ends 2 mm short of the tip
 HAND_TO_FINGER = 0.0584  # m: hand frame to finger frame, from the Panda's URDF
 HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
@@ -135,8 +127,7 @@ def _replace_finger(link: ET.Element, side: str) -> None:
     _, outward = _FINGERS[side]
     _, deep, long = FINGER_SIZE
     centre = (0.0, outward * (GEL_SIZE[2] + deep / 2), long / 2)
-    _add_box(link, "visual", FINGER_SIZE, centre, colour="0.16 0.16 0.18 1")
-    _add_box(link, "collision", FINGER_SIZE, centre)
+    _add_box(link, FINGER_SIZE, centre, colour="0.16 0.16 0.18 1")
     _add_inertia(link, mass=FINGER_MASS, size=FINGER_SIZE, centre=centre)
 
 
@@ -144,11 +135,7 @@ def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element
     name = f"gel_{side}"
     link = ET.Element("link", name=name)
     centre = (0.0, 0.0, -GEL_SIZE[2] / 2)
-    _add_box(link, "visual", GEL_SIZE, centre, colour="0.75 0.77 0.8 1")
-    width, length = ((size - GEL_GAP) / 2 for size in GEL_SIZE[:2])
-    for across, along in product((-1, 1), (-1, 1)):
-        middle = (across * (width + GEL_GAP) / 2, along * (length + GEL_GAP) / 2, centre[2])
-        _add_box(link, "collision", (width, length, GEL_SIZE[2]), middle)
+    _add_box(link, GEL_SIZE, centre, colour="0.75 0.77 0.8 1")
     _add_inertia(link, mass=GEL_MASS, size=GEL_SIZE, centre=centre)
     joint = ET.Element("joint", name=f"{name}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=finger)
@@ -159,12 +146,13 @@ def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element
     return link, joint
 
 
-def _add_box(link: ET.Element, tag: str, size: tuple, centre: tuple, colour: str = "") -> None:
-    shape = ET.SubElement(link, tag)
-    ET.SubElement(shape, "origin", xyz=_text(centre), rpy="0 0 0")
-    ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_text(size))
-    if colour:
-        ET.SubElement(ET.SubElement(shape, "material", name=link.get("name", "")), "color", rgba=colour)
+def _add_box(link: ET.Element, size: tuple, centre: tuple, colour: str) -> None:
+    for tag in ("visual", "collision"):
+        shape = ET.SubElement(link, tag)
+        ET.SubElement(shape, "origin", xyz=_text(centre), rpy="0 0 0")
+        ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_text(size))
+        if tag == "visual":
+            ET.SubElement(ET.SubElement(shape, "material", name=link.get("name", "")), "color", rgba=colour)
 
 
 def _add_inertia(link: ET.Element, mass: float, size: tuple, centre: tuple) -> None:

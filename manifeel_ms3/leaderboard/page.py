@@ -152,7 +152,6 @@ def _for_page(row: Row) -> dict[str, Any]:
         sensing=condition.obs_mode,
         cameras=", ".join(condition.cameras),
         policy=condition.policy,
-        network=condition.network,
         setup=str(setup_of(condition)),
         encoder=condition.encoder,
         name=about.name,

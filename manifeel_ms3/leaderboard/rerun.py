@@ -283,8 +283,7 @@ def _differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
     for name in COMPARED:
         tolerance = FORCE_TOLERANCE if name in FORCES else 0
         before, now = episode.get(name), again.get(name)
-        unknown = before is None or now is None
-        differs = before is not now if unknown else abs(before - now) > tolerance
+        differs = before is not now if before is None or now is None else abs(before - now) > tolerance
         if differs:
             found.append(f"{name} says {before}, run again it is {now}")
     return found

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import manifeel_ms3  # noqa: F401
 
 GRIP = 20.0  # N, of each pad, on parts that the task itself does not put into the hand
-BALL_INDENTATION, BATTERY_INDENTATION = 2.0e-3, 3.2e-4  # m, under that grip
+BALL_INDENTATION, BATTERY_INDENTATION = 2.5e-3, 6e-4  # m, under that grip
 PUSHER = (0.005, 0.003, 0.001)  # m, half size: it fits between the pads
 PUSHER_SPEED, APPROACH_SPEED, PUSHER_START = 0.012, 0.05, 0.045  # m/s, m/s, m beside the tool
 TURNED, SHIFTED = np.deg2rad(10.0), 2e-3  # rad, m: the push ends where the part has slipped so far

@@ -11,6 +11,7 @@ SETTLE_SECONDS = 0.5
 RAMP_SECONDS = 0.4
 DRAG = 20.0  # N s/m; at rest it does nothing, while PhysX's own damping takes its share of a steady force, too
 TWIST_DRAG = 0.01  # N m s
+FRICTION = 1.5  # of an indenter: with the gel's 0.5 a contact has 1.0, as the sensor assumes
 
 
 def indenter(name: str, rotation: np.ndarray | None = None, **shape):
@@ -19,12 +20,13 @@ def indenter(name: str, rotation: np.ndarray | None = None, **shape):
     def build(env: PadBench) -> list[Actor]:
         builder = env.scene.create_actor_builder()
         pose = sapien.Pose(rotation if rotation is not None else np.eye(4))
+        rough = dict(material=sapien.physx.PhysxMaterial(FRICTION, FRICTION, 0.0))
         if "half_size" in shape:
-            builder.add_box_collision(pose, **shape)
+            builder.add_box_collision(pose, **shape, **rough)
         elif "half_length" in shape:
-            builder.add_cylinder_collision(pose, **shape)
+            builder.add_cylinder_collision(pose, **shape, **rough)
         else:
-            builder.add_sphere_collision(pose, **shape)
+            builder.add_sphere_collision(pose, **shape, **rough)
         builder.set_mass_and_inertia(0.1, sapien.Pose(), [1e-4] * 3)
         builder.initial_pose = sapien.Pose([0, 0, 2])
         return [builder.build(name)]

@@ -19,8 +19,8 @@ START_XYZ = (0.5, 0.0, 0.15)
 """Nominal position of the tool, in m, at the start (public code of the paper)."""
 GRIP_FORCE = 20.0
 """Force of each pad on the plug, in N."""
-GRIP_INDENTATION = 3.2e-4
-"""Indentation of each gel under the grip of 20 N, in m: sixteen contact points of 4 kN/m."""
+GRIP_INDENTATION = 6e-4
+"""Indentation of each gel under the grip of 20 N, in m: four contact points of 8 kN/m."""
 MAX_TILT = np.deg2rad(3.0)
 """Angle, in rad, from the socket's axis below which the plug counts as upright."""
 LOST = 0.03

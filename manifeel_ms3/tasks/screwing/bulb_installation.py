@@ -74,7 +74,7 @@ class BulbInstallationEnv(ScrewingEnv):
 
     Randomization = BulbRandomization
     screw = bulb_and_holder()
-    grip_indentation = 1.3e-3  # m: four contact points of 4 kN/m, 4 mm beside the middle on both axes
+    grip_indentation = 1.5e-3  # m: one contact point of 8 kN/m
     contacts = CONTACTS | dict(
         enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
         contact_offset=4e-5,  # m; without them, what moves further than twice that in a physics step slips through a thread
