@@ -178,7 +178,8 @@ class PolicyAgent:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch warns of shapes in Python, which are always the same here
-                self.policy.unet = torch.jit.optimize_for_inference(torch.jit.trace(network, given[0], check_trace=False))
+                traced: Any = torch.jit.trace(network, given[0], check_trace=False)
+                self.policy.unet = torch.jit.optimize_for_inference(traced)
             # the first calls optimise it further
             same = all(torch.allclose(sample(), expected, rtol=0.0, atol=ROUNDING) for _ in range(TRIAL_STEPS))
         except (RuntimeError, AttributeError):  # not every network can be traced

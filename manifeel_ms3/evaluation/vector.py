@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
@@ -62,5 +62,5 @@ def _wrapped(env: gym.Env, wrappers: Sequence[Wrapper], video_dir: str | None) -
     for wrapper in wrappers:
         env = wrapper(env)
     if video_dir:
-        env = RecordEpisode(env, output_dir=video_dir, save_trajectory=False, info_on_video=True)
+        env = RecordEpisode(cast(Any, env), output_dir=video_dir, save_trajectory=False, info_on_video=True)
     return env
