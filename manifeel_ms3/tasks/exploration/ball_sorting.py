@@ -58,9 +58,9 @@ class BallSortingRewardConfig:
     category="exploration",
     paper_demos=80,
     paper_tables=("II", "III"),
-    demo_steps=84,
+    demo_steps=83,
     revision=2,
-    force_limit=10.0,
+    force_limit=12.0,
 )
 class BallSortingEnv(VisuotactileEnv):
     """Tell a golf ball from a table-tennis ball by touch, and lift it.
@@ -174,9 +174,9 @@ class BallSortingEnv(VisuotactileEnv):
     category="exploration",
     paper_demos=80,
     paper_tables=("I", "II", "III"),
-    demo_steps=84,
+    demo_steps=83,
     revision=2,
-    force_limit=10.0,
+    force_limit=12.0,
 )
 class BallSortingDimEnv(BallSortingEnv):
     """BallSorting at 5 % of the light."""

@@ -54,13 +54,13 @@ class ObjectSearchRewardConfig:
 
 @register_task(
     "ManiFeel-ObjectSearch-v1",
-    max_episode_steps=220,
+    max_episode_steps=160,
     category="exploration",
     paper_demos=50,
     paper_tables=("I", "II", "III"),
-    demo_steps=110,
+    demo_steps=77,
     revision=2,
-    force_limit=11.0,
+    force_limit=8.0,
 )
 class ObjectSearchEnv(VisuotactileEnv):
     """Find a battery in a container that the camera cannot see into, and lift it.

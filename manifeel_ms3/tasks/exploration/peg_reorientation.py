@@ -40,8 +40,8 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     revision=2,
-    demo_steps=139,
-    force_limit=25.0,
+    demo_steps=128,
+    force_limit=38.0,
 )
 class PegReorientationEnv(InsertionEnv):
     """Turn a tilted peg in the hand against a rim that the camera cannot see, and put it in.

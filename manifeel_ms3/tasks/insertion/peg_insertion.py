@@ -12,9 +12,9 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=83,
+    demo_steps=55,
     revision=2,
-    force_limit=28.0,
+    force_limit=36.0,
 )
 class PegInsertionEnv(InsertionEnv):
     """Insert a rectangular peg into a socket.

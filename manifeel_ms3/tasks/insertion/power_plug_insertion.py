@@ -12,9 +12,9 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=92,
+    demo_steps=57,
     revision=2,
-    force_limit=24.0,
+    force_limit=32.0,
 )
 class PowerPlugInsertionEnv(InsertionEnv):
     """Insert a NEMA 5-15 plug into a socket that looks up.

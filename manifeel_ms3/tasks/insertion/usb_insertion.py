@@ -12,9 +12,9 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=78,
+    demo_steps=61,
     revision=2,
-    force_limit=30.0,
+    force_limit=31.0,
 )
 class USBInsertionEnv(InsertionEnv):
     """Insert a USB-A plug into a port that looks up.
