@@ -42,7 +42,7 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     revision=2,
-    demo_steps=139,
+    demo_steps=135,
 )
 class PegReorientationEnv(InsertionEnv):
     """Turn a tilted peg in the hand against a rim that the camera cannot see, and put it in.
