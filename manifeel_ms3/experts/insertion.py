@@ -182,7 +182,7 @@ class InsertionExpert:
                 return
             aside = self._aside(load)
             gently = self._tilt() > config.leaning * config.upright or self._is_on_top() or aside.any()
-            wanted = [0, 0, config.feel_press if gently else config.press_force]
+            wanted = [0, 0, config.feel_press if gently else self._press_force(stuck)]
             move = np.clip(config.compliance * (load - wanted), -config.force_step, config.force_step)
             if aside.any():
                 move[:2] = aside  # against the friction of what it stands on
@@ -192,6 +192,10 @@ class InsertionExpert:
             command, _ = skills.commanded
             facing = self._twisted(stuck) * self._facing(STRAIGHT)
             yield skills.command(command + move, skills.towards(facing, config.turn_rate))
+
+    def _press_force(self, stuck: int) -> float:
+        """Downward force, in N, on a plug that has been stuck for so many steps."""
+        return self.config.press_force
 
     def _is_on_top(self) -> bool:
         """Whether the plug's end has not entered the hole."""

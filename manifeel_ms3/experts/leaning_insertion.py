@@ -18,6 +18,8 @@ class LeaningConfig(InsertionExpertConfig):
     Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
     """
 
+    feel_press: float = 2.0
+    press_force: float = 8.0
     search_radius: float = 0.0012
     """Distance of the second and later landing places from the first, in m. Tuned."""
     search_places: int = 6
@@ -29,9 +31,9 @@ class LeaningConfig(InsertionExpertConfig):
     landed_in_hole: float = 0.0004
     """Depth of the leading corner below the rim, in m, beyond which it is in the hole. Tuned."""
 
-    feel_force: float = 2.5
+    feel_force: float = 1.8
     """Force on the plug, in N, that is a wall if the plug no longer moves: friction pushes back, too. Tuned."""
-    wall_force: float = 7.0
+    wall_force: float = 4.5
     """Force on the plug, in N, that is a wall in any case. Tuned."""
     feel_step: float = 6e-4
     """Step towards the walls, in m per step. Tuned."""
@@ -42,7 +44,7 @@ class LeaningConfig(InsertionExpertConfig):
 
     stand_up_steps: int = 30
     """Number of steps for each of the two rotations that stand the plug up. Tuned."""
-    stand_up_push: tuple[float, float, float] = (4e-4, 4e-4, -5e-4)
+    stand_up_push: tuple[float, float, float] = (3e-4, 3e-4, -3e-4)
     """Offset of the command into the hole's corner while the plug is stood up, in m. Tuned."""
 
 

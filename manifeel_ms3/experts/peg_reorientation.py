@@ -42,11 +42,6 @@ class PegReorientationConfig(LeaningConfig):
     """Height of the peg's end over the rim, in m, to which it is lifted before it moves sideways. Tuned."""
     slipped: float = float(np.deg2rad(4.0))
     """Angle in the hand, in rad, at which a peg outside the hole is turned again. Tuned."""
-    feel_press: float = 2.0
-    feel_force: float = 1.8
-    wall_force: float = 4.5
-    press_force: float = 8.0
-    stand_up_push: tuple[float, float, float] = (3e-4, 3e-4, -3e-4)
     in_hole: float = 0.003
     """Depth of the peg's end in the hole, in m, at which what angle is left turns in the hole. Tuned."""
     straight: float = float(np.deg2rad(0.7))

@@ -25,6 +25,10 @@ class UprightConfig(InsertionExpertConfig):
     """Motion of the plug away from what it stands on, in m per step. Tuned."""
     sure_force: float = 1.5
     """Downward force, in N, from which the place of a contact can be told. Tuned."""
+    unload_every: int = 10
+    """Number of steps between changes of the force on a gear whose teeth stand on others. Tuned."""
+    light_press: float = 1.0
+    """The smaller of these forces, in N. Tuned."""
     centred: float = 0.0008
     """Distance of the contact from the middle, in m, below which it says no direction. Tuned."""
 
@@ -59,9 +63,16 @@ class UprightInsertionExpert(InsertionExpert):
 
 
 class UprightGearExpert(UprightInsertionExpert):
-    """Lowers the bore over the shaft, and turns the gear to and fro until its teeth fall into gaps."""
+    """Lowers the bore over the shaft, and turns the gear to and fro until its teeth fall into gaps.
+
+    Where teeth stand on teeth, it presses less every other time, so that the gear turns over its neighbours instead of with them.
+    """
 
     config = UprightConfig(twist=0.10)  # tuned
+
+    def _press_force(self, stuck: int) -> float:
+        unloaded = stuck // self.config.unload_every % 2 == 1
+        return self.config.light_press if unloaded else self.config.press_force
 
 
 @register_demonstrator("ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1")

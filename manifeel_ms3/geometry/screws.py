@@ -55,7 +55,7 @@ HEX_WEDGES = 12  # two convex pieces for each side of a hexagon
 BOLT_TURN = np.deg2rad(-15)  # so that the threads meet soon after the hand begins to turn
 NUT_GAP, NUT_CREST_GAP, NUT_TURNS, NUT_MOUTH = 1e-4, 2e-4, 2.0, 0.0015  # m; the mouth is below the ridge
 NUT_DESCENT = 1.5  # pitches from the first contact of the threads to the goal
-NUT_TIGHTENING, NUT_SYMMETRY, NUT_GRIP_FORCE = np.deg2rad(40), np.deg2rad(60), 20.0  # rad; rad, of a hexagon; N
+NUT_TIGHTENING, NUT_SYMMETRY, NUT_GRIP_FORCE = np.deg2rad(40), np.deg2rad(60), 27.0  # rad; rad, of a hexagon; N
 NUT_ENGAGED = 0.0018  # m: its middle over the bolt's end, where the ridge's lower end just passes under the end of the crest
 
 

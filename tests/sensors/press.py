@@ -11,7 +11,7 @@ SETTLE_SECONDS = 0.5
 RAMP_SECONDS = 0.4
 DRAG = 20.0  # N s/m; at rest it does nothing, while PhysX's own damping takes its share of a steady force, too
 TWIST_DRAG = 0.01  # N m s
-FRICTION = 1.5  # of an indenter: with the gel's 0.5 a contact has 1.0, as the sensor assumes
+FRICTION = 0.8  # of an indenter: with the gel's 0.5 a contact has 0.65
 
 
 def indenter(name: str, rotation: np.ndarray | None = None, **shape):

@@ -154,7 +154,7 @@ def test_stuck_area_shrinks_as_the_closed_form(ball, figure):
         touching = depth > 0
         stuck = touching & (gel.shear_stiffness * model._bristle[0].norm(dim=-1) < 0.999 * limit)
         off = abs((stuck.sum() / touching.sum()).item() - np.sqrt(1 - share))
-        figure("stuck share of a pressed ball, off the closed form", off, at_most=0.02)
+        figure("stuck share of a pressed ball, off the closed form", off, at_most=0.03)
 
 
 def test_held_shear_does_not_drift_and_unloading_dissipates(ball, figure):

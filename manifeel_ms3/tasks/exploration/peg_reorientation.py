@@ -40,7 +40,7 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     revision=2,
-    demo_steps=128,
+    demo_steps=135,
     force_limit=38.0,
 )
 class PegReorientationEnv(InsertionEnv):

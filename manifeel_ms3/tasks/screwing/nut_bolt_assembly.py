@@ -44,7 +44,7 @@ class NutBoltAssemblyEnv(ScrewingEnv):
     """
 
     screw = nut_and_bolt()
-    grip_indentation = 6e-4  # m: four contact points of 8 kN/m
+    grip_indentation = 8e-4  # m: four contact points of 8 kN/m
 
     def goal_reached(self, measures):
         on = (measures["offset"] < ON_AXIS) & (measures["tilt"] < MAX_TILT)
