@@ -65,7 +65,7 @@ class UprightInsertionExpert(InsertionExpert):
 class UprightGearExpert(UprightInsertionExpert):
     """Lowers the bore over the shaft, and turns the gear to and fro until its teeth fall into gaps.
 
-    Where teeth stand on teeth, it presses less every other time, so that the gear turns over its neighbours instead of with them.
+    Where teeth stand on teeth, it presses less now and then, so that the gear turns over its neighbours instead of with them.
     """
 
     config = UprightConfig(twist=0.10)  # tuned

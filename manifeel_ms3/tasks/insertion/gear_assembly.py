@@ -30,13 +30,13 @@ class GearRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-GearAssembly-v1",
-    max_episode_steps=300,
+    max_episode_steps=430,
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
-    demo_steps=106,
+    demo_steps=138,
     revision=2,
-    force_limit=25.0,
+    force_limit=27.0,
 )
 class GearAssemblyEnv(InsertionEnv):
     """Put a gear onto its shaft between two others, with which its teeth mesh.
