@@ -13,11 +13,8 @@ from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
 
 TASKS = sorted(name for name in all_tasks() if name.startswith("ManiFeel-"))
-SAMPLE_REVISIONS = dict.fromkeys(TASKS, 1)
+SAMPLE_REVISIONS = dict.fromkeys(TASKS, 2)
 """Revision of each task with which its sample was recorded."""
-EPISODES = dict.fromkeys(TASKS, 0) | {"ManiFeel-PegInsertion-v1": 1}
-"""The episode that is replayed. The first one of PegInsertion feels its way along the rim of a hole with 0.04 mm of clearance:
-there the rounding of another processor decides whether the peg enters."""
 FREE_STEPS = 20
 """Steps before the first contact of any sample; until then a replay repeats the recording on every processor."""
 SAME_MOTION = 1e-5
@@ -48,7 +45,7 @@ class Replay:
 @cache
 def replayed(task: str) -> Replay:
     path = data_dir() / "sample" / task / "states.h5"
-    episode = read_header(path)["episodes"][EPISODES[task]]
+    episode = read_header(path)["episodes"][0]
     with h5py.File(path) as file:
         trajectory = file[f"traj_{episode['episode_id']}"]
         actions = trajectory["actions"][()]
