@@ -126,7 +126,7 @@ def test_the_success_under_a_force_counts_the_force_until_the_first_success():
 
 
 TIGHT_LIMIT = 250
-"""Time limit that follows from the demonstrations of the insertion tasks with the tight fit, the longest of which has 163 steps."""
+"""Time limit that follows from the demonstrations of the insertion tasks with the tight fit; the longest has 163 steps."""
 
 
 @pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
