@@ -54,6 +54,8 @@ class InsertionExpertConfig:
     """Largest step under force, along each axis, in m. Tuned."""
     press_steps: int = 10_000
     """Number of steps after which pressing ends: more than any episode has."""
+    keeps_hand: bool = False
+    """Whether the hand keeps its orientation while it presses, instead of following a plug that slips in it."""
     progress: float = 1e-4
     """Descent, in m, that counts as progress. Tuned."""
     patience: int = 15
@@ -97,6 +99,7 @@ class InsertionExpert:
         self._end = np.array([0.0, 0.0, env.fit.reach])
         self._rim = self.socket[2] + env.fit.rim
         self._disturbance, self._disturbed_steps = np.zeros(6), 0
+        self._kept: Rotation | None = None  # orientation that the hand keeps while it presses
 
     def _see_socket(self) -> None:
         """Perceive the socket's position, with a new error."""
@@ -125,6 +128,9 @@ class InsertionExpert:
         return tool + facing.apply(position + rotation.apply(point))
 
     def _facing(self, lean: Rotation) -> Rotation:
+        """Orientation of the hand for a lean of the plug."""
+        if self._kept is not None:
+            return lean * self._kept
         return self._tool_for(np.zeros(3), np.zeros(3), lean)[1]
 
     def _tilt(self, upright: Rotation = STRAIGHT) -> float:
@@ -144,7 +150,9 @@ class InsertionExpert:
         self.skills.tare()
         while True:
             yield from self._enter()
+            self._kept = self._facing(STRAIGHT) if self.config.keeps_hand else None
             yield from self._press()
+            self._kept = None
             here, facing = self.skills.commanded
             yield from self.skills.reach(above(here, self.config.hover_height), facing, tolerance=self.config.return_tolerance)
             self._see_socket()

@@ -19,6 +19,7 @@ class UprightConfig(InsertionExpertConfig):
     Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
     """
 
+    keeps_hand: bool = True
     lowering: float = 0.003
     """Depth below the rim, in m, down to which the plug is lowered at a steady pace where nothing stops it. Tuned."""
     slide: float = 3e-4
@@ -68,7 +69,7 @@ class UprightGearExpert(UprightInsertionExpert):
     Where teeth stand on teeth, it presses less now and then, so that the gear turns over its neighbours instead of with them.
     """
 
-    config = UprightConfig(twist=0.10)  # tuned
+    config = UprightConfig(twist=0.10, press_force=6.0)  # tuned
 
     def _press_force(self, stuck: int) -> float:
         unloaded = stuck // self.config.unload_every % 2 == 1
