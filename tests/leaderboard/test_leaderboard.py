@@ -68,7 +68,7 @@ def change(folder: Path, edit) -> None:
     [
         (lambda r: r["episodes"].pop(), "its 49 episodes are not those of the 50"),
         (lambda r: r["episodes"][3].update(seed=7), r"foreign \[7\]"),
-        (lambda r: r.update(revision=99), "is of revision 99 of .* but the task has revision 1 here; evaluate again"),
+        (lambda r: r.update(revision=99), "is of revision 99 of .* but the task has revision 2 here; evaluate again"),
         (lambda r: r["versions"].update(sapien="2.2.0"), "run with sapien 2.2.0, the leaderboard takes 3"),
         (lambda r: r["success_once"].update(rate=0.9), "success_once says"),
         (lambda r: r["episodes"][0].update(episode_len=900), "900 steps, the task ends after"),
@@ -100,7 +100,7 @@ def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
         result["episode_len"] = 2.0
 
     change(submission, lie)
-    with pytest.raises(SubmissionError, match="length says 2, run again it is 3"):
+    with pytest.raises(SubmissionError, match="episode_len says 2, run again it is 3"):
         submit(submission, tmp_path / "board", rerun=1)
     assert not (tmp_path / "board").exists()
 
