@@ -30,7 +30,7 @@ class GearRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-GearAssembly-v1",
-    max_episode_steps=430,
+    max_episode_steps=400,
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
