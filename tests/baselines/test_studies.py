@@ -296,7 +296,7 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
 
 
 def test_what_fails_is_told_and_tried_again(study, tmp_path):
-    study.write_text(TINY.replace("steps: 12", "steps: 12, image-size: -1, policy.encoder.force-field: nonsense"))
+    study.write_text(TINY.replace("steps: 12", "steps: 12, policy.encoder.force-field: nonsense"))
     record, train, _ = jobs_of(read_study(study))
     root = tmp_path / "study"
     (record.folder(root)).mkdir(parents=True)

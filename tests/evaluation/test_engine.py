@@ -136,7 +136,7 @@ def questions(count: int) -> list[Question]:
             2 * k,
             {
                 "sensor_data/tactile_right/force_field": chance.random((2, 10, 14, 3), np.float32),
-                "extra/tcp_pose": chance.random((2, 9), np.float32),
+                "extra/tcp_pose": chance.random((2, 7), np.float32),
             },
         )
         for k in range(count)
@@ -254,9 +254,9 @@ def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_oth
         assert (evaluation.env_kwargs["fit"], evaluation.env_kwargs["lighting"]) == ("tight", "dim")
         assert "max_episode_steps" not in evaluation.env_kwargs
         assert not caplog.messages
-        evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "tight", "lighting": "dim"}'))
-    assert evaluation.env_kwargs["fit"] == "tight"
-    assert caplog.messages == ["--env-kwargs: fit is 'tight' here, but 'loose' in the demonstrations of the policy"]
+        evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "paper", "lighting": "dim"}'))
+    assert evaluation.env_kwargs["fit"] == "paper"
+    assert caplog.messages == ["--env-kwargs: fit is 'paper' here, but 'tight' in the demonstrations of the policy"]
 
 
 @pytest.mark.slow

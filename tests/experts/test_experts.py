@@ -54,7 +54,7 @@ def test_every_expert_succeeds_gently(make_env, task):
 @pytest.mark.parametrize(
     ("task", "variant"),
     [
-        ("ManiFeel-BallSorting-v1", dict(goal="bowls")),
+        ("ManiFeel-BallSorting-v1", dict(goal="bowls", max_episode_steps=400)),
         ("ManiFeel-BulbInstallation-v1", dict(start="holder")),
         ("ManiFeel-GearAssembly-v1", dict(randomization=dict(base_yaw=0.3))),
     ],

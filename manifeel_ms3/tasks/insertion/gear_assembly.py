@@ -30,11 +30,11 @@ class GearRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-GearAssembly-v1",
-    max_episode_steps=400,
+    max_episode_steps=390,
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
-    demo_steps=138,
+    demo_steps=131,
     revision=2,
     force_limit=27.0,
 )

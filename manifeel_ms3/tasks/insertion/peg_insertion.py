@@ -12,7 +12,7 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=55,
+    demo_steps=57,
     revision=2,
     force_limit=36.0,
 )

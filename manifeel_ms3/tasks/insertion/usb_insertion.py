@@ -12,7 +12,7 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=61,
+    demo_steps=60,
     revision=2,
     force_limit=31.0,
 )

@@ -41,12 +41,12 @@ class BulbRandomization(ScrewingRandomization):
 
 @register_task(
     "ManiFeel-BulbInstallation-v1",
-    max_episode_steps=820,
+    max_episode_steps=890,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
-    demo_steps=410,
+    demo_steps=444,
     revision=2,
     force_limit=29.0,
 )
