@@ -395,7 +395,7 @@ def test_a18_nan_never_gets_into_a_result(tmp_path):
                 read_result(path)
             path.unlink()
     path.write_text(json.dumps(result()).replace("1.5", "1e999"))
-    with pytest.raises(ResultError, match="episodes/0/(peak_contact_force|force_until_success)"):
+    with pytest.raises(ResultError, match=r"episodes/0/(peak_contact_force|force_until_success)"):
         read_result(path)
     for kwargs in ('{"gain": NaN}', '{"gain": 1e999}'):
         with pytest.raises(ResultError, match="config/policy_kwargs/gain"):
