@@ -130,6 +130,7 @@ def test_only_the_last_checkpoints_are_kept(run, tmp_path):
     assert kept == ["00000012", "00000016", "00000020", "last"]
 
 
+@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
 def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
@@ -146,6 +147,7 @@ def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkey
     assert log_of(tmp_path) == log_of(run.args.run_dir)
 
 
+@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
 def test_the_seed_fixes_everything(run, tmp_path):
     losses = []
     for name, seed in (("first", 0), ("same", 0), ("other", 1)):
