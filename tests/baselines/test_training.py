@@ -28,6 +28,8 @@ from tests.conftest import PEG
 
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
 POLICIES["consistency"] = (flow, dict(consistency=True))
+QUICK = ["diffusion", "flow", "consistency", pytest.param("equivariant", marks=pytest.mark.slow)]
+"""All policies; the equivariant one, whose convolutions are slow on a CPU, in the slow run."""
 
 
 @dataclasses.dataclass
@@ -130,7 +132,7 @@ def test_only_the_last_checkpoints_are_kept(run, tmp_path):
     assert kept == ["00000012", "00000016", "00000020", "last"]
 
 
-@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("run", QUICK, indirect=True)
 def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
@@ -147,7 +149,7 @@ def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkey
     assert log_of(tmp_path) == log_of(run.args.run_dir)
 
 
-@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("run", QUICK, indirect=True)
 def test_the_seed_fixes_everything(run, tmp_path):
     losses = []
     for name, seed in (("first", 0), ("same", 0), ("other", 1)):
@@ -173,7 +175,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_pat
     assert all(torch.isfinite(tensor).all() for path in weights for tensor in read_tensors(path).values())
 
 
-@pytest.mark.parametrize("run", ["diffusion", pytest.param("equivariant", marks=pytest.mark.slow)], indirect=True)
+@pytest.mark.parametrize("run", QUICK, indirect=True)
 def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
     run.again(run_dir=tmp_path, precision="bf16")
     for half, full in zip(log_of(tmp_path), log_of(run.args.run_dir), strict=True):
