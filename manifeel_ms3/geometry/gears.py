@@ -7,7 +7,7 @@ import numpy as np
 
 from .fits import Fit, Lead
 from .materials import ABS, ALUMINIUM
-from .part import Box, Cylinder, Hulls, Part, Piece, extruded, ring_of_wedges
+from .part import Box, Cylinder, Hulls, Part, Piece, extruded, lofted, ring_of_wedges
 
 MODULE = 0.002  # m: pitch diameter per tooth
 PRESSURE_ANGLE = np.deg2rad(20.0)
@@ -153,5 +153,5 @@ def _shaft(sizes: ShaftSizes, x: float) -> list[Piece]:
         return [cylinder]
     angles = 2 * np.pi * np.arange(TIP_POINTS) / TIP_POINTS
     circle, top = np.c_[np.cos(angles), np.sin(angles)], BASE_SIZE[2] + SHAFT_HEIGHT
-    rings = [(sizes.shaft, top - cut), (sizes.tip, top)]
-    return [cylinder, Hulls((np.concatenate([np.c_[r * circle + (x, 0.0), np.full(TIP_POINTS, z)] for r, z in rings]),))]
+    rings = [(radius * circle + (x, 0.0), z) for radius, z in ((sizes.shaft, top - cut), (sizes.tip, top))]
+    return [cylinder, Hulls((lofted(rings),))]

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -172,9 +172,14 @@ class Part:
         return actor
 
 
+def lofted(sections: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
+    """Points (m, 3) of several outlines (n, 2), each at its height; all in m."""
+    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for outline, z in sections])
+
+
 def extruded(outline: np.ndarray, bottom: float, top: float) -> np.ndarray:
     """Points (2 n, 3) of an outline (n, 2) at two heights."""
-    return np.concatenate([np.c_[outline, np.full(len(outline), z)] for z in (bottom, top)])
+    return lofted([(outline, bottom), (outline, top)])
 
 
 def ring_of_wedges(
@@ -198,13 +203,15 @@ def ring_of_wedges(
     return wedges
 
 
-def bevelled_box(box: Box, bevels: dict[str, float]) -> Hulls:
-    """Box whose upper edges on some sides are cut off at 45 degrees.
+def bevelled_box(box: Box, bevels: dict[str, float]) -> Box | Hulls:
+    """Box whose upper edges on some sides are cut off at 45 degrees; the box itself if no cut has a width.
 
     Args:
         box: The whole box.
         bevels: Width of the cut, in m, by side: "-x", "+x", "-y" or "+y".
     """
+    if not any(bevels.values()):
+        return box
     low, high = np.array(box.centre) - np.array(box.size) / 2, np.array(box.centre) + np.array(box.size) / 2
     shift = np.array([[bevels.get("-x", 0.0), bevels.get("-y", 0.0)], [-bevels.get("+x", 0.0), -bevels.get("+y", 0.0)]])
     corners = np.array([low[:2], high[:2]])
@@ -236,7 +243,7 @@ def block_with_holes(outer: tuple[float, float], depth: float, holes: Holes, bot
 
 def block_with_chamfered_holes(
     outer: tuple[float, float], depth: float, holes: Holes, bottom: float, chamfer: float
-) -> tuple[Hulls, ...]:
+) -> tuple[Box | Hulls, ...]:
     """Convex pieces of a slab as `block_with_holes` makes it, each hole with a chamfer of 45 degrees around its upper mouth.
 
     Args:
@@ -244,7 +251,7 @@ def block_with_chamfered_holes(
         depth: Size along z, in m.
         holes: The holes.
         bottom: Height of the underside, in m.
-        chamfer: Width of the chamfer, in m.
+        chamfer: Width of the chamfer, in m; 0 for none.
 
     Raises:
         ValueError: Holes overlap or reach beyond the slab.

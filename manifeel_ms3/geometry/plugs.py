@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from . import materials
 from .fits import Fit, Lead
-from .part import Box, Holes, Part, block_with_chamfered_holes, block_with_holes
+from .part import Box, Part, block_with_chamfered_holes, block_with_holes
 
 BRASS, PLASTIC = (0.80, 0.62, 0.20), (0.25, 0.35, 0.55)
 
@@ -42,11 +42,7 @@ def peg_fit(fit: str = "paper") -> Fit:
     """
     socket = PEG_SOCKETS[fit]
     side, floor = socket.plate
-    holes: Holes = [(socket.hole, (0.0, 0.0))]
-    if socket.chamfer:
-        block = block_with_chamfered_holes(PEG_BLOCK, socket.depth, holes, floor, socket.chamfer)
-    else:
-        block = block_with_holes(PEG_BLOCK, socket.depth, holes, floor)
+    block = block_with_chamfered_holes(PEG_BLOCK, socket.depth, [(socket.hole, (0.0, 0.0))], floor, socket.chamfer)
     plate = (Box((side, side, floor), (0.0, 0.0, floor / 2)),) if floor else ()
     half_hole = (socket.hole[0] / 2, socket.hole[1] / 2)
     return Fit(

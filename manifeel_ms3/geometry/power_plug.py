@@ -6,7 +6,7 @@ import numpy as np
 
 from . import materials
 from .fits import Fit, Lead
-from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, block_with_holes
+from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
 METAL, BRASS, DARK, WHITE = (0.72, 0.74, 0.78), (0.80, 0.62, 0.20), (0.14, 0.14, 0.16), (0.85, 0.85, 0.82)
 ARC_POINTS = 8
@@ -140,8 +140,7 @@ def _ground_pin(sizes: PowerPlugSizes, bottom: float) -> Piece:
 
 def _prong(levels: list[tuple[np.ndarray, float]], place: tuple[float, float], bottom: float) -> Hulls:
     """Convex prong through sections (n, 2) at heights over `bottom`."""
-    points = [np.c_[section + place, np.full(len(section), bottom + z)] for section, z in levels]
-    return Hulls((np.concatenate(points),))
+    return Hulls((lofted([(section + place, bottom + z) for section, z in levels]),))
 
 
 def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
@@ -150,7 +149,5 @@ def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
     at, middle = -sizes.offset / 2, rim - sizes.depth / 2
     holes: Holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]
     bar = Box((x + 2 * sizes.chamfer, sizes.spacing - y, sizes.depth), (at, 0.0, middle))
-    if not sizes.chamfer:
-        return (*block_with_holes(sizes.block[:2], sizes.depth, holes, rim - sizes.depth), bar)
     slab = block_with_chamfered_holes(sizes.block[:2], sizes.depth, holes, rim - sizes.depth, sizes.chamfer)
     return (*slab, bevelled_box(bar, {"-y": sizes.chamfer, "+y": sizes.chamfer}))
