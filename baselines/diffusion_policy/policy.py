@@ -45,7 +45,7 @@ class DiffusionPolicy(VisuotactilePolicy):
         """The mean squared error of the predicted noise or clean actions."""
         noise = torch.randn_like(clean)
         step: Any = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
-        predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
+        predicted = self.action_network(self.ddpm.add_noise(clean, noise, step), step, condition)
         return F.mse_loss(predicted, noise if self.config.prediction == "epsilon" else clean)
 
     def generate(self, condition, steps, generators):
@@ -54,7 +54,7 @@ class DiffusionPolicy(VisuotactilePolicy):
         scheduler: Any = self.ddpm if full else self.ddim
         scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
         for step in scheduler.timesteps:
-            predicted = self.unet(actions, step.expand(len(actions)), condition)
+            predicted = self.action_network(actions, step.expand(len(actions)), condition)
             extra = dict(generator=generators) if full else {}
             actions = scheduler.step(predicted, step, actions, **extra).prev_sample
         return actions

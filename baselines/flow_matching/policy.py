@@ -54,7 +54,7 @@ class FlowMatchingPolicy(VisuotactilePolicy):
 
     def velocity(self, x: torch.Tensor, time: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The velocity (B, T, A) at points x (B, T, A) and times (B,) in [0, 1]."""
-        predicted = self.unet(x, self.time_scale * time, condition)
+        predicted = self.action_network(x, self.time_scale * time, condition)
         if self.config.prediction == "velocity":
             return predicted
         return (predicted - x) / _column((1 - time).clamp(min=self.config.interval))
@@ -63,7 +63,7 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         noise, time = torch.randn_like(clean), torch.rand(len(clean), device=clean.device)
         if self.config.consistency:
             return self._consistency_loss(noise, clean, time, condition)
-        predicted = self.unet(_between(noise, clean, time), self.time_scale * time, condition)
+        predicted = self.action_network(_between(noise, clean, time), self.time_scale * time, condition)
         return F.mse_loss(predicted, clean - noise if self.config.prediction == "velocity" else clean)
 
     def _consistency_loss(self, noise, clean, time, condition):
