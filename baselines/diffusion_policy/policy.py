@@ -5,8 +5,6 @@ from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
 from baselines.common.observation import ObservationSpec
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy
@@ -32,6 +30,9 @@ class DiffusionPolicy(VisuotactilePolicy):
     config: DiffusionConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
+        from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # here, because it takes seconds
+        from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+
         super().__init__(config, spec, action_dim)
         schedule: dict[str, Any] = dict(
             num_train_timesteps=config.diffusion_steps,
