@@ -1,6 +1,7 @@
 """The renderer that this process can use, and what to do where it has none."""
 
 import functools
+import gc
 import os
 
 import sapien
@@ -20,6 +21,9 @@ FORKED = (
     "obs_mode='state' or 'tacff'."
 )
 _IMPORTED_IN = os.getpid()
+os.register_at_fork(after_in_child=gc.freeze)
+# what a forked process inherits is never collected there: to destroy the parent's Vulkan objects, it would wait for ever for
+# their driver's threads, which a fork loses
 _renders_in: int | None = None
 """Id of the process whose renderer this is; a fork copies this answer, but not the renderer."""
 

@@ -3,12 +3,15 @@
 # pyright: reportArgumentType=false
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 import sapien
 import torch
+from gymnasium.envs.registration import EnvSpec
 from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 
 from manifeel_ms3.agents import PandaGelSight
@@ -17,10 +20,12 @@ from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.geometry import Box, Part
 from manifeel_ms3.sensors import gelsight_r15, with_options
 
-from .checks import check_num_envs, check_seed, checked_randomization
+from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
+from .registry import gym_id
 from .rendering import FORKED, NO_RENDERER, available_render_backend, renderer_lost, use_one_thread_after_fork
 from .sensing import SensingEnv
+from .states import unflattened
 from .viewpoints import looking_at, looking_down
 
 CONTROL_FREQ = 10
@@ -75,6 +80,8 @@ class VisuotactileEnv(SensingEnv):
         cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
         tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
         tactile: Fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+        sensor_configs: ManiSkill's: fields to change of one sensor, by its name, or of every camera. Pads are sensors, too:
+            `dict(width=128, wrist=dict(fov=1.2), tactile_right={"optics.noise": 2.0})`.
         lighting: "normal" or "dim" (5 %).
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
@@ -105,6 +112,7 @@ class VisuotactileEnv(SensingEnv):
     side_camera_at = (0.5, -0.17, 0.17)
     """Position of the side camera, in m (public code of the paper)."""
     agent: PandaGelSight
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -116,6 +124,7 @@ class VisuotactileEnv(SensingEnv):
         cameras: Iterable[str] | None = None,
         tactile_sensors: Iterable[str] = ("right",),
         tactile: Mapping[str, Any] | None = None,
+        sensor_configs: Mapping[str, Any] | None = None,
         lighting: str = "normal",
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
@@ -125,9 +134,10 @@ class VisuotactileEnv(SensingEnv):
         self._full_obs_mode = obs_mode or "state"
         self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
         self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
+        pads = {f"tactile_{side}": gelsight_r15(f"tactile_{side}", f"gel_{side}") for side in self._sides}
+        camera_configs, pad_options = split_sensor_configs(sensor_configs or {}, self._camera_names, pads)
         self._tactile_configs = {
-            f"tactile_{side}": with_options(gelsight_r15(f"tactile_{side}", f"gel_{side}"), tactile or {})
-            for side in self._sides
+            name: with_options(with_options(pad, tactile or {}), pad_options.get(name, {})) for name, pad in pads.items()
         }
         self._lighting = one_of("lighting", lighting, LIGHTING)
         one_of("occlusion", occlusion, (None, False, True))
@@ -149,6 +159,7 @@ class VisuotactileEnv(SensingEnv):
             control_mode=control_mode or self.default_control_mode,
             robot_uids=robot_uids,
             render_backend=backend,
+            sensor_configs=camera_configs,
             **kwargs,
         )
 
@@ -161,6 +172,15 @@ class VisuotactileEnv(SensingEnv):
     @property
     def obs_mode(self) -> str:
         return self._full_obs_mode
+
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Specification of gymnasium. Its id names the module to import, for ManiSkill's tools, which make it from a file."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = replace(spec, id=gym_id(spec.id, type(self))) if spec and ":" not in spec.id else spec
 
     # ---------------------------------------------------------------- for tasks to define
 
@@ -318,6 +338,10 @@ class VisuotactileEnv(SensingEnv):
         if "controller" in state:
             self.agent.set_controller_state(state["controller"])
         self._touch_is_fresh, self._measured = False, None
+
+    def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
+        """Set the state from the vectors (N, D) of `get_state`, which hold the controller's targets, too."""
+        self.set_state_dict(unflattened(common.to_tensor(state, self.device), self._init_raw_state), env_idx)
 
     def evaluate(self) -> dict:
         measures, self._measured = self._measured or self.measure(), None
