@@ -20,6 +20,8 @@ import fast_simplification
 import numpy as np
 import trimesh
 from mani_skill import PACKAGE_ASSET_DIR
+from scipy.spatial import KDTree
+from trimesh.exchange.gltf import export_glb
 
 from manifeel_ms3.paths import cache_dir, writable_cache
 
@@ -31,6 +33,8 @@ HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
 TRIANGLES_PER_MESH = 1200  # with so many, a link's silhouette moves by less than a pixel at 256 x 256
 FEWEST_TRIANGLES = 24  # of a small part of a mesh, which would vanish with its share of the triangles
 SMOOTH_ANGLE = np.deg2rad(35)  # edges that are sharper stay sharp; chosen by eye
+NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; by eye
+ROUGHNESS = 0.35  # of the arm's painted and plastic surfaces; by eye
 FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
@@ -94,30 +98,56 @@ def _derive(robot: ET.Element, work: Path) -> None:
 
 
 def _decimate(source: Path, work: Path) -> str:
-    """Write a decimated copy of a mesh file beside the URDF, materials kept; return its name."""
+    """Write a decimated copy of a mesh file, with its materials, beside the URDF; return its name."""
     scene = trimesh.load(source, force="scene")
-    parts: list[trimesh.Trimesh] = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    parts = [_placed(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
     total = sum(len(part.faces) for part in parts)
     out = trimesh.Scene()
     for part in parts:
-        budget = max(FEWEST_TRIANGLES, TRIANGLES_PER_MESH * len(part.faces) // total)
-        vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
-        if len(faces) > budget:
-            merged = trimesh.Trimesh(vertices, faces)  # seams of the texture are cracks to the decimator
-            merged.merge_vertices(merge_tex=True, merge_norm=True)
-            vertices, faces, *_ = fast_simplification.simplify(
-                np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=budget
-            )
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorFactor=part.visual.material.baseColorFactor, metallicFactor=0.1, roughnessFactor=0.5
-        )
-        # unmerged vertices give flat facets with true normals; smooth shading over big facets looks dented
-        mesh = trimesh.Trimesh(vertices, faces, process=False)
-        mesh.visual = trimesh.visual.TextureVisuals(material=material)
-        out.add_geometry(trimesh.graph.smooth_shade(mesh, angle=SMOOTH_ANGLE))
+        out.add_geometry(_decimated(part, max(FEWEST_TRIANGLES, TRIANGLES_PER_MESH * len(part.faces) // total)))
     name = f"{source.stem}.glb"
-    (work / name).write_bytes(out.export(file_type="glb"))
+    (work / name).write_bytes(export_glb(out, include_normals=True))
     return name
+
+
+def _placed(mesh: trimesh.Trimesh, matrix: np.ndarray) -> trimesh.Trimesh:
+    """A mesh where its node has it, with the normals of its file; `Scene.dump` would compute others."""
+    vertices, normals = trimesh.transform_points(mesh.vertices, matrix), mesh.vertex_normals @ matrix[:3, :3].T
+    return trimesh.Trimesh(vertices, mesh.faces, vertex_normals=normals, visual=mesh.visual, process=False)
+
+
+def _decimated(part: trimesh.Trimesh, budget: int) -> trimesh.Trimesh:
+    """A mesh of one material with at most about `budget` triangles, in the colour and with the normals of the full one."""
+    vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
+    if len(faces) > budget:
+        merged = trimesh.Trimesh(vertices, faces)  # seams of the texture are cracks to the decimator
+        merged.merge_vertices(merge_tex=True, merge_norm=True)
+        vertices, faces, *_ = fast_simplification.simplify(
+            np.asarray(merged.vertices, np.float32), np.asarray(merged.faces), target_count=budget
+        )
+    split = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces, process=False), angle=SMOOTH_ANGLE)
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=part.visual.material.baseColorFactor, metallicFactor=0.0, roughnessFactor=ROUGHNESS
+    )
+    # a mesh without texture coordinates loses its material when it is exported
+    visual = trimesh.visual.TextureVisuals(uv=np.zeros((len(split.vertices), 2)), material=material)
+    return trimesh.Trimesh(
+        split.vertices, split.faces, vertex_normals=_nearest_normals(split, part), visual=visual, process=False
+    )
+
+
+def _nearest_normals(mesh: trimesh.Trimesh, full: trimesh.Trimesh) -> np.ndarray:
+    """Normals (n, 3) of the full mesh where the vertices of a decimated one are.
+
+    The decimated mesh's own normals are those of its few big facets, and make them look dented. Of the nearest vertices of the
+    full mesh, the one counts whose normal is most like the decimated mesh's, which tells the two sides of an edge apart.
+    """
+    _, nearest = KDTree(full.vertices).query(mesh.vertices, k=min(NORMAL_CANDIDATES, len(full.vertices)))
+    candidates = full.vertex_normals[nearest]  # (n, candidates, 3)
+    best = np.einsum("nkd,nd->nk", candidates, mesh.vertex_normals).argmax(axis=1)
+    normals = candidates[np.arange(len(best)), best]
+    defined = np.linalg.norm(normals, axis=1, keepdims=True) > 0.5  # vertices of empty triangles have none
+    return np.where(defined, normals, mesh.vertex_normals)
 
 
 def _replace_finger(link: ET.Element, side: str) -> None:
