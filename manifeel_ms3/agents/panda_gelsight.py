@@ -1,4 +1,4 @@
-"""The robot of every ManiFeel task: a Franka Panda with a GelSight R1.5 finger on each side and a wrist camera."""
+"""The robot of every ManiFeel task: a Franka Panda with a tactile finger on each side and a wrist camera."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (ManiSkill builds controller configurations from dicts of mixed types, and annotates a combined controller by its base class)
@@ -23,6 +23,7 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
 from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseController, LimitedLeadEEPoseControllerConfig, solve_ik
+from .fingers import Finger
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
 GEL_STIFFNESS = 16000.0
@@ -70,10 +71,15 @@ WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
 
 @register_agent()
 class PandaGelSight(BaseAgent):
-    """Panda arm, Franka hand, two GelSight R1.5 fingers.
+    """Panda arm, Franka hand, two fingers with gels: GelSight R1.5, or of the sizes given.
 
     The gel is a compliant contact: PhysX takes a negative restitution as a spring (N/m per contact point). Pads are the links
     `gel_left` and `gel_right`; the tool centre point lies between their centres, z along the fingers.
+
+    Args:
+        args: Positional arguments of ManiSkill's `BaseAgent`.
+        finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
+        kwargs: Other arguments of ManiSkill's `BaseAgent`.
     """
 
     uid = "panda_gelsight"
@@ -103,9 +109,13 @@ class PandaGelSight(BaseAgent):
 
     mounted_cameras: tuple[str, ...] = ("wrist",)
 
+    def __init__(self, *args, finger: Finger | None = None, **kwargs):
+        self.finger = finger or Finger()
+        super().__init__(*args, **kwargs)
+
     @property
     def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return panda_gelsight_urdf(visuals=self.scene.can_render())
+        return panda_gelsight_urdf(self.scene.can_render(), self.finger)
 
     @property
     def _controller_configs(self):

@@ -41,6 +41,11 @@ class SensingEnv(BaseEnv):
         }
         self._touch_is_fresh = False
 
+    def _drawn_imperfections(self) -> dict[str, dict[str, dict[str, torch.Tensor]]]:
+        """An entry `imperfections` of `info`: what the episodes drew, by pad and name; nothing for perfect sensors."""
+        drawn = {name: sensor.drawn_imperfections for name, sensor in self._tactile_sensors.items()}
+        return dict(imperfections=drawn) if any(drawn.values()) else {}
+
     def get_obs(self, info: dict | None = None, unflattened: bool = False):
         if not self._tactile_outputs:
             return super().get_obs(info, unflattened)

@@ -15,10 +15,11 @@ from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 
 from manifeel_ms3.agents import PandaGelSight
+from manifeel_ms3.agents.fingers import Finger
 from manifeel_ms3.arguments import by_name, checked_action, one_of, several_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.geometry import Box, Part
-from manifeel_ms3.sensors import gelsight_r15, with_options
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
@@ -56,13 +57,13 @@ FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), colour=(0.30,
 
 
 class VisuotactileEnv(SensingEnv):
-    """Base class of the ManiFeel tasks: a Panda with two GelSight fingers at the origin of a table, x ahead, z up.
+    """Base class of the ManiFeel tasks: a Panda with two tactile fingers at the origin of a table, x ahead, z up.
 
     The observation mode joins ManiSkill's modes with `tacrgb` and `tacff` by "+". An observation holds what the mode asks for:
 
     - `sensor_data[camera]`: `rgb` uint8 (N, 256, 256, 3) and ManiSkill's other textures;
     - `sensor_data["tactile_left" | "tactile_right"]`: `rgb` uint8 (N, 240, 320, 3); `force_field` float32 (N, 10, 14, 3), N per
-      taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`);
+      taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`); sizes of the default sensor;
     - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Privileged state is in the state modes alone.
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
@@ -79,9 +80,12 @@ class VisuotactileEnv(SensingEnv):
         render_backend: "auto", "gpu", "cpu" or "none".
         cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
         tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
+        sensor: Sensor on both fingers: "gelsight_r15", "gelsight_mini", "digit", or one that another package registers.
         tactile: Fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
         sensor_configs: ManiSkill's: fields to change of one sensor, by its name, or of every camera. Pads are sensors, too:
             `dict(width=128, wrist=dict(fov=1.2), tactile_right={"optics.noise": 2.0})`.
+        imperfections: Amounts of `ImperfectionConfig` by name, such as `{"hysteresis": 0.2, "delay": (0, 3)}`; the entry
+            "imperfections" of `info` holds what the episode drew of them, by pad.
         lighting: "normal" or "dim" (5 %).
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
@@ -123,8 +127,10 @@ class VisuotactileEnv(SensingEnv):
         render_backend: str = "auto",
         cameras: Iterable[str] | None = None,
         tactile_sensors: Iterable[str] = ("right",),
+        sensor: str = DEFAULT_SENSOR,
         tactile: Mapping[str, Any] | None = None,
         sensor_configs: Mapping[str, Any] | None = None,
+        imperfections: Mapping[str, Any] | None = None,
         lighting: str = "normal",
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
@@ -134,11 +140,15 @@ class VisuotactileEnv(SensingEnv):
         self._full_obs_mode = obs_mode or "state"
         self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
         self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
-        pads = {f"tactile_{side}": gelsight_r15(f"tactile_{side}", f"gel_{side}") for side in self._sides}
-        camera_configs, pad_options = split_sensor_configs(sensor_configs or {}, self._camera_names, pads)
-        self._tactile_configs = {
-            name: with_options(with_options(pad, tactile or {}), pad_options.get(name, {})) for name, pad in pads.items()
+        self.sensor = sensor
+        names = {side: f"tactile_{side}" for side in SIDES}
+        camera_configs, own = split_sensor_configs(sensor_configs or {}, self._camera_names, [names[s] for s in self._sides])
+        configs = {
+            side: task_sensor(sensor, name, f"gel_{side}", {**(tactile or {}), **own.get(name, {})}, imperfections)
+            for side, name in names.items()
         }
+        self._tactile_configs = {names[side]: configs[side] for side in self._sides}
+        self._finger = Finger.of(configs["right"])
         self._lighting = one_of("lighting", lighting, LIGHTING)
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
@@ -245,7 +255,10 @@ class VisuotactileEnv(SensingEnv):
         return CameraConfig("render_camera", pose, 512, 512, np.deg2rad(45), near=0.01, far=10)
 
     def _load_agent(self, options: dict):
-        super()._load_agent(options, sapien.Pose())
+        # not by its name in `robot_uids`, by which ManiSkill makes robots without arguments
+        self.agent = PandaGelSight(
+            self.scene, self._control_freq, self._control_mode, initial_pose=sapien.Pose(), finger=self._finger
+        )
         self.agent.mounted_cameras = tuple(name for name in self._camera_names if name == "wrist")
 
     def _load_scene(self, options: dict):
@@ -284,6 +297,8 @@ class VisuotactileEnv(SensingEnv):
             return obs, info
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
         self._settle(env_idx)
+        for sensor in self._tactile_sensors.values():
+            sensor.forget_readings(env_idx)  # those before the grip had settled
         info = self.get_info() | dict(reconfigure=info["reconfigure"])
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
@@ -349,7 +364,7 @@ class VisuotactileEnv(SensingEnv):
         info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
         if self.paper_goal_reached(measures) is not None:
             info["success_paper"] = self._success_paper.clone()
-        return info
+        return info | self._drawn_imperfections()
 
     # ---------------------------------------------------------------- observation
 
