@@ -104,6 +104,8 @@ class VisuotactileEnv(SensingEnv):
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
     """Whether the task has a part that hides its interior from the policy's camera."""
+    grips_round_parts = False
+    """Whether the parts that the hand holds are round (`Finger.grips_round_parts`)."""
     physics_rate = 480
     """Physics steps per second, in Hz. At 240 the solver does not converge on a light part that is held and pushed: it turns
     in the hand like on a rubber band, and springs back."""
@@ -148,7 +150,7 @@ class VisuotactileEnv(SensingEnv):
             for side, name in names.items()
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
-        self._finger = Finger.of(configs["right"])
+        self._finger = Finger.of(configs["right"], self.grips_round_parts)
         self._lighting = one_of("lighting", lighting, LIGHTING)
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:

@@ -85,6 +85,7 @@ class BallSortingEnv(VisuotactileEnv):
     Randomization = BallSortingRandomization
     reward_config = BallSortingRewardConfig()
     policy_cameras = ("front",)
+    grips_round_parts = True
     default_control_mode = "pd_ee_delta_pose"
     front_camera_at = (0.80, 0.0, 0.15)
     side_camera_at = (0.5, -0.4, 0.17)
