@@ -18,8 +18,8 @@ from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
-from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import write_json
+from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import task_spec
 

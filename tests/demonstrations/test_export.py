@@ -12,10 +12,10 @@ from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys
-from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
-SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 
 

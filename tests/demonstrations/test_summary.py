@@ -9,10 +9,10 @@ from rich.console import Console
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.summary import sparkline, summary
-from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
-SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 
 
 def test_it_counts_what_is_there():

@@ -15,10 +15,10 @@ from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
 from tests.conftest import PEG
 from tests.outcomes import made_up
+from tests.sample import states_sample
 
 
 class ExpertPolicy:
@@ -131,7 +131,7 @@ TIGHT_LIMIT = 250
 
 @pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
 def test_limits_follow_from_demonstrations(spec):
-    sample = limits_of_file(data_dir() / "sample" / spec.env_id / "states.h5")
+    sample = limits_of_file(states_sample(spec.env_id))
     assert spec.max_episode_steps >= LONGEST_FACTOR * sample.longest
     assert spec.max_episode_steps >= MEAN_FACTOR * spec.demo_steps - STEPS
     tight = TIGHT_LIMIT if spec.category == "insertion" else 0

@@ -22,7 +22,7 @@ NUMBER_KINDS = "biuf"
 """numpy's kinds of numbers: Boolean, integers with and without a sign, and floating point."""
 GROUPS = ("obs", "obs/sensor_data", "obs/extra", "env_states", "env_states/actors")
 """Parts of an episode that hold other parts; each one stands after its parent."""
-PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force")
+PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force", "rewards")
 """Parts of an episode with one number for each step."""
 POSE_SIZE = 7
 """Numbers of a pose: position and quaternion."""

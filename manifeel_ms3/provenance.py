@@ -24,7 +24,7 @@ def git_commit() -> str | None:
     None where the package was installed from a wheel, even if that is inside of another repository, where git is not
     installed, or where git refuses to read a repository of another user.
     """
-    source = Path(__file__).resolve().parents[2]
+    source = Path(__file__).resolve().parents[1]
     project = source / "pyproject.toml"
     if not project.is_file() or f'name = "{PACKAGES[0]}"' not in project.read_text(encoding="utf-8").splitlines():
         return None
