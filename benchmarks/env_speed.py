@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.tasks.rendering import available_render_backend
+from manifeel_ms3.rendering.backend import available_render_backend
 
 TARGETS = {"state": 150, "rgb": 50, "rgb+tacff": 35, "rgb+tacrgb+tacff": 25}
 PARTS = {  # where the time goes: functions by a part of their file's and their name

@@ -32,7 +32,7 @@ MAKE_WITHOUT_RENDERER = (
 )
 MAKE_WITH_IMAGES = "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='rgb+tacrgb')"
 STEP = "; env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
-RENDERER = "; from manifeel_ms3.tasks.rendering import available_render_backend as found; print(found())"
+RENDERER = "; from manifeel_ms3.rendering.backend import available_render_backend as found; print(found())"
 CUDA = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else 'none')"
 RENDERER_REMEDY = (
     "Without a GPU: install Mesa 24.3 or newer, libvulkan1, libegl1 and libgl1, as scripts/setup.sh does. With a GPU: install "

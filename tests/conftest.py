@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.tasks.rendering import available_render_backend
+from manifeel_ms3.rendering.backend import available_render_backend
 
 torch.set_num_threads(1)
 PEG = "ManiFeel-PegInsertion-v1"

@@ -20,6 +20,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
 from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseController, LimitedLeadEEPoseControllerConfig, solve_ik
@@ -195,6 +196,7 @@ class PandaGelSight(BaseAgent):
                 near=0.005,
                 far=10,
                 mount=self.robot.links_map["panda_hand"],
+                shader_config=camera_shader(),
             )
         ]
 

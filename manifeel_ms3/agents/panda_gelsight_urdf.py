@@ -31,6 +31,7 @@ from .fingers import GEL_CENTRE, Finger, gel_pad, replace_finger
 HAND_TO_FINGER = 0.0584  # m: hand frame to finger frame, from the Panda's URDF
 HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
 TRIANGLES_PER_MESH = 1200  # with so many, a link's silhouette moves by less than a pixel at 256 x 256
+TRIANGLES_OF_THE_HAND = 2400  # which every camera sees from near; with half as many it looks dented
 FEWEST_TRIANGLES = 24  # of a small part of a mesh, which would vanish with its share of the triangles
 SMOOTH_ANGLE = np.deg2rad(35)  # edges that are sharper stay sharp; chosen by eye
 NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; by eye
@@ -104,9 +105,10 @@ def _decimate(source: Path, work: Path) -> str:
     scene = trimesh.load(source, force="scene")
     parts = [_placed(scene.geometry[name], matrix) for matrix, name in map(scene.graph.get, scene.graph.nodes_geometry)]
     total = sum(len(part.faces) for part in parts)
+    whole = TRIANGLES_OF_THE_HAND if source.stem == "hand" else TRIANGLES_PER_MESH
     out = trimesh.Scene()
     for part in parts:
-        out.add_geometry(_decimated(part, max(FEWEST_TRIANGLES, TRIANGLES_PER_MESH * len(part.faces) // total)))
+        out.add_geometry(_decimated(part, max(FEWEST_TRIANGLES, whole * len(part.faces) // total)))
     name = f"{source.stem}.glb"
     (work / name).write_bytes(export_glb(out, include_normals=True))
     return name

@@ -5,6 +5,8 @@ import functools
 import numpy as np
 import trimesh
 
+from manifeel_ms3.rendering.looks import DARK_PLASTIC, WHITE_PLASTIC
+
 from .part import Ball, Box, Part, block_with_holes
 
 BALL_RADIUS = 0.02075
@@ -18,7 +20,6 @@ SUBDIVISIONS = 6
 """Subdivisions of the golf ball's icosahedron: 82,000 triangles, of about 0.4 mm, resolve the dimples."""
 SEAT_HEIGHT = STAND_HEIGHT + float(np.sqrt(BALL_RADIUS**2 - (SEAT_HOLE / 2) ** 2))
 """Height of a seated ball's centre, in m: the ball rests on the four edges of a square hole."""
-WHITE = (0.93, 0.93, 0.90)
 
 
 @functools.cache
@@ -34,7 +35,7 @@ def tennis_ball() -> Part:
 
 def _ball(name: str, mass: float, relief: trimesh.Trimesh | None) -> Part:
     volume = 4 / 3 * np.pi * BALL_RADIUS**3
-    return Part(name, (Ball(BALL_RADIUS),), WHITE, density=mass / volume, relief=relief)
+    return Part(name, (Ball(BALL_RADIUS),), WHITE_PLASTIC, density=mass / volume, relief=relief)
 
 
 def golf_ball_mesh() -> trimesh.Trimesh:
@@ -59,4 +60,4 @@ def ball_stand() -> Part:
         for box in seat
     ]
     bar = Box((SEAT_SIZE[0], SEAT_SPACING - SEAT_SIZE[1], STAND_HEIGHT / 3), (0.0, 0.0, STAND_HEIGHT / 6))
-    return Part("stand", (*seats, bar), (0.30, 0.32, 0.36))
+    return Part("stand", (*seats, bar), DARK_PLASTIC)

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from manifeel_ms3.rendering.looks import BRASS, CARDBOARD, Look
+
 from .part import Box, Cylinder, Hulls, Part, ring_of_wedges
 
 CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004  # m
@@ -33,7 +35,7 @@ def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Pa
         *(Box((x - 2 * wall, wall, height), (0.0, side * (y - wall) / 2, height / 2)) for side in (-1, 1)),
         Box((x - 2 * wall, y - 2 * wall, CONTAINER_FLOOR), (0.0, 0.0, CONTAINER_FLOOR / 2)),
     )
-    return Part("container", pieces, colour=(0.36, 0.30, 0.26), undrawn=frozenset() if front_drawn else frozenset({0}))
+    return Part("container", pieces, CARDBOARD, undrawn=frozenset() if front_drawn else frozenset({0}))
 
 
 def battery() -> Part:
@@ -43,13 +45,13 @@ def battery() -> Part:
     return Part(
         "battery",
         (Box((size, size, size)), terminal),
-        (0.12, 0.35, 0.20),
+        Look((0.05, 0.25, 0.10)),
         density=BATTERY_DENSITY,
-        other_colours={1: (0.8, 0.7, 0.3)},
+        other_looks={1: BRASS},
     )
 
 
-def bowl(name: str, colour: tuple[float, float, float]) -> Part:
+def bowl(name: str, look: Look) -> Part:
     """Round bowl with an upright wall; its frame in the middle of its underside."""
 
     def rim(angles: np.ndarray) -> np.ndarray:
@@ -57,4 +59,4 @@ def bowl(name: str, colour: tuple[float, float, float]) -> Part:
 
     wall = ring_of_wedges(BOWL_WEDGES, BOWL_RADIUS, rim, 0.0, BOWL_HEIGHT)
     floor = Cylinder(BOWL_RADIUS, BOWL_FLOOR, (0.0, 0.0, BOWL_FLOOR / 2))
-    return Part(name, (Hulls(tuple(wall)), floor), colour)
+    return Part(name, (Hulls(tuple(wall)), floor), look)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.rendering.looks import BLUE_PLASTIC, DARK_PLASTIC, STEEL, Look
+
 from .fits import Fit, Lead
 from .materials import ABS, ALUMINIUM
 from .part import Box, Cylinder, Hulls, Part, Piece, extruded, lofted, ring_of_wedges
@@ -34,7 +36,7 @@ SHAFT_X = {
     "large": MODULE * (TEETH["medium"] + TEETH["large"]) / 2,
 }
 BASE_SHIFT = -0.010  # m: the base's middle, seen from the medium shaft
-COLOURS = {"small": (0.75, 0.35, 0.25), "medium": (0.80, 0.62, 0.20), "large": (0.30, 0.50, 0.35)}
+LOOKS = {"small": Look((0.62, 0.10, 0.05)), "medium": Look((0.85, 0.55, 0.05)), "large": Look((0.06, 0.35, 0.12))}
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def neighbour_gear(name: str, fit: str = "paper") -> Part:
     return Part(
         f"{name}_gear",
         (gear_hulls(TEETH[name], SHAFTS[fit].bore, 0.0, THICKNESS[name]),),
-        COLOURS[name],
+        LOOKS[name],
         density=ALUMINIUM,
         friction=GEAR_FRICTION,
     )
@@ -109,10 +111,10 @@ def gear_fit(fit: str = "paper") -> Fit:
         plug=Part(
             "medium_gear",
             (body, ring, Box(HANDLE_SIZE)),
-            COLOURS["medium"],
+            LOOKS["medium"],
             density=ALUMINIUM,
             friction=GEAR_FRICTION,
-            other_colours={2: (0.14, 0.14, 0.16)},
+            other_looks={2: DARK_PLASTIC},
             other_densities={2: ABS},
         ),
         socket=gear_base(fit),
@@ -138,9 +140,9 @@ def gear_base(fit: str = "paper") -> Part:
     return Part(
         "gear_base",
         (plate, *shafts),
-        (0.25, 0.35, 0.55),
+        BLUE_PLASTIC,
         friction=GEAR_FRICTION,
-        other_colours=dict.fromkeys(range(1, 1 + len(shafts)), (0.7, 0.7, 0.72)),
+        other_looks=dict.fromkeys(range(1, 1 + len(shafts)), STEEL),
     )
 
 

@@ -16,13 +16,13 @@ from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.paths import cache_dir, writable_cache
+from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.sensors.depth.surfaces import give_relief
 
 from .materials import ABS
 
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
 """Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""
-ROUGHNESS, SPECULAR = 0.6, 0.3  # of every part's surface, chosen by eye
 UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
 
 
@@ -135,15 +135,15 @@ class Part:
     """Name of the actor in the scene."""
     pieces: tuple[Piece, ...]
     """Shapes that are drawn, collide and are touched."""
-    colour: tuple[float, float, float]
-    """RGB in [0, 1]."""
+    look: Look
+    """Look of the surface."""
     density: float = ABS
     """Density in kg/m^3 of a dynamic part: that of the material it is drawn as. A light part between stiff pads needs a high
     physics rate; see `VisuotactileEnv.physics_rate`."""
     friction: float = 0.5
     """Coulomb's coefficient."""
-    other_colours: dict[int, tuple[float, float, float]] = field(default_factory=dict)
-    """Colours of single pieces, by index in `pieces`."""
+    other_looks: dict[int, Look] = field(default_factory=dict)
+    """Looks of single pieces, by index in `pieces`."""
     other_densities: dict[int, float] = field(default_factory=dict)
     """Densities of single pieces, by index in `pieces`."""
     undrawn: frozenset[int] = frozenset()
@@ -159,8 +159,7 @@ class Part:
         for k, piece in enumerate(self.pieces):
             look = None
             if scene.can_render() and k not in self.undrawn:  # a render material cannot even be made without a renderer
-                colour = self.other_colours.get(k, self.colour)
-                look = RenderMaterial(base_color=[*colour, 1.0], roughness=ROUGHNESS, specular=SPECULAR)
+                look = self.other_looks.get(k, self.look).material()
             # the engine takes negative restitution as a spring, and averages it with the other body's
             material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
             piece.add_to(builder, material, self.other_densities.get(k, self.density), look)

@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass
 
+from manifeel_ms3.rendering.looks import BLUE_PLASTIC, BRASS
+
 from . import materials
 from .fits import Fit, Lead
 from .part import Box, Part, block_with_chamfered_holes, block_with_holes
-
-BRASS, PLASTIC = (0.80, 0.62, 0.20), (0.25, 0.35, 0.55)
 
 PEG_SIZE = (0.01196, 0.00791, 0.050)  # m
 
@@ -46,8 +46,8 @@ def peg_fit(fit: str = "paper") -> Fit:
     plate = (Box((side, side, floor), (0.0, 0.0, floor / 2)),) if floor else ()
     half_hole = (socket.hole[0] / 2, socket.hole[1] / 2)
     return Fit(
-        plug=Part("peg", (Box(PEG_SIZE),), colour=BRASS, density=materials.BRASS),
-        socket=Part("socket", (*block, *plate), colour=PLASTIC),
+        plug=Part("peg", (Box(PEG_SIZE),), look=BRASS, density=materials.BRASS),
+        socket=Part("socket", (*block, *plate), look=BLUE_PLASTIC),
         reach=PEG_SIZE[2] / 2,
         grip=-socket.grip,
         grip_width=PEG_SIZE[1],
@@ -70,8 +70,8 @@ def reorientation_fit() -> Fit:
     base = Box((0.03, 0.03, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
     rim = block_with_holes((0.03, 0.03), RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
     return Fit(
-        plug=Part("peg", (Box(REORIENTATION_PEG),), colour=BRASS, density=materials.BRASS),
-        socket=Part("rim", (base, *rim), colour=PLASTIC),
+        plug=Part("peg", (Box(REORIENTATION_PEG),), look=BRASS, density=materials.BRASS),
+        socket=Part("rim", (base, *rim), look=BLUE_PLASTIC),
         reach=z / 2,
         grip=-0.018,  # the fingers stay clear of the rim at 30 degrees
         grip_width=y,

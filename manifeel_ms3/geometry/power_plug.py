@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.rendering import looks
+
 from . import materials
 from .fits import Fit, Lead
 from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
-METAL, BRASS, DARK, WHITE = (0.72, 0.74, 0.78), (0.80, 0.62, 0.20), (0.14, 0.14, 0.16), (0.85, 0.85, 0.82)
 ARC_POINTS = 8
 """Number of points of the round side of the U-shaped ground pin."""
 
@@ -98,11 +99,11 @@ def power_fit(fit: str = "paper") -> Fit:
         plug=Part(
             "power_plug",
             (_ground_pin(sizes, half), *_blades(sizes, half), Box(sizes.handle), *head),
-            DARK,
-            other_colours={0: BRASS, 1: METAL, 2: METAL},
+            looks.DARK_PLASTIC,
+            other_looks={0: looks.BRASS, 1: looks.STEEL, 2: looks.STEEL},
             other_densities=dict.fromkeys(range(3), materials.BRASS),
         ),
-        socket=Part("power_socket", (Box((*sizes.block[:2], floor), (0, 0, floor / 2)), *_outlet(sizes)), WHITE),
+        socket=Part("power_socket", (Box((*sizes.block[:2], floor), (0, 0, floor / 2)), *_outlet(sizes)), looks.WHITE_PLASTIC),
         reach=half + ground[2],
         grip=GRIP,
         grip_width=sizes.handle[1],

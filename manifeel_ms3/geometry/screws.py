@@ -8,6 +8,8 @@ import numpy as np
 import torch
 import trimesh
 
+from manifeel_ms3.rendering import looks
+
 from .materials import STEEL
 from .part import Ball, Box, Cylinder, Hulls, Part, Solid, ring_of_wedges
 from .threads import FLANK, edison, external_mesh, internal_mesh, iso_metric, ridge
@@ -44,7 +46,6 @@ class Screw:
 
 
 GREASED_FRICTION = 0.15  # Coulomb's coefficient of greased steel
-GREY, BLUE = (0.70, 0.72, 0.75), (0.25, 0.35, 0.55)  # RGB
 M16 = iso_metric(0.008, 0.002)  # ISO 261, coarse pitch
 M16_POINT = 0.006  # m: radius of the flat point (ISO 4753)
 BOLT_FOOT, BOLT_LENGTH = 0.030, 0.024  # m: plate and head; thread
@@ -71,7 +72,13 @@ def m16_bolt() -> Part:
     shank.apply_transform(trimesh.transformations.rotation_matrix(BOLT_TURN, [0, 0, 1]))
     shank.apply_translation([0, 0, BOLT_FOOT])
     plate = Box((PLATE_SIZE, PLATE_SIZE, PLATE_HEIGHT), (0.0, 0.0, PLATE_HEIGHT / 2))
-    return Part("bolt", (plate, Hulls(tuple(head)), Solid(shank)), GREY, friction=GREASED_FRICTION, other_colours={0: BLUE})
+    return Part(
+        "bolt",
+        (plate, Hulls(tuple(head)), Solid(shank)),
+        looks.STEEL,
+        friction=GREASED_FRICTION,
+        other_looks={0: looks.BLUE_PLASTIC},
+    )
 
 
 def m16_nut() -> Part:
@@ -85,7 +92,7 @@ def m16_nut() -> Part:
     section[:, 1] += NUT_MOUTH + M16.pitch / 2 - NUT_HEIGHT / 2
     wedges = ring_of_wedges(HEX_WEDGES, NUT_WALL, hexagon(NUT_ACROSS_FLATS), -NUT_HEIGHT / 2, NUT_HEIGHT / 2)
     pieces = (*wedges, *ridge(section, M16.pitch, NUT_TURNS, PIECES_PER_TURN))
-    return Part("nut", (Hulls(pieces),), GREY, density=STEEL, friction=GREASED_FRICTION)
+    return Part("nut", (Hulls(pieces),), looks.STEEL, density=STEEL, friction=GREASED_FRICTION)
 
 
 def nut_and_bolt() -> Screw:
@@ -116,7 +123,6 @@ BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's c
 BORE_TURN = np.deg2rad(-10)  # the hand turns by 80 degrees before the threads meet, while the cap finds its place in the mouth
 CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.3 N m of the thread
 DRY_FRICTION = 0.35  # Coulomb's coefficient of brass on brass, neither greased nor polished
-BRASS, GLASS = (0.80, 0.68, 0.35), (0.95, 0.94, 0.88)
 LEAD_IN = 0.25  # turns over which the cap's ridge rises
 BULB_TIGHTENING, BULB_SYMMETRY, BULB_GRIP_FORCE = np.deg2rad(120), np.deg2rad(15), 12.0  # rad, tuned; rad; N
 BULB_DENSITY = 400.0  # kg/m^3, of the whole, which is hollow: 53 g, of the 50 to 60 g of an LED lamp of this size (data sheets)
@@ -153,10 +159,10 @@ def e27_bulb() -> Part:
     return Part(
         "bulb",
         (Ball(GLASS_RADIUS), Hulls((neck,)), Hulls(cap), Hulls((foot,)), tip),
-        GLASS,
+        looks.OPAL_GLASS,
         density=BULB_DENSITY,
         friction=DRY_FRICTION,
-        other_colours={2: GREY, 3: (0.1, 0.1, 0.1), 4: BRASS},
+        other_looks={2: looks.STEEL, 3: looks.BLACK_PLASTIC, 4: looks.BRASS},
     )
 
 
@@ -174,9 +180,9 @@ def e27_holder() -> Part:
     return Part(
         "holder",
         (Solid(shell), Solid(thread), contact),
-        (0.16, 0.16, 0.18),
+        looks.DARK_PLASTIC,
         friction=DRY_FRICTION,
-        other_colours={1: GREY, 2: BRASS},
+        other_looks={1: looks.STEEL, 2: looks.BRASS},
         springs={2: CONTACT_SPRING},
     )
 

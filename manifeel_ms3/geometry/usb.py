@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass
 
+from manifeel_ms3.rendering import looks
+
 from .fits import Fit, Lead
 from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
-METAL, INSULATOR, DARK, PLASTIC = (0.72, 0.74, 0.78), (0.90, 0.90, 0.90), (0.14, 0.14, 0.16), (0.25, 0.35, 0.55)
 HANDLE = (0.012, 0.030, 0.070)  # m; narrower than a pad, so that touch sees its edges
 GRIP = -0.012  # m, from the handle's middle
 BLOCK, RIM = (0.066, 0.066), 0.037  # m: the port's block, and its height
@@ -83,8 +84,10 @@ def usb_fit(fit: str = "paper") -> Fit:
     pieces: tuple[Piece, ...] = (Box(HANDLE), *shell)
     sheets = dict.fromkeys(range(2, len(pieces)), STEEL)
     return Fit(
-        plug=Part("usb_plug", pieces, METAL, other_colours={0: DARK, 1: INSULATOR}, other_densities=sheets),
-        socket=Part("usb_port", (tongue, base, *walls), PLASTIC, other_colours={0: INSULATOR}),
+        plug=Part(
+            "usb_plug", pieces, looks.STEEL, other_looks={0: looks.DARK_PLASTIC, 1: looks.WHITE_PLASTIC}, other_densities=sheets
+        ),
+        socket=Part("usb_port", (tongue, base, *walls), looks.BLUE_PLASTIC, other_looks={0: looks.WHITE_PLASTIC}),
         reach=HANDLE[2] / 2 + sizes.shell[2],
         grip=GRIP,
         grip_width=HANDLE[1],

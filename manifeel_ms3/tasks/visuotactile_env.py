@@ -18,13 +18,22 @@ from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.agents.fingers import Finger
 from manifeel_ms3.arguments import by_name, checked_action, one_of, several_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
-from manifeel_ms3.geometry import Box, Part
+from manifeel_ms3.rendering.backend import (
+    FORKED,
+    NO_RENDERER,
+    available_render_backend,
+    renderer_lost,
+    use_one_thread_after_fork,
+)
+from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
+from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, drawn_sizes, fine_shadow, presentation_shader
+from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
+from .bench import build_bench
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
 from .registry import gym_id
-from .rendering import FORKED, NO_RENDERER, available_render_backend, renderer_lost, use_one_thread_after_fork
 from .sensing import SensingEnv
 from .states import is_part_of, unflattened
 from .viewpoints import looking_at, looking_down
@@ -43,8 +52,8 @@ IMAGE_SIZE = 256
 """Width and height of the cameras' images, in pixels (public code of the paper)."""
 FIELD_OF_VIEW = np.deg2rad(75)
 """Field of view of the cameras, in rad (public code of the paper)."""
-AMBIENT_LIGHT, KEY_LIGHT, FILL_LIGHT = 0.3, 0.8, 0.35  # intensities, chosen by eye
-KEY_DIRECTION, FILL_DIRECTION = [0.4, 0.6, -1], [-0.5, -0.3, -1]
+FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
+"""Links whose shadow falls beside what the shadow map covers."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
@@ -52,8 +61,6 @@ CONTACTS: dict[str, Any] = dict(
     sleep_threshold=0.0,  # a sleeping body's contacts freeze
 )
 """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
-TABLE = Part("table", (Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02)),), colour=(0.55, 0.52, 0.48), friction=0.5)
-FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), colour=(0.30, 0.31, 0.33))
 
 
 class VisuotactileEnv(SensingEnv):
@@ -78,6 +85,8 @@ class VisuotactileEnv(SensingEnv):
         control_mode: Controller, one of the robot's; the task's own if not given.
         robot_uids: Robot; only "panda_gelsight" is supported.
         render_backend: "auto", "gpu", "cpu" or "none".
+        human_render_camera_configs: Fields of the camera of `render_mode="rgb_array"` to change, such as `dict(width=512)`; its
+            images have 768 x 768 pixels, and take about a second each on a CPU.
         cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
         tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
         sensor: Sensor on both fingers: "gelsight_r15", "gelsight_mini", "digit", or one that another package registers.
@@ -87,6 +96,7 @@ class VisuotactileEnv(SensingEnv):
         imperfections: Amounts of `ImperfectionConfig` by name, such as `{"hysteresis": 0.2, "delay": (0, 3)}`; the entry
             "imperfections" of `info` holds what the episode drew of them, by pad.
         lighting: "normal" or "dim" (5 %).
+        quality: Quality of the cameras' images: "normal", or "fast", which leaves out the shadow.
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
         kwargs: Other arguments of ManiSkill's `BaseEnv`.
@@ -127,6 +137,7 @@ class VisuotactileEnv(SensingEnv):
         control_mode: str | None = None,
         robot_uids: str = "panda_gelsight",
         render_backend: str = "auto",
+        human_render_camera_configs: Mapping[str, Any] | None = None,
         cameras: Iterable[str] | None = None,
         tactile_sensors: Iterable[str] = ("right",),
         sensor: str = DEFAULT_SENSOR,
@@ -134,6 +145,7 @@ class VisuotactileEnv(SensingEnv):
         sensor_configs: Mapping[str, Any] | None = None,
         imperfections: Mapping[str, Any] | None = None,
         lighting: str = "normal",
+        quality: str = "normal",
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
         **kwargs,
@@ -152,6 +164,7 @@ class VisuotactileEnv(SensingEnv):
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
         self._finger = Finger.of(configs["right"], self.grips_round_parts)
         self._lighting = one_of("lighting", lighting, LIGHTING)
+        self._quality = one_of("quality", quality, SHADOWS)
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -172,6 +185,7 @@ class VisuotactileEnv(SensingEnv):
             robot_uids=robot_uids,
             render_backend=backend,
             sensor_configs=camera_configs,
+            human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
 
@@ -246,7 +260,16 @@ class VisuotactileEnv(SensingEnv):
     def _default_sensor_configs(self):
         views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
         return [
-            CameraConfig(name, looking_down(*views[name]), IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, near=0.01, far=10)
+            CameraConfig(
+                name,
+                looking_down(*views[name]),
+                IMAGE_SIZE,
+                IMAGE_SIZE,
+                FIELD_OF_VIEW,
+                near=0.01,
+                far=10,
+                shader_config=camera_shader(),
+            )
             for name in self._camera_names
             if name in views
         ]
@@ -254,7 +277,12 @@ class VisuotactileEnv(SensingEnv):
     @property
     def _default_human_render_camera_configs(self):
         pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
-        return CameraConfig("render_camera", pose, 512, 512, np.deg2rad(45), near=0.01, far=10)
+        drawn, view = SIZE * SUPERSAMPLING, np.deg2rad(45)
+        return CameraConfig("render_camera", pose, drawn, drawn, view, near=0.01, far=10, shader_config=presentation_shader())
+
+    def render_rgb_array(self, camera_name: str | None = None):
+        with fine_shadow(self._lamps, SHADOWS[self._quality]):
+            return super().render_rgb_array(camera_name)
 
     def _load_agent(self, options: dict):
         # not by its name in `robot_uids`, by which ManiSkill makes robots without arguments
@@ -264,16 +292,17 @@ class VisuotactileEnv(SensingEnv):
         self.agent.mounted_cameras = tuple(name for name in self._camera_names if name == "wrist")
 
     def _load_scene(self, options: dict):
-        for part in (TABLE, FLOOR):
-            part.build(self.scene, "static", sapien.Pose())
+        build_bench(self.scene)
         self._load_task()
 
+    def _setup_sensors(self, options: dict):
+        set_picture_formats()
+        super()._setup_sensors(options)
+
     def _load_lighting(self, options: dict):
-        level = LIGHTING[self._lighting]
-        key, fill = KEY_LIGHT * level, FILL_LIGHT * level
-        self.scene.set_ambient_light([AMBIENT_LIGHT * level] * 3)
-        self.scene.add_directional_light(KEY_DIRECTION, [key] * 3, shadow=self.enable_shadow, shadow_scale=1.0)
-        self.scene.add_directional_light(FILL_DIRECTION, [fill] * 3)
+        self._lamps = add_lights(self.scene, LIGHTING[self._lighting], SHADOWS[self._quality])
+        links = self.agent.robot.links_map
+        cast_no_shadow([self.scene.actors["table"], self.scene.actors["floor"], *(links[name] for name in FAR_LINKS)])
 
     def _after_reconfigure(self, options: dict):
         self._make_tactile_sensors()

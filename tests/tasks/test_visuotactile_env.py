@@ -9,9 +9,9 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
-from manifeel_ms3.tasks.rendering import NO_RENDERER
 from tests.conftest import needs_renderer
 
 

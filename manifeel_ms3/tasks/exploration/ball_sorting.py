@@ -10,6 +10,7 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
+from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
@@ -24,7 +25,10 @@ ON_TABLE = 0.005
 """Height of a ball's lowest point over the table, in m, below which it has fallen off the stand."""
 PAD_END = 0.021
 """Distance from the tool centre point to below the fingertips, in m, with some clearance."""
-BOWLS = {"golf": ((0.40, 0.19), (0.90, 0.45, 0.10)), "tennis": ((0.40, -0.19), (0.15, 0.35, 0.75))}  # xy, m; orange, blue
+BOWLS = {
+    "golf": ((0.40, 0.19), Look((0.85, 0.25, 0.03))),
+    "tennis": ((0.40, -0.19), Look((0.03, 0.12, 0.60))),
+}  # xy, m; orange, blue
 GOALS = ("lift", "bowls")
 
 
@@ -104,8 +108,8 @@ class BallSortingEnv(VisuotactileEnv):
 
     def _load_task(self):
         if self.goal == "bowls":
-            for name, ((x, y), colour) in BOWLS.items():
-                bowl(f"{name}_bowl", colour).build(self.scene, "static", sapien.Pose([x, y, 0]))
+            for name, ((x, y), look) in BOWLS.items():
+                bowl(f"{name}_bowl", look).build(self.scene, "static", sapien.Pose([x, y, 0]))
         self.stand = ball_stand().build(self.scene, "kinematic", sapien.Pose([*STAND_XY, 0]))
         self.golf = golf_ball().build(self.scene, "dynamic", sapien.Pose([0.45, 0, 0.1]))
         self.tennis = tennis_ball().build(self.scene, "dynamic", sapien.Pose([0.55, 0, 0.1]))

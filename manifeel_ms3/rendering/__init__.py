@@ -1,0 +1,1 @@
+"""How scenes look: the renderer at hand, shaders, lights, surfaces, the table, and their randomization."""

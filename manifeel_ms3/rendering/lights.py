@@ -1,0 +1,90 @@
+"""Light of the scene: from all sides, and one lamp that casts a shadow."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# (SAPIEN's stubs ask for arrays of single precision, and leave out what is internal)
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import sapien
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.utils.structs import Actor, Link
+from sapien.render import RenderBodyComponent
+from sapien.render import RenderDirectionalLightComponent as Lamp
+
+AMBIENT_LIGHT, KEY_LIGHT = 0.42, 1.9  # intensities, chosen by eye
+KEY_DIRECTION = (-0.35, 0.45, -1.0)
+"""Direction in which the lamp shines, from above, in front and the right of the robot; chosen by eye."""
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """Map of what the lamp reaches."""
+
+    size: int
+    """Width and height, in pixels."""
+    half_extent: float
+    """Half of the width that it covers, in m."""
+    centre: tuple[float, float, float] = (0.5, 0.0, 0.0)
+    """Middle of what it covers, in m: that of the tasks' parts."""
+    near: float = -1.0
+    """Distance from the centre towards the lamp from which it is drawn, in m, negative."""
+    far: float = 1.5
+    """Distance from the centre away from the lamp to which it is drawn, in m."""
+
+
+SHADOWS = {"normal": Shadow(512, 0.45), "fast": None}
+"""Shadow by the quality of the policy's images; half of a picture's time goes into a larger one."""
+PRESENTATION_SHADOW = Shadow(4096, 0.8)
+"""Shadow of the images for people."""
+
+
+def add_lights(
+    scene: ManiSkillScene, level: float, shadow: Shadow | None
+) -> list[sapien.render.RenderDirectionalLightComponent]:
+    """Add the scene's light.
+
+    Args:
+        scene: Scene to be lit.
+        level: Share of the normal light.
+        shadow: Shadow of the lamp, if it casts one.
+
+    Returns:
+        The lamp of each environment.
+    """
+    scene.set_ambient_light([AMBIENT_LIGHT * level] * 3)
+    lamps = []
+    for sub_scene in scene.sub_scenes:
+        lamp = Lamp()
+        lamp.set_color([KEY_LIGHT * level] * 3)
+        cast_shadow(lamp, shadow)
+        entity = sapien.Entity()
+        entity.name = "lamp"
+        entity.add_component(lamp)
+        aim_lamp(lamp, KEY_DIRECTION)
+        sub_scene.add_entity(entity)
+        lamps.append(lamp)
+    return lamps
+
+
+def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
+    """Let a lamp cast this shadow, or none."""
+    lamp.shadow = shadow is not None
+    if shadow is not None:
+        lamp.shadow_map_size, lamp.shadow_half_size = shadow.size, shadow.half_extent
+        lamp.shadow_near, lamp.shadow_far = shadow.near, shadow.far
+
+
+def aim_lamp(lamp: Lamp, direction: tuple[float, float, float]) -> None:
+    """Let a lamp shine in a direction, over the middle of what its shadow covers."""
+    unit = np.asarray(direction) / np.linalg.norm(direction)
+    lamp.local_pose = sapien.Pose([0.5, 0.0, 0.0], sapien.math.shortest_rotation(np.array([1.0, 0.0, 0.0]), unit))
+
+
+def cast_no_shadow(bodies: Iterable[Actor | Link]) -> None:
+    """Leave bodies out of the lamp's shadow, whose shadows no camera sees: each costs its share of every image."""
+    for body in bodies:
+        for entity in (obj if isinstance(obj, sapien.Entity) else obj.entity for obj in body._objs):
+            component = entity.find_component_by_type(RenderBodyComponent)
+            for drawn in component._internal_node.children if component else ():
+                drawn.cast_shadow = False
