@@ -312,3 +312,12 @@ def test_what_fails_is_told_and_tried_again(study, tmp_path):
     with pytest.raises(ValueError, match="nonsense"):
         perform(train, root)
     assert json.loads((train.folder(root) / "started.json").read_text())["attempts"] == 2
+
+
+def test_a_policy_is_trained_once_and_evaluated_with_each_set_of_arguments():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/robustness.yaml"))
+    counts = {kind: [job.kind for job in jobs].count(kind) for kind in ("record", "train", "evaluate")}
+    assert counts == dict(record=2, train=12, evaluate=108)  # 2 tasks, 2 observation modes, 3 seeds, 9 sensors
+    given = {job.settings["env_kwargs"] for job in jobs if job.kind == "evaluate"}
+    assert {"{}", '{"imperfections": {"delay": 2}}'} < given
+    assert all(job.settings["env_kwargs"] == "{}" for job in jobs if job.kind == "record")

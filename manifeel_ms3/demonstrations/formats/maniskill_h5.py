@@ -176,5 +176,9 @@ def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) 
 
 
 MANISKILL_H5 = DemonstrationFormat(
-    "maniskill", matches=lambda path: not Path(path).is_dir(), count=count_episodes, read=read_demonstrations
+    "maniskill",
+    matches=lambda path: not Path(path).is_dir(),
+    count=count_episodes,
+    read=read_demonstrations,
+    env_kwargs=lambda path: read_header(path)["env_info"]["env_kwargs"],
 )
