@@ -73,7 +73,7 @@ class Args:
         )
         if self.sensor is not None:
             sensing["sensor"] = self.sensor
-        return dict(sim_backend="physx_cpu") | sensing | json_object("--env-kwargs", self.env_kwargs)
+        return dict(obs_mode=self.obs_mode, sim_backend="physx_cpu") | sensing | json_object("--env-kwargs", self.env_kwargs)
 
     @property
     def seeds(self) -> range:

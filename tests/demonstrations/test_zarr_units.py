@@ -60,9 +60,7 @@ def test_the_papers_data_are_in_the_papers_units_and_not_mixed_with_newtons(pape
     fields[:] = 1e-3 * fields[:]
     assert read(papers_store)[..., 0].max() < 0.02
     assert recorded_env_kwargs([papers_store]) == {"tactile": {"units": "tacsl"}}
-    with pytest.raises(
-        DemonstrationError, match="train on files that were recorded with the same"
-    ):
+    with pytest.raises(DemonstrationError, match="train on files that were recorded with the same"):
         recorded_env_kwargs([papers_store, SAMPLE])
 
 
