@@ -63,7 +63,7 @@ class BallSortingRewardConfig:
     paper_demos=80,
     paper_tables=("II", "III"),
     demo_steps=83,
-    revision=2,
+    revision=3,
     force_limit=12.0,
 )
 class BallSortingEnv(VisuotactileEnv):
@@ -180,7 +180,7 @@ class BallSortingEnv(VisuotactileEnv):
     paper_demos=80,
     paper_tables=("I", "II", "III"),
     demo_steps=83,
-    revision=2,
+    revision=3,
     force_limit=12.0,
 )
 class BallSortingDimEnv(BallSortingEnv):

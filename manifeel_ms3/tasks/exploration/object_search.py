@@ -59,7 +59,7 @@ class ObjectSearchRewardConfig:
     paper_demos=50,
     paper_tables=("I", "II", "III"),
     demo_steps=77,
-    revision=2,
+    revision=3,
     force_limit=8.0,
 )
 class ObjectSearchEnv(VisuotactileEnv):

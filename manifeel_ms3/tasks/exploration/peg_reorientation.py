@@ -39,7 +39,7 @@ class PegReorientationRandomization(InsertionRandomization):
     category="exploration",
     paper_demos=50,
     paper_tables=("I",),
-    revision=2,
+    revision=3,
     demo_steps=135,
     force_limit=38.0,
 )

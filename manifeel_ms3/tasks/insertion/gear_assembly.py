@@ -35,7 +35,7 @@ class GearRandomization(InsertionRandomization):
     paper_demos=100,
     paper_tables=("I", "II", "III"),
     demo_steps=131,
-    revision=2,
+    revision=3,
     force_limit=27.0,
 )
 class GearAssemblyEnv(InsertionEnv):

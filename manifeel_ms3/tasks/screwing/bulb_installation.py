@@ -47,7 +47,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
     demo_steps=444,
-    revision=2,
+    revision=3,
     force_limit=29.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
