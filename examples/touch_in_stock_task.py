@@ -1,15 +1,14 @@
 """A gel on the left finger of the stock Panda, in ManiSkill's own PickCube: `python examples/touch_in_stock_task.py`."""
 
 import gymnasium as gym
-import sapien
 from mani_skill.envs.tasks import PickCubeEnv
 from mani_skill.utils.registration import register_env
 
-from manifeel_ms3.sensors import GelConfig, TactileSensor, TactileSensorConfig
+from manifeel_ms3.sensors import GelConfig, TactileSensor, TactileSensorConfig, grids_for, pad_pose
 
-GEL = GelConfig(size=(0.020, 0.0205))
-ON_FINGER = sapien.Pose([0, 0, 0.0465], [0.5**0.5, 0.5**0.5, 0, 0])  # across it x, to its tip z, towards the other finger -y
-PAD = TactileSensorConfig("touch", "panda_leftfinger", ON_FINGER, GEL, (200, 200), 1e-4, (10, 10), 2e-3)
+SIZE = (0.020, 0.0205)  # m, across and along the finger
+ON_LEFT = pad_pose(facing=(0, -1, 0), tip=(0, 0, 1), at=(0, 0, 0.0465))  # on the right finger: facing=(0, 1, 0)
+PAD = TactileSensorConfig("touch", "panda_leftfinger", ON_LEFT, GelConfig(SIZE), **grids_for(SIZE))
 
 
 @register_env("TouchPickCube-v1", max_episode_steps=50)
@@ -24,7 +23,10 @@ class TouchPickCubeEnv(PickCubeEnv):
 
     def _get_obs_extra(self, info):
         self.touch.capture()
-        return super()._get_obs_extra(info) | self.touch.get_obs()
+        touch = self.touch.get_obs()
+        if self.obs_mode == "state":  # which is a vector
+            touch = dict(force_field=touch["force_field"].flatten(1))
+        return super()._get_obs_extra(info) | touch
 
 
 if __name__ == "__main__":
