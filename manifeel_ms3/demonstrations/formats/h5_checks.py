@@ -106,8 +106,9 @@ def _check_episode(episode: Any, path: Path) -> None:
     """Check that the parts of an episode that are read are what they must be: groups, or arrays with so many axes."""
     if not isinstance(episode, h5py.Group):
         raise _refused(path, f"{episode.name} is not an episode")
+    flat = isinstance(episode.get("obs"), h5py.Dataset) and episode["obs"].ndim == 2  # ManiSkill's vectors of states
     for name in GROUPS:
-        if name in episode:
+        if name in episode and not (flat and name == "obs"):
             _require(isinstance(episode[name], h5py.Group), path, episode, name)
     arrays = dict(actions=2) | dict.fromkeys(PER_STEP, 1)
     sensors: Any = episode.get("obs/sensor_data", {})
