@@ -17,7 +17,7 @@ from manifeel_ms3.sensors.config import GelConfig, HousingConfig, TactileSensorC
 GEL_CENTRE = 0.082  # m along the finger, for all sensors: the R1.5's gel ends 2 mm short of the tip
 FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 FLATTENED = 5e-4  # m: 2.6 N flatten a dome with a radius of 35 mm so far (F = pi K R d^2)
-CUT = 1e-3  # m under the box: deeper than a grip of 20 N presses the box in, so that the dome then carries nothing
+CUT = 2e-3  # m under the box: deeper than 30 N on two contact points press the box in, so that the dome then carries nothing
 MIDDLE = 0.012  # m: side of the middle box; a golf ball then slips at 0.073 N m under 20 N, where the gel's patch gives 0.093
 DRAWN_POINTS, SOLID_POINTS = 41, 13  # along each side of a dome that is drawn, and that bodies collide with (chosen)
 
