@@ -109,6 +109,7 @@ def shelf(tmp_path_factory) -> Path:
             cv2.imwrite(str(shelf / f"real_pictures/{k}.png"), picture)
     module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
     (shelf / "my_module.py").write_text(module[1])
+    (shelf / "my_seeds.txt").write_text("734501\n220011\n")
     flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
     evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.sensors import pad_pose
+from tests.conftest import needs_renderer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -62,3 +63,39 @@ def test_a_pad_on_the_wrong_side_is_named(monkeypatch, caplog):
     assert squeeze(env)["extra"]["force_field"][..., 0].sum().item() > 5.0
     assert not caplog.text
     env.close()
+
+
+@needs_renderer
+def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
+    """vla-eval's own loop, server and protocol; the model is a function that stands still and writes down what it is asked."""
+    vla_eval = pytest.importorskip("vla_eval", reason="vla-eval is not installed")
+    from vla_eval.model_servers.predict import PredictModelServer
+    from vla_eval.specs import POSITION_DELTA
+
+    asked = []
+
+    class StandStill(PredictModelServer):
+        def predict(self, obs, ctx):
+            asked.append(obs)
+            return {"actions": np.zeros(6, np.float32)}
+
+        def get_action_spec(self):
+            return {"position": POSITION_DELTA}
+
+        def get_observation_spec(self):
+            return {}
+
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    params = dict(tasks=["ManiFeel-PegInsertion-v1"], obs_mode="rgb+tacrgb+tacff", env_kwargs=dict(max_episode_steps=3))
+    benchmark = dict(benchmark="vla_eval_benchmark:ManiFeelBenchmark", episodes_per_task=2, params=params)
+    (result,) = vla_eval.evaluate(StandStill(), dict(benchmarks=[benchmark]), no_save=True)
+    assert result["mean_success"] == 0.0
+    (task,) = result["tasks"]
+    assert [episode["steps"] for episode in task["episodes"]] == [3, 3]
+    assert len(asked) == 6
+    assert {name: image.shape for name, image in asked[0]["images"].items()} == dict(
+        wrist=(256, 256, 3), tactile_right=(240, 320, 3)
+    )
+    assert asked[0]["task_description"] == "Insert the peg into the hole."
+    assert np.shape(asked[0]["touch"]["right"]) == (10, 14, 3)
+    assert not np.allclose(asked[0]["state"], asked[3]["state"])  # another initial state

@@ -122,7 +122,8 @@ def _units(job: Job) -> int:
         return settings["episodes"] * settings["checkpoints"]
     args, record = training_args(job), job.needs[0]
     demos = args.num_demos or record.settings["num"]
-    samples = demos * _demonstration_steps(record.settings["env_id"])
+    steps = _demonstration_steps(record.settings["env_id"])
+    samples = demos * max(steps - args.policy.action_horizon + 1, 1)  # as `SequenceDataset` counts them
     return args.steps or default_steps(demos, samples, args.batch_size)
 
 

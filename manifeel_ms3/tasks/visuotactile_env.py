@@ -33,7 +33,7 @@ from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 from .bench import build_bench
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
-from .registry import gym_id
+from .registry import gym_id, instruction_of
 from .sensing import SensingEnv
 from .states import is_part_of, unflattened
 from .viewpoints import looking_at, looking_down
@@ -75,7 +75,8 @@ class VisuotactileEnv(SensingEnv):
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
     (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
-    the last control step, between the held object and the rest of the world) and the task's own measures.
+    the last control step, between the held object and the rest of the world) and the task's own measures. That of a reset also
+    holds `language_instruction`, the task as a sentence for each environment.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
 
@@ -330,9 +331,13 @@ class VisuotactileEnv(SensingEnv):
         self._settle(env_idx)
         for sensor in self._tactile_sensors.values():
             sensor.forget_readings(env_idx)  # those before the grip had settled
-        info = self.get_info() | dict(reconfigure=info["reconfigure"])
+        info = self.get_info() | dict(reconfigure=info["reconfigure"], language_instruction=self.get_language_instruction())
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
+
+    def get_language_instruction(self, **_kwargs: Any) -> list[str]:
+        """The task as a sentence, one for each environment; the method's name and form are those of ManiSkill's tasks."""
+        return [instruction_of(type(self))] * self.num_envs
 
     def _settle(self, env_idx: torch.Tensor) -> None:
         """Let the grip take its load before the first observation; the other environments' states are restored afterwards."""

@@ -9,10 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 import tyro
 
 from baselines.common.checkpoint import as_json
+from baselines.common.dataset import SequenceDataset
+from baselines.common.observation import observation_spec
+from baselines.common.train_args import default_steps
 from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
@@ -231,6 +236,17 @@ def test_what_is_wrong_with_a_study_is_said(study, content, word):
         read_study(study)
     if "cannot be read" not in word:  # yaml's own message has several lines
         assert len(str(error.value).splitlines()) == 1
+
+
+def test_training_is_as_long_as_the_samples_of_its_demonstrations_make_it():
+    (train, *_) = (job for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml")) if job.kind == "train")
+    args, record = training_args(train), train.needs[0].settings
+    steps = task_spec(record["env_id"]).demo_steps
+    spec = observation_spec("rgb", (), (), 32)
+    episodes = [{"actions": np.zeros((steps, 6))} | {key: np.zeros((steps + 1, 7)) for key in spec.keys}] * record["num"]
+    horizons = args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon
+    data = SequenceDataset(episodes, spec, *horizons, torch.device("cpu"))
+    assert cost._units(train) == default_steps(record["num"], len(data), args.batch_size)
 
 
 def test_a_plan_tells_the_hours_from_a_trial(study, tmp_path):

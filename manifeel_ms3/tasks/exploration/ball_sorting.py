@@ -58,6 +58,7 @@ class BallSortingRewardConfig:
 
 @register_task(
     "ManiFeel-BallSorting-v1",
+    instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,
@@ -175,6 +176,7 @@ class BallSortingEnv(VisuotactileEnv):
 
 @register_task(
     "ManiFeel-BallSortingDim-v1",
+    instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,

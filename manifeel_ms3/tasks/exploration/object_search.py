@@ -54,6 +54,7 @@ class ObjectSearchRewardConfig:
 
 @register_task(
     "ManiFeel-ObjectSearch-v1",
+    instruction="Find the battery in the container, and lift it.",
     max_episode_steps=160,
     category="exploration",
     paper_demos=50,

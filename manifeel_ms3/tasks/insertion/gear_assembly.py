@@ -30,6 +30,7 @@ class GearRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-GearAssembly-v1",
+    instruction="Put the gear onto its shaft between the two other gears.",
     max_episode_steps=390,
     category="insertion",
     paper_demos=100,

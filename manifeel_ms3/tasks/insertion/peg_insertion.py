@@ -8,6 +8,7 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PegInsertion-v1",
+    instruction="Insert the peg into the hole.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,

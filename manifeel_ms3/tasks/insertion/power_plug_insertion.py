@@ -8,6 +8,7 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PowerPlugInsertion-v1",
+    instruction="Insert the power plug into the socket.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,

@@ -8,6 +8,7 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-USBInsertion-v1",
+    instruction="Insert the USB plug into the port.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,

@@ -41,6 +41,7 @@ class BulbRandomization(ScrewingRandomization):
 
 @register_task(
     "ManiFeel-BulbInstallation-v1",
+    instruction="Screw the light bulb into its holder.",
     max_episode_steps=890,
     category="screwing",
     paper_demos=20,

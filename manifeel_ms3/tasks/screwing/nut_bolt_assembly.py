@@ -15,6 +15,7 @@ MAX_TILT = np.deg2rad(2.0)
 
 @register_task(
     "ManiFeel-NutBoltAssembly-v1",
+    instruction="Screw the nut onto the bolt.",
     max_episode_steps=810,
     category="screwing",
     paper_demos=30,
