@@ -19,7 +19,7 @@ MP4_QUALITY = 7
 """Quality of the mp4 encoding from 0 to 10, as imageio has it (chosen; captions stay sharp)."""
 WEBP_QUALITY = 70
 """Quality of the WebP encoding from 0 to 100 (chosen; captions stay sharp)."""
-WEBP_EFFORT = 6
+WEBP_EFFORT = 4
 """Effort of the WebP encoding from 0 to 6; the largest takes longer, and yields the smallest file."""
 END_SECONDS = 1.5
 """Time for which the last frame of each episode is shown, in s (chosen)."""
