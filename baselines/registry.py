@@ -17,7 +17,6 @@ from . import tactile_representations as tactile_representations  # registers it
 from .common.agent import PolicyAgent
 from .common.policy import VisuotactilePolicy
 from .common.train_args import TrainArgs
-from .common.training import train
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,8 @@ class PolicySpec:
 
     def train(self, args: TrainArgs) -> Path:
         """Train, and return the last checkpoint."""
+        from .common.training import train  # here, because it takes seconds
+
         return train(args, self.policy_class)
 
     def load(self, checkpoint: Path, **kwargs: Any) -> PolicyAgent:

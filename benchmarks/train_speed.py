@@ -106,7 +106,7 @@ def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iter
     lay_out_channels_last(policy)
     if args.compile:
         policy.encoder.compile()
-        policy.unet.compile()
+        policy.action_network.compile()
     optimizer = torch.optim.AdamW(policy.parameters(), 8e-5, fused=True)
     ema = EMAModel(policy.parameters(), power=0.75, foreach=True)
     precision = torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16")

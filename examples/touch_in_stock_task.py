@@ -1,22 +1,24 @@
-"""A gel on the left finger of the stock Panda, in ManiSkill's own PickCube: `python examples/touch_in_stock_task.py`."""
+"""A sensor on the left finger of the stock Panda, in ManiSkill's own PickCube: `python examples/touch_in_stock_task.py`."""
 
 import gymnasium as gym
 import sapien
 from mani_skill.envs.tasks import PickCubeEnv
 from mani_skill.utils.registration import register_env
 
-from manifeel_ms3.sensors import GelConfig, TactileSensor, TactileSensorConfig
+from manifeel_ms3.sensors import TactileSensor, sensor_config
 
-GEL = GelConfig(size=(0.020, 0.0205))
 ON_FINGER = sapien.Pose([0, 0, 0.0465], [0.5**0.5, 0.5**0.5, 0, 0])  # across it x, to its tip z, towards the other finger -y
-PAD = TactileSensorConfig("touch", "panda_leftfinger", ON_FINGER, GEL, (200, 200), 1e-4, (10, 10), 2e-3)
 
 
 @register_env("TouchPickCube-v1", max_episode_steps=50)
 class TouchPickCubeEnv(PickCubeEnv):
+    def __init__(self, *args, sensor: str = "gelsight_mini", **kwargs):
+        self.pad = sensor_config(sensor, "touch", "panda_leftfinger", pad_pose=ON_FINGER)
+        super().__init__(*args, **kwargs)
+
     def _after_reconfigure(self, options):
         super()._after_reconfigure(options)
-        self.touch = TactileSensor(PAD, self.scene, self.agent.robot)
+        self.touch = TactileSensor(self.pad, self.scene, self.agent.robot)
 
     def _initialize_episode(self, env_idx, options):
         super()._initialize_episode(env_idx, options)
@@ -28,5 +30,7 @@ class TouchPickCubeEnv(PickCubeEnv):
 
 
 if __name__ == "__main__":
-    obs, _ = gym.make("TouchPickCube-v1", obs_mode="state_dict", render_backend="none").reset(seed=0)
-    print(obs["extra"]["rgb"].shape, obs["extra"]["force_field"].shape)  # noqa: T201
+    for name in ("gelsight_mini", "digit"):
+        env = gym.make("TouchPickCube-v1", obs_mode="state_dict", render_backend="none", sensor=name)
+        obs, _ = env.reset(seed=0)
+        print(name, obs["extra"]["rgb"].shape, obs["extra"]["force_field"].shape)  # noqa: T201

@@ -1,4 +1,4 @@
-"""Plug-ins: tasks, policies and commands that installed packages add through entry points (`importlib.metadata`).
+"""Plug-ins: tasks, policies, sensors and commands that installed packages add through entry points (`importlib.metadata`).
 
 A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows one of each group:
 
@@ -19,6 +19,8 @@ TASKS = "manifeel.tasks"
 """Modules that register tasks when they are imported (`manifeel_ms3.tasks.registry.register_task`)."""
 POLICIES = "manifeel.policies"
 """Objects with a method `load(checkpoint, **kwargs)` that returns a `manifeel_ms3.evaluation.Policy`."""
+SENSORS = "manifeel.sensors"
+"""Functions from the name of a pad and of its link to a `manifeel_ms3.sensors.TactileSensorConfig`."""
 COMMANDS = "manifeel.commands"
 """`Command` objects."""
 

@@ -32,5 +32,5 @@ def test_touch_in_a_stock_maniskill_task():
     contact = env.agent.robot.get_net_contact_forces(["panda_leftfinger"])[0, 0].norm().item()
     assert field[..., 0].sum().item() == pytest.approx(contact, rel=0.02)
     assert contact > 5.0
-    assert obs["extra"]["rgb"].shape == (1, 200, 200, 3)
+    assert obs["extra"]["rgb"].shape == (1, 240, 320, 3)
     env.close()

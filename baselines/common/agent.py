@@ -171,7 +171,7 @@ class PolicyAgent:
             generators = [_generator_of(self.seed, place) for place in range(self.batch_size)]
             return self.policy.sample(batch, TRIAL_STEPS, generators)
 
-        network, given = self.policy.unet, []
+        network, given = self.policy.action_network, []
         handle = network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
         expected = sample()
         handle.remove()
@@ -179,13 +179,13 @@ class PolicyAgent:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch warns of shapes in Python, which are always the same here
                 traced: Any = torch.jit.trace(network, given[0], check_trace=False)
-                self.policy.unet = torch.jit.optimize_for_inference(traced)
+                self.policy.action_network = torch.jit.optimize_for_inference(traced)
             # the first calls optimise it further
             same = all(torch.allclose(sample(), expected, rtol=0.0, atol=ROUNDING) for _ in range(TRIAL_STEPS))
         except (RuntimeError, AttributeError):  # not every network can be traced
             same = False
         if not same:
-            self.policy.unet = network
+            self.policy.action_network = network
 
 
 def _generator_of(*numbers: int) -> torch.Generator:

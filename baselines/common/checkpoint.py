@@ -174,20 +174,28 @@ def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, mo
         source: The checkpoint, for the error's message.
 
     Raises:
-        CheckpointError: The weights belong to another architecture.
+        CheckpointError: The weights belong to another architecture, or something is missing or damaged.
     """
     load_weights(model, {n.removeprefix("model."): t for n, t in packed.items() if n.startswith("model.")}, source)
+    try:
+        _restore_optimizer(packed, optimizer)
+        torch.set_rng_state(packed["random"])
+        if "cuda_random" in packed and torch.cuda.is_available():
+            torch.cuda.set_rng_state(packed["cuda_random"])
+    except (LookupError, ValueError, TypeError, RuntimeError) as error:
+        raise CheckpointError(f"{source}: the state of training cannot be restored ({error}); train anew") from error
+
+
+def _restore_optimizer(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer) -> None:
+    """Restore the optimiser's moments, in the memory layout of their weights, which fused optimisers expect."""
     state: dict[int, dict[str, torch.Tensor]] = {}
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for name, tensor in packed.items():
         if name.startswith("optimizer."):
             _, index, key = name.split(".", 2)
-            own = parameters[int(index)]  # fused optimisers expect moments in the memory layout of their weights
+            own = parameters[int(index)]
             state.setdefault(int(index), {})[key] = torch.empty_like(own).copy_(tensor) if tensor.shape == own.shape else tensor
     optimizer.load_state_dict(optimizer.state_dict() | dict(state=state))
-    torch.set_rng_state(packed["random"])
-    if "cuda_random" in packed and torch.cuda.is_available():
-        torch.cuda.set_rng_state(packed["cuda_random"])
 
 
 def as_json(config: Any) -> dict[str, Any]:

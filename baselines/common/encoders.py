@@ -7,7 +7,6 @@ from pathlib import Path
 
 import torch
 import torch.nn as nn
-from transformers import ResNetConfig, ResNetModel
 
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
@@ -60,6 +59,8 @@ class ResNet18(nn.Module):
     out_channels = 512
 
     def __init__(self):
+        from transformers import ResNetConfig, ResNetModel  # here, because it takes seconds
+
         super().__init__()
         widths = [64, 128, 256, self.out_channels]
         config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", hidden_sizes=widths, embedding_size=widths[0])

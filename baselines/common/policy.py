@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, cast
+from typing import ClassVar, Literal, cast
 
 import torch
 import torch.nn as nn
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
+from .mlp import ConditionalMLP
 from .normalizer import Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
 from .unet import ConditionalUnet1D
@@ -25,6 +26,12 @@ class PolicyConfig:
     """Number of actions of a prediction that are executed before the next prediction."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
+    action_network: Literal["unet", "mlp"] = "unet"
+    """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which learns sooner on a CPU."""
+    mlp_width: int = 256
+    """Number of features of the MLP."""
+    mlp_blocks: int = 3
+    """Number of residual blocks of the MLP."""
     down_dims: tuple[int, ...] = (512, 1024, 2048)
     """Channels of the U-Net, from the finest to the coarsest scale."""
     kernel_size: int = 5
@@ -63,7 +70,7 @@ class VisuotactilePolicy(nn.Module):
     def __init__(self, config: PolicyConfig, spec: ObservationSpec, action_dim: int):
         super().__init__()
         self.config, self.spec, self.action_dim = config, spec, action_dim
-        self.encoder, self.unet = self.make_networks()
+        self.encoder, self.action_network = self.make_networks()
         sizes = {POSE: spec.pose_features} | dict.fromkeys(spec.force_fields, 3)
         self.obs_normalizers = nn.ModuleDict({module_name(key): Normalizer(size) for key, size in sizes.items()})
         self.action_normalizer = Normalizer(action_dim)
@@ -72,7 +79,7 @@ class VisuotactilePolicy(nn.Module):
         """The observation encoder, and the network over action sequences."""
         config = self.config
         encoder = ObservationEncoder(config.encoder, self.spec, config.obs_horizon)
-        return encoder, ConditionalUnet1D(self.action_dim, encoder.out_features, **unet_settings(config))
+        return encoder, make_action_network(config, self.action_dim, encoder.out_features)
 
     def generation_loss(self, clean: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The loss, a scalar, of normalised actions (B, pred_horizon, A) given conditions (B, ...)."""
@@ -134,10 +141,18 @@ def draw_rows(
     return torch.stack([draw(shape, generator=generator) for generator in generators]).to(device)
 
 
-def unet_settings(config: PolicyConfig) -> dict[str, Any]:
-    """The arguments of `ConditionalUnet1D` that a policy's settings hold."""
-    names = ("down_dims", "kernel_size", "n_groups", "diffusion_step_embed_dim")
-    return {name: getattr(config, name) for name in names}
+def make_action_network(config: PolicyConfig, action_dim: int, condition_dim: int) -> nn.Module:
+    """The network over action sequences that a policy's settings ask for.
+
+    Args:
+        config: Settings of the policy.
+        action_dim: Numbers of an action.
+        condition_dim: Numbers of a condition.
+    """
+    embedding = config.diffusion_step_embed_dim
+    if config.action_network == "mlp":
+        return ConditionalMLP(action_dim, condition_dim, config.pred_horizon, config.mlp_width, config.mlp_blocks, embedding)
+    return ConditionalUnet1D(action_dim, condition_dim, config.down_dims, config.kernel_size, config.n_groups, embedding)
 
 
 def module_name(key: str) -> str:

@@ -199,7 +199,7 @@ class Trainer:
         policy.fit_normalizers(self.dataset.observations, self.dataset.actions)
         if self.args.compile:
             policy.encoder.compile()
-            policy.unet.compile()
+            policy.action_network.compile()
         return policy
 
     def _resume(self) -> None:

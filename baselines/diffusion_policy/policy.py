@@ -5,8 +5,6 @@ from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F  # noqa: N812
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
 from baselines.common.observation import ObservationSpec
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy
@@ -32,6 +30,9 @@ class DiffusionPolicy(VisuotactilePolicy):
     config: DiffusionConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
+        from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # here, because it takes seconds
+        from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+
         super().__init__(config, spec, action_dim)
         schedule: dict[str, Any] = dict(
             num_train_timesteps=config.diffusion_steps,
@@ -45,7 +46,7 @@ class DiffusionPolicy(VisuotactilePolicy):
         """The mean squared error of the predicted noise or clean actions."""
         noise = torch.randn_like(clean)
         step: Any = torch.randint(self.config.diffusion_steps, (len(clean),), device=clean.device)
-        predicted = self.unet(self.ddpm.add_noise(clean, noise, step), step, condition)
+        predicted = self.action_network(self.ddpm.add_noise(clean, noise, step), step, condition)
         return F.mse_loss(predicted, noise if self.config.prediction == "epsilon" else clean)
 
     def generate(self, condition, steps, generators):
@@ -54,7 +55,7 @@ class DiffusionPolicy(VisuotactilePolicy):
         scheduler: Any = self.ddpm if full else self.ddim
         scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
         for step in scheduler.timesteps:
-            predicted = self.unet(actions, step.expand(len(actions)), condition)
+            predicted = self.action_network(actions, step.expand(len(actions)), condition)
             extra = dict(generator=generators) if full else {}
             actions = scheduler.step(predicted, step, actions, **extra).prev_sample
         return actions

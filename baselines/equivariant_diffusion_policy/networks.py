@@ -1,13 +1,10 @@
 """Encoder and denoiser of the equivariant policy: if the scene turns about the vertical axis, their outputs turn with it."""
 
-from typing import Any
-
 import torch
 import torch.nn as nn
 
 from baselines.common.encoders import EncoderConfig, by_name, field_encoder, image_encoder, network_images
 from baselines.common.observation import POSE, ObservationSpec, is_tactile
-from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .groups import ORDER, GroupConv, from_regular, representation, to_regular, turned
@@ -93,16 +90,15 @@ class EquivariantObservationEncoder(nn.Module):
         return torch.cat([*images, *fields], dim=-1)
 
 
-class EquivariantUnet(nn.Module):
-    """One U-Net predicts in every frame from the actions and the condition in that frame; the output is the mean of all frames.
+class EquivariantActionNetwork(nn.Module):
+    """One network predicts in every frame from the actions and condition in that frame; the output is the mean of all frames.
 
-    The U-Net sees actions as regular fields, and what it predicts is turned back into actions.
+    The network sees actions as regular fields, and what it predicts is turned back into actions.
 
     Args:
         action_dim: Numbers of an action.
-        condition_dim: Numbers of the condition in a frame.
         fields: Number of regular fields for an action.
-        **unet: Further arguments of `ConditionalUnet1D`.
+        network: Network from fields (B, T, fields), steps (B,) and the condition in a frame (B, C) to fields (B, T, fields).
 
     Raises:
         InvalidArgumentError: It is not known how actions of so many numbers turn.
@@ -110,7 +106,7 @@ class EquivariantUnet(nn.Module):
 
     turns: torch.Tensor
 
-    def __init__(self, action_dim: int, condition_dim: int, fields: int, **unet: Any):
+    def __init__(self, action_dim: int, fields: int, network: nn.Module):
         super().__init__()
         if action_dim not in ACTION_PAIRS:
             raise InvalidArgumentError(
@@ -118,12 +114,12 @@ class EquivariantUnet(nn.Module):
                 "ACTION_PAIRS"
             )
         self.embed = nn.Sequential(nn.Linear(action_dim, fields), nn.ReLU())
-        self.unet = ConditionalUnet1D(fields, condition_dim, **unet)
+        self.network = network
         self.out = nn.Linear(fields, action_dim)
         self.register_buffer("turns", representation(action_dim, ACTION_PAIRS[action_dim]), persistent=False)
 
     def forward(self, actions: torch.Tensor, step: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The prediction (B, T, A) for actions (B, T, A) at steps (B,), given conditions (B, 8, C)."""
         regular = self.embed(to_regular(actions, self.turns)).flatten(0, 1)
-        predicted = self.out(self.unet(regular, step.repeat(ORDER), condition.movedim(1, 0).flatten(0, 1)))
+        predicted = self.out(self.network(regular, step.repeat(ORDER), condition.movedim(1, 0).flatten(0, 1)))
         return from_regular(predicted.view(ORDER, *actions.shape), self.turns)

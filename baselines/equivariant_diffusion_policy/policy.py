@@ -8,10 +8,10 @@ import torch
 from baselines.common.encoders import EncoderConfig
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE
-from baselines.common.policy import unet_settings
+from baselines.common.policy import make_action_network
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 
-from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantObservationEncoder, EquivariantUnet
+from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantActionNetwork, EquivariantObservationEncoder
 
 
 @dataclass
@@ -29,7 +29,7 @@ class EquivariantConfig(DiffusionConfig):
     """Number of regular fields of each camera's features and of an observation; each has eight numbers, one for every rotation
     of C8."""
     action_fields: int = 64
-    """Number of regular fields that the U-Net has for an action."""
+    """Number of regular fields that the network over action sequences has for an action."""
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):
@@ -42,8 +42,8 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
     def make_networks(self):
         config = self.config
         encoder = EquivariantObservationEncoder(config.encoder, self.spec, config.hidden, config.obs_horizon)
-        unet = EquivariantUnet(self.action_dim, encoder.out_features, config.action_fields, **unet_settings(config))
-        return encoder, unet
+        network = make_action_network(config, config.action_fields, encoder.out_features)
+        return encoder, EquivariantActionNetwork(self.action_dim, config.action_fields, network)
 
     def fit_normalizers(self, observations, actions):
         super().fit_normalizers(observations, actions)

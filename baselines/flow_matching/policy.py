@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 import torch.nn.functional as F  # noqa: N812
 
-from baselines.common.policy import PolicyConfig, VisuotactilePolicy
+from baselines.common.policy import PolicyConfig, VisuotactilePolicy, draw_rows
 
 TIME_SCALE = 100.0
 """Factor from a time in [0, 1] to the range of diffusion steps for which the U-Net's embedding is made."""
@@ -48,15 +48,13 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         """Factor from a time in [0, 1] to what the network is given."""
         return 1.0 if self.config.public_code else TIME_SCALE
 
-    def noise(self, condition, generator):
-        if not self.config.public_code:
-            return super().noise(condition, generator)
-        shape = (len(condition), self.config.pred_horizon, self.action_dim)
-        return torch.rand(shape, generator=generator, device=condition.device)
+    def noise(self, condition, generators):
+        draw = torch.rand if self.config.public_code else torch.randn
+        return draw_rows(draw, (self.config.pred_horizon, self.action_dim), generators, condition.device)
 
     def velocity(self, x: torch.Tensor, time: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The velocity (B, T, A) at points x (B, T, A) and times (B,) in [0, 1]."""
-        predicted = self.unet(x, self.time_scale * time, condition)
+        predicted = self.action_network(x, self.time_scale * time, condition)
         if self.config.prediction == "velocity":
             return predicted
         return (predicted - x) / _column((1 - time).clamp(min=self.config.interval))
@@ -65,7 +63,7 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         noise, time = torch.randn_like(clean), torch.rand(len(clean), device=clean.device)
         if self.config.consistency:
             return self._consistency_loss(noise, clean, time, condition)
-        predicted = self.unet(_between(noise, clean, time), self.time_scale * time, condition)
+        predicted = self.action_network(_between(noise, clean, time), self.time_scale * time, condition)
         return F.mse_loss(predicted, clean - noise if self.config.prediction == "velocity" else clean)
 
     def _consistency_loss(self, noise, clean, time, condition):

@@ -4,14 +4,18 @@ CLIP's ViT-L/14 with additional tokens that name the sensor; an image enters as 
 the class token, normalised and projected to CLIP's embedding space, as in the paper's public code. 305 M parameters.
 """
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn as nn
-from transformers import CLIPVisionConfig, CLIPVisionModel
 
 from .representation import ColourNormalisation, TokenRepresentation, under_prefix
 from .vit import interpolate_pos_embed
+
+if TYPE_CHECKING:
+    from transformers import CLIPVisionConfig
 
 SENSORS = {"gelsight": 0, "digit": 1, "gelslim": 2, "gelsight_mini": 3, "duragel": 4, "universal": 9}
 """Indices of the sensors among the tokens of the published checkpoint; "universal" stands for any sensor. The paper's public
@@ -29,7 +33,7 @@ ONLY_FOR_TRAINING = (
 )
 """Beginnings of the names of weights that the feature does not depend on: the decoder of masked autoencoding, and the patch
 embedding of single images, in whose place the video's is used."""
-VIT_LARGE = CLIPVisionConfig(
+VIT_LARGE: dict[str, Any] = dict(
     hidden_size=1024,
     intermediate_size=4096,
     num_hidden_layers=24,
@@ -38,6 +42,7 @@ VIT_LARGE = CLIPVisionConfig(
     projection_dim=768,
     hidden_act="gelu",  # as the checkpoint of CLIP has it that AnyTouch begins with (laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K)
 )
+"""Settings of CLIP's vision model."""
 
 
 class AnyTouch(TokenRepresentation):
@@ -47,8 +52,11 @@ class AnyTouch(TokenRepresentation):
     released = "checkpoint.pth of AnyTouch"
     sensors, sensor = SENSORS, "gelsight"
 
-    def __init__(self, config: CLIPVisionConfig = VIT_LARGE):
+    def __init__(self, config: CLIPVisionConfig | None = None):
+        from transformers import CLIPVisionConfig, CLIPVisionModel  # here, because it takes seconds
+
         super().__init__()
+        config = config or CLIPVisionConfig(**VIT_LARGE)
         self.width, self.out_features = config.hidden_size, config.projection_dim
         self.sensor_token = nn.Parameter(torch.zeros(NUM_SENSORS, SENSOR_TOKENS, self.width))
         clip = CLIPVisionModel(config)

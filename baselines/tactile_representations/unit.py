@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import torch
 import torch.nn as nn
-from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (diffusers imports lazily)
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
@@ -40,6 +39,8 @@ class UniT(Representation):
     released = "a checkpoint of UniT's VQGAN"
 
     def __init__(self, channels: tuple[int, ...] = CHANNELS, attention: bool = False):
+        from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (here, because it takes seconds)
+
         super().__init__()
         self.size = 128 if attention else 256
         coarsest = "Attn" if attention else ""

@@ -20,9 +20,12 @@ from mani_skill.agents.controllers import (
     PDJointPosController,
     PDJointPosControllerConfig,
 )
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.utils import common
 from mani_skill.utils.geometry.rotation_conversions import (
     axis_angle_to_quaternion,
+    euler_angles_to_matrix,
+    matrix_to_quaternion,
     quaternion_invert,
     quaternion_multiply,
     quaternion_to_axis_angle,
@@ -48,10 +51,33 @@ def rotation_between(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
     return quaternion_to_axis_angle(turn)
 
 
-class LimitedLeadEEPoseController(PDEEPoseController):
-    """Delta pose control of the tool about the base frame's axes; the target's lead over the tool is limited.
+def solve_ik(kinematics: Kinematics, pose: Pose, q0: torch.Tensor, iterations: int = 1) -> torch.Tensor:
+    """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0`.
 
-    Action +-1 maps to `pos_upper` metres along and `rot_upper` radians about each axis of the base frame, right-hand rule.
+    On a GPU this takes `iterations` Levenberg-Marquardt steps; on the CPU Gauss-Newton runs to convergence. Where no solution
+    is found the nearest iterate is returned: a target out of reach must not stop the arm dead.
+    """
+    joints = kinematics.active_joint_indices
+    if kinematics.use_gpu_ik:
+        q = q0.clone()
+        for _ in range(iterations):
+            q[:, joints] = kinematics.compute_ik(pose, q)
+        return q[:, joints]
+    start = q0[0, kinematics.pmodel_active_joint_indices].cpu().numpy()
+    # dt = 1 makes the damped iteration Gauss-Newton; the stock 0.1 stops 0.1 mm short
+    solution, _, _ = kinematics.pmodel.compute_inverse_kinematics(
+        kinematics.end_link_idx, pose.sp, start, kinematics.qmask, eps=IK_TOLERANCE, max_iterations=IK_ITERATIONS, dt=1.0
+    )
+    limits = kinematics.articulation.get_qlimits()[0, joints]
+    q = common.to_tensor(solution[kinematics.pmodel_controlled_joint_indices], device=kinematics.device).float()
+    return q.clamp(limits[:, 0], limits[:, 1])[None]
+
+
+class LimitedLeadEEPoseController(PDEEPoseController):
+    """Pose control of the tool about the base frame's axes; the target's lead over the tool is limited.
+
+    A delta action of +-1 maps to `pos_upper` metres along and `rot_upper` radians about each axis of the base frame, right-hand
+    rule. An absolute action (`use_delta=False`) is ManiSkill's: position in m, and Euler angles XYZ in rad.
     """
 
     config: "LimitedLeadEEPoseControllerConfig"
@@ -61,20 +87,36 @@ class LimitedLeadEEPoseController(PDEEPoseController):
         high = np.r_[np.full(3, self.config.pos_upper), np.full(rotations, self.config.rot_upper)].astype(np.float32)
         self.single_action_space = spaces.Box(-high, high, dtype=np.float32)
 
+    def _clip_and_scale_action_space(self):
+        super()._clip_and_scale_action_space()
+        self._scale = self.action_space_high
+        # ManiSkill's conversion of actions (`from_pd_joint_pos_to_ee`), which divides by these bounds, takes it that rotations
+        # are flipped, as its own controllers flip them
+        sign = torch.ones_like(self._scale)
+        sign[3:] = -1.0
+        self.action_space_low, self.action_space_high = self.action_space_low * sign, self.action_space_high * sign
+
     def _clip_and_scale_action(self, action):
         # not the stock scaling: that one multiplies rotations by their lower bound, which flips their sign
-        return action.clamp(-1.0, 1.0) * self.action_space_high
+        return action.clamp(-1.0, 1.0) * self._scale
 
     def set_action(self, action):
-        delta = self._preprocess_action(action)
+        action = self._preprocess_action(action)
+        self._target_pose = self._moved(action) if self.config.use_delta else self._absolute(action)
+        self.set_drive_targets(solve_ik(self.kinematics, self._target_pose, self.articulation.get_qpos()))
+
+    def _moved(self, delta: torch.Tensor) -> Pose:
+        """The commanded pose, moved by a delta in m and rad."""
         turn = delta.new_zeros(len(delta), 3)
         turn[:, list(self.config.rotation_axes)] = delta[:, 3:]
         turn[:, list(self.config.locked_axes)] = 0.0
         base = self.commanded_pose
-        self._target_pose = Pose.create_from_pq(
-            base.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), base.q)
-        )
-        self.set_drive_targets(self.solve_ik(self._target_pose))
+        return Pose.create_from_pq(base.p + delta[:, :3], quaternion_multiply(axis_angle_to_quaternion(turn), base.q))
+
+    def _absolute(self, action: torch.Tensor) -> Pose:
+        """The pose of an absolute action (m, and Euler angles in rad), its lead over the tool limited."""
+        rotation = matrix_to_quaternion(euler_angles_to_matrix(action[:, 3:], "XYZ"))
+        return self._limit_lead(Pose.create_from_pq(action[:, :3], rotation), self.ee_pose_at_base)
 
     @property
     def commanded_pose(self) -> Pose:
@@ -88,32 +130,9 @@ class LimitedLeadEEPoseController(PDEEPoseController):
             quaternion_multiply(axis_angle_to_quaternion(turn), current.q),
         )
 
-    def solve_ik(self, pose: Pose, q0: torch.Tensor | None = None, iterations: int = 1) -> torch.Tensor:
-        """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0`.
-
-        On a GPU this takes `iterations` Levenberg-Marquardt steps; on the CPU Gauss-Newton runs to convergence. Where no
-        solution is found the nearest iterate is returned: a target out of reach must not stop the arm dead.
-        """
-        q0 = self.articulation.get_qpos() if q0 is None else q0
-        if self.kinematics.use_gpu_ik:
-            q = q0.clone()
-            for _ in range(iterations):
-                q[:, self.active_joint_indices] = self.kinematics.compute_ik(
-                    pose, q, solver_config=self.config.delta_solver_config
-                )
-            return q[:, self.active_joint_indices]
-        solver = self.kinematics
-        start = q0[0, solver.pmodel_active_joint_indices].cpu().numpy()
-        # dt = 1 makes the damped iteration Gauss-Newton; the stock 0.1 stops 0.1 mm short
-        solution, _, _ = solver.pmodel.compute_inverse_kinematics(
-            solver.end_link_idx, pose.sp, start, solver.qmask, eps=IK_TOLERANCE, max_iterations=IK_ITERATIONS, dt=1.0
-        )
-        limits = self.articulation.get_qlimits()[0, self.active_joint_indices]
-        q = common.to_tensor(solution[solver.pmodel_controlled_joint_indices], device=self.device).float()
-        return q.clamp(limits[:, 0], limits[:, 1])[None]
-
     def set_state(self, state: dict):
-        self._target_pose = Pose.create(state["target_pose"])
+        if state:  # that of another controller has none
+            self._target_pose = Pose.create(state["target_pose"])
 
 
 @dataclass
@@ -121,20 +140,21 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     """Configuration of `LimitedLeadEEPoseController`."""
 
     pos_lower: float = -0.01
-    """Translation of an action of -1, in m."""
+    """Translation of a delta action of -1, in m; lowest coordinate of an absolute action."""
     pos_upper: float = 0.01
-    """Translation of an action of 1, in m (public code of the paper)."""
+    """Translation of a delta action of 1, in m (public code of the paper); highest coordinate of an absolute action."""
     rot_lower: float = -0.05
-    """Rotation of an action of -1, in rad."""
+    """Rotation of a delta action of -1, in rad; lowest angle of an absolute action."""
     rot_upper: float = 0.05
-    """Rotation of an action of 1, in rad (public code of the paper)."""
+    """Rotation of a delta action of 1, in rad (public code of the paper); highest angle of an absolute action."""
     rotation_axes: Sequence[int] = (0, 1, 2)
     """Axes of the base frame that have a rotation action; (2,) is yaw alone."""
     locked_axes: Sequence[int] = ()
     """Axes of the base frame whose rotation action is ignored, as the paper's public code sets it to zero."""
     target_lead_limit_pos: float = 0.006
-    """Largest lead of the target over the tool before a command is added, in m. The arm's lag at full speed is 5.8 mm (joint
-    time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds the force near 16 N."""
+    """Largest lead of the target over the tool before a delta is added, or of an absolute target, in m. The arm lags at full
+    speed by 5.8 mm (joint time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds
+    the force near 16 N."""
     target_lead_limit_rot: float = 0.04
     """The same for rotation, in rad."""
     use_target: bool = True
@@ -155,6 +175,14 @@ class HoldGripperController(PDJointPosController):
 
     def set_action(self, action):
         pass
+
+    def get_state(self) -> dict:
+        return {"target_qpos": self.articulation.get_drive_targets()[:, self.active_joint_indices]}
+
+    def set_state(self, state: dict):
+        if state:  # files that were recorded before grips were recorded have none
+            targets = common.to_tensor(state["target_qpos"], device=self.device).reshape(-1, len(self.joints))
+            self.set_drive_targets(targets)
 
 
 @dataclass

@@ -1,7 +1,8 @@
-"""The robot of every ManiFeel task: a Franka Panda with a GelSight R1.5 finger on each side and a wrist camera."""
+"""The robot of every ManiFeel task: a Franka Panda with a tactile finger on each side and a wrist camera."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (ManiSkill builds controller configurations from dicts of mixed types, and annotates a combined controller by its base class)
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +14,7 @@ from mani_skill.agents.controllers import (
     PDJointPosMimicControllerConfig,
     deepcopy_dict,
 )
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
@@ -21,7 +23,8 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
-from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseControllerConfig
+from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseController, LimitedLeadEEPoseControllerConfig, solve_ik
+from .fingers import Finger
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
 GEL_STIFFNESS = 16000.0
@@ -45,25 +48,39 @@ FINGER_RANGE = (-0.01, 0.04)
 distance."""
 IK_STEPS = 20
 """Number of Levenberg-Marquardt steps of the inverse kinematics at a reset on a GPU."""
-_TURNS = ("roll", "pitch", "yaw")
+JOINT_DELTA = 0.1
+"""Largest change of a joint's target in a step of the delta controllers of joints, in rad (ManiSkill's Panda)."""
+ABSOLUTE_LEAD_POS, ABSOLUTE_LEAD_ROT = 0.024, 0.127
+"""Largest lead of an absolute target over the tool, in m and rad: the lead limit of delta control and, along the diagonal, one
+step of it, so that an absolute action can do what a delta action can."""
+ABSOLUTE_RANGE_POS, ABSOLUTE_RANGE_ROT = 2.0, 2 * np.pi
+"""Largest coordinate, in m, and angle, in rad, of an absolute action (ManiSkill's Panda)."""
+FIXED_GRIPPER = "_fixed_gripper"
+"""End of the names of control modes without an action of the gripper, which keeps its grip."""
+_POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 ACTION_AXES = {
-    "pd_ee_delta_pose": ("x", "y", "z", *_TURNS, "gripper"),
-    "pd_ee_delta_pose_fixed_gripper": ("x", "y", "z", *_TURNS),
-    "pd_ee_delta_pose_fixed_roll_pitch": ("x", "y", "z", *_TURNS, "gripper"),
-    "pd_ee_delta_pose_fixed_rotation": ("x", "y", "z", *_TURNS, "gripper"),
+    "pd_ee_delta_pose": (*_POSE, "gripper"),
+    "pd_ee_delta_pose_fixed_gripper": _POSE,
+    "pd_ee_delta_pose_fixed_roll_pitch": (*_POSE, "gripper"),
+    "pd_ee_delta_pose_fixed_rotation": (*_POSE, "gripper"),
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
-"""Meaning of the components of an action by controller, in their order; rotations are about the base's axes."""
+"""Meaning of the components of an action by delta controller, in their order; rotations are about the base's axes."""
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
 WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
 
 
 @register_agent()
 class PandaGelSight(BaseAgent):
-    """Panda arm, Franka hand, two GelSight R1.5 fingers.
+    """Panda arm, Franka hand, two fingers with gels: GelSight R1.5, or of the sizes given.
 
     The gel is a compliant contact: PhysX takes a negative restitution as a spring (N/m per contact point). Pads are the links
     `gel_left` and `gel_right`; the tool centre point lies between their centres, z along the fingers.
+
+    Args:
+        args: Positional arguments of ManiSkill's `BaseAgent`.
+        finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
+        kwargs: Other arguments of ManiSkill's `BaseAgent`.
     """
 
     uid = "panda_gelsight"
@@ -93,24 +110,55 @@ class PandaGelSight(BaseAgent):
 
     mounted_cameras: tuple[str, ...] = ("wrist",)
 
+    def __init__(self, *args, finger: Finger | None = None, **kwargs):
+        self.finger = finger or Finger()
+        super().__init__(*args, **kwargs)
+
     @property
     def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return panda_gelsight_urdf(visuals=self.scene.can_render())
+        return panda_gelsight_urdf(self.scene.can_render(), self.finger)
 
     @property
     def _controller_configs(self):
-        pose = dict(
-            joint_names=self.arm_joint_names,
-            stiffness=ARM_STIFFNESS,
-            damping=ARM_DAMPING,
-            force_limit=ARM_FORCE_LIMIT,
-            ee_link=self.ee_link_name,
-            urdf_path=self.urdf_path,
+        drive = dict(
+            joint_names=self.arm_joint_names, stiffness=ARM_STIFFNESS, damping=ARM_DAMPING, force_limit=ARM_FORCE_LIMIT
         )
+        pose = drive | dict(ee_link=self.ee_link_name, urdf_path=self.urdf_path)
         delta_pose = LimitedLeadEEPoseControllerConfig(**pose)
+        absolute_pose = LimitedLeadEEPoseControllerConfig(
+            **pose,
+            use_delta=False,
+            normalize_action=False,
+            pos_upper=ABSOLUTE_RANGE_POS,
+            rot_upper=ABSOLUTE_RANGE_ROT,
+            target_lead_limit_pos=ABSOLUTE_LEAD_POS,
+            target_lead_limit_rot=ABSOLUTE_LEAD_ROT,
+        )
         level = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1))
         unturned = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1, 2))
         delta_yaw = LimitedLeadEEPoseControllerConfig(**pose, rotation_axes=(2,))
+        joint_delta = drive | dict(lower=-JOINT_DELTA, upper=JOINT_DELTA, use_delta=True)
+        arms = dict(  # every one of these also with a gripper that keeps its grip
+            pd_ee_delta_pose=delta_pose,
+            pd_ee_pose=absolute_pose,
+            pd_joint_pos=PDJointPosControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
+            pd_joint_delta_pos=PDJointPosControllerConfig(**joint_delta),
+            pd_joint_target_delta_pos=PDJointPosControllerConfig(**joint_delta, use_target=True),
+        )
+        gripper, hold = self._gripper_configs
+        return deepcopy_dict(
+            {name: dict(arm=arm, gripper=gripper) for name, arm in arms.items()}
+            | {name + FIXED_GRIPPER: dict(arm=arm, gripper=hold) for name, arm in arms.items()}
+            | dict(
+                pd_ee_delta_pose_fixed_roll_pitch=dict(arm=level, gripper=gripper),  # 7-D, of which two do nothing
+                pd_ee_delta_pose_fixed_rotation=dict(arm=unturned, gripper=gripper),  # 7-D, of which three do nothing
+                pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper),  # 5-D
+            )
+        )
+
+    @property
+    def _gripper_configs(self):
+        """The gripper that an action opens and closes, and the one that keeps its grip."""
         gripper = PDJointPosMimicControllerConfig(
             self.gripper_joint_names,
             lower=FINGER_RANGE[0],
@@ -128,25 +176,7 @@ class PandaGelSight(BaseAgent):
             damping=HOLD_DAMPING,
             force_limit=HOLD_FORCE_LIMIT,
         )
-        joints = PDJointPosControllerConfig(
-            self.arm_joint_names,
-            None,
-            None,
-            stiffness=ARM_STIFFNESS,
-            damping=ARM_DAMPING,
-            force_limit=ARM_FORCE_LIMIT,
-            normalize_action=False,
-        )
-        return deepcopy_dict(
-            dict(
-                pd_ee_delta_pose=dict(arm=delta_pose, gripper=gripper),  # 7-D
-                pd_ee_delta_pose_fixed_gripper=dict(arm=delta_pose, gripper=hold),  # 6-D
-                pd_ee_delta_pose_fixed_roll_pitch=dict(arm=level, gripper=gripper),  # 7-D, of which two do nothing
-                pd_ee_delta_pose_fixed_rotation=dict(arm=unturned, gripper=gripper),  # 7-D, of which three do nothing
-                pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper),  # 5-D
-                pd_joint_pos=dict(arm=joints, gripper=gripper),
-            )
-        )
+        return gripper, hold
 
     @property
     def _sensor_configs(self):
@@ -218,8 +248,15 @@ class PandaGelSight(BaseAgent):
 
     def solve_ik(self, pose: Pose, q0: torch.Tensor) -> torch.Tensor:
         """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
-        controller = self.controller.controllers["arm"]
-        return controller.solve_ik(pose, q0, iterations=IK_STEPS)
+        return solve_ik(self._kinematics, pose, q0, iterations=IK_STEPS)
+
+    @cached_property
+    def _kinematics(self) -> Kinematics:
+        """Kinematics of the arm: the controller's own, or one for a controller of joints, which has none."""
+        arm = self.controller.controllers["arm"]
+        if isinstance(arm, LimitedLeadEEPoseController):
+            return arm.kinematics
+        return Kinematics(self.urdf_path, self.ee_link_name, self.robot, arm.active_joint_indices)
 
     def pad_wrench(self, side: str) -> torch.Tensor:
         """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame: the sums over its TacFF."""

@@ -1,4 +1,4 @@
-"""The Panda with two GelSight R1.5 fingers as a URDF, derived from the one that ManiSkill ships.
+"""The Panda with two fingers that carry gels as a URDF, derived from the one that ManiSkill ships.
 
 Arm and hand keep their kinematics, inertia and convex collision shapes. Their visual meshes are decimated (a software
 renderer transforms every vertex, and the packaged arm has 150,000 triangles), the fingers are replaced, and a gel pad hangs on
@@ -25,9 +25,9 @@ from trimesh.exchange.gltf import export_glb
 
 from manifeel_ms3.paths import cache_dir, writable_cache
 
-FINGER_SIZE = (0.030, 0.023, 0.100)  # m: across, deep, long; 26 mm deep with the 3 mm gel (GelSight R1.5 finger)
-GEL_SIZE = (0.024, 0.032, 0.003)  # m: across, along the finger, thick
-GEL_CENTRE = 0.082  # m along the finger: the gel ends 2 mm short of the tip
+from . import fingers
+from .fingers import GEL_CENTRE, Finger, gel_pad, replace_finger
+
 HAND_TO_FINGER = 0.0584  # m: hand frame to finger frame, from the Panda's URDF
 HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
 TRIANGLES_PER_MESH = 1200  # with so many, a link's silhouette moves by less than a pixel at 256 x 256
@@ -36,34 +36,36 @@ FEWEST_TRIANGLES = 24  # of a small part of a mesh, which would vanish with its 
 SMOOTH_ANGLE = np.deg2rad(35)  # edges that are sharper stay sharp; chosen by eye
 NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; by eye
 ROUGHNESS = 0.35  # of the arm's painted and plastic surfaces; by eye
-FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
 
 
-def panda_gelsight_urdf(visuals: bool = True) -> str:
+def panda_gelsight_urdf(visuals: bool = True, finger: Finger | None = None) -> str:
     """Path of the derived URDF; it and the low-poly meshes are made on the first call and cached.
 
     Args:
         visuals: Whether links have visual meshes. Without them the file can be loaded where there is no renderer at all: SAPIEN
             makes a render material for every visual.
+        finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
     """
-    # the key covers everything the files are made from: this module, the package's URDF, and where the package lies
-    recipe = Path(__file__).read_bytes() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
+    finger = finger or Finger()
+    # the key covers everything the files are made from: the modules, the finger, the package's URDF, and where it lies
+    modules = Path(__file__).read_bytes() + Path(fingers.__file__).read_bytes()
+    recipe = modules + repr(finger).encode() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
     folder = cache_dir() / f"panda_gelsight-{hashlib.sha256(recipe).hexdigest()[:12]}"
     if not (folder / "panda.urdf").is_file():
-        _build_into(folder)
+        _build_into(folder, finger)
     return str(folder / ("panda.urdf" if visuals else "panda_bare.urdf"))
 
 
-def _build_into(folder: Path) -> None:
+def _build_into(folder: Path, finger: Finger) -> None:
     """Build in a temporary folder and move it in place, so that processes that start together do not disturb each other."""
     with writable_cache(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
         work = Path(scratch) / "new"
         work.mkdir()
         tree = ET.parse(_SOURCE / "panda_v2.urdf")
-        _derive(tree.getroot(), work)
+        _derive(tree.getroot(), work, finger)
         tree.write(work / "panda.urdf")
         for link in tree.getroot().iter("link"):
             for visual in link.findall("visual"):
@@ -78,14 +80,14 @@ def _build_into(folder: Path) -> None:
                 raise
 
 
-def _derive(robot: ET.Element, work: Path) -> None:
+def _derive(robot: ET.Element, work: Path, finger: Finger) -> None:
     for element in list(robot):
         if "pad" in element.get("name", ""):  # the stock pads are bare frames; the gel links replace them
             robot.remove(element)
     for link in robot.iter("link"):
         name = link.get("name", "")
         if "finger" in name:
-            _replace_finger(link, side=next(side for side, (finger, _) in _FINGERS.items() if finger == name))
+            replace_finger(link, next(outward for own, outward in _FINGERS.values() if own == name), finger)
         for mesh in link.iterfind("visual/geometry/mesh"):
             low_poly = _decimate(_SOURCE / mesh.attrib["filename"], work)
             mesh.set("filename", low_poly)
@@ -94,8 +96,8 @@ def _derive(robot: ET.Element, work: Path) -> None:
     tcp = robot.find("joint[@name='panda_hand_tcp_joint']/origin")
     assert tcp is not None
     tcp.set("xyz", f"0 0 {HAND_TO_TCP}")
-    for side, (finger, outward) in _FINGERS.items():
-        robot.extend(_gel(side, finger, outward))
+    for side, (parent, outward) in _FINGERS.items():
+        robot.extend(gel_pad(side, parent, outward, finger, work))
 
 
 def _decimate(source: Path, work: Path) -> str:
@@ -150,50 +152,3 @@ def _nearest_normals(mesh: trimesh.Trimesh, full: trimesh.Trimesh) -> np.ndarray
     normals = candidates[np.arange(len(best)), best]
     defined = np.linalg.norm(normals, axis=1, keepdims=True) > 0.5  # vertices of empty triangles have none
     return np.where(defined, normals, mesh.vertex_normals)
-
-
-def _replace_finger(link: ET.Element, side: str) -> None:
-    for tag in ("visual", "collision", "inertial"):
-        for element in link.findall(tag):
-            link.remove(element)
-    _, outward = _FINGERS[side]
-    _, deep, long = FINGER_SIZE
-    centre = (0.0, outward * (GEL_SIZE[2] + deep / 2), long / 2)
-    _add_box(link, FINGER_SIZE, centre, colour="0.16 0.16 0.18 1")
-    _add_inertia(link, mass=FINGER_MASS, size=FINGER_SIZE, centre=centre)
-
-
-def _gel(side: str, finger: str, outward: float) -> tuple[ET.Element, ET.Element]:
-    name = f"gel_{side}"
-    link = ET.Element("link", name=name)
-    centre = (0.0, 0.0, -GEL_SIZE[2] / 2)
-    _add_box(link, GEL_SIZE, centre, colour="0.75 0.77 0.8 1")
-    _add_inertia(link, mass=GEL_MASS, size=GEL_SIZE, centre=centre)
-    joint = ET.Element("joint", name=f"{name}_joint", type="fixed")
-    ET.SubElement(joint, "parent", link=finger)
-    ET.SubElement(joint, "child", link=name)
-    # columns of the rotation: pad x, y, z in the finger frame; roll +90 deg for z = -y (left), -90 deg for z = +y (right)
-    rpy = f"{np.pi / 2} 0 0" if outward > 0 else f"{np.pi / 2} 0 {np.pi}"
-    ET.SubElement(joint, "origin", xyz=f"0 0 {GEL_CENTRE}", rpy=rpy)
-    return link, joint
-
-
-def _add_box(link: ET.Element, size: tuple, centre: tuple, colour: str) -> None:
-    for tag in ("visual", "collision"):
-        shape = ET.SubElement(link, tag)
-        ET.SubElement(shape, "origin", xyz=_text(centre), rpy="0 0 0")
-        ET.SubElement(ET.SubElement(shape, "geometry"), "box", size=_text(size))
-        if tag == "visual":
-            ET.SubElement(ET.SubElement(shape, "material", name=link.get("name", "")), "color", rgba=colour)
-
-
-def _add_inertia(link: ET.Element, mass: float, size: tuple, centre: tuple) -> None:
-    inertial = ET.SubElement(link, "inertial")
-    ET.SubElement(inertial, "origin", xyz=_text(centre), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=str(mass))
-    xx, yy, zz = (mass / 12 * (sum(s * s for s in size) - size[axis] ** 2) for axis in range(3))
-    ET.SubElement(inertial, "inertia", ixx=f"{xx}", iyy=f"{yy}", izz=f"{zz}", ixy="0", ixz="0", iyz="0")
-
-
-def _text(values: tuple) -> str:
-    return " ".join(str(v) for v in values)

@@ -48,6 +48,8 @@ class Args:
     """Cameras to record."""
     tactile_sensors: tuple[str, ...] = SIDES
     """Sides of the tactile sensors to record."""
+    sensor: str | None = None
+    """Sensor on the fingers: gelsight_r15, gelsight_mini, digit, or one of another package; the task's default if not given."""
     env_kwargs: str = "{}"
     """Further arguments of the task as json, such as '{"fit": "tight", "randomization": {"socket_xy": 0.01}}'."""
     max_tries: int = 10
@@ -89,7 +91,8 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     """
     require_demonstrator(args.env_id)
     path, seeds = args.path, args.seeds
-    images = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
+    sensor = {} if args.sensor is None else dict(sensor=args.sensor)
+    images = sensor | dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     env_kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | images | json_object("--env-kwargs", args.env_kwargs)
     header = make_header(args.env_id, env_kwargs) | dict(failed_seeds=[])
     with open_recording(path, header, seeds) as recording:

@@ -26,6 +26,7 @@ from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
 
 from .checkpoint_config import CheckpointError, checkpoint_config
@@ -63,6 +64,9 @@ class Args:
     """Cameras that the policy observes, for a --policy; the task's policy camera if not given. A checkpoint brings its own."""
     tactile_sensors: tuple[str, ...] = ("right",)
     """Finger pads that the policy observes, for a --policy: left, right, or both. A checkpoint brings its own."""
+    sensor: str | None = None
+    """Sensor on the fingers, for a --policy: gelsight_r15, gelsight_mini, digit, or one of another package. A checkpoint brings
+    that of its demonstrations, and --env-kwargs '{"sensor": "digit"}' evaluates it with another one."""
     out: Path | None = None
     """Path of the result file; evaluation.json in the checkpoint's run folder, or in the working directory, if not given. The
     finished episodes of an evaluation that was interrupted are in <name>.episodes.jsonl beside it."""
@@ -182,7 +186,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
     if unused := [name for name in ("device", "batch_size") if getattr(args, name) is not None]:
         raise InvalidArgumentError(f"{_flags(unused)} are for a --checkpoint; tell a --policy of your own by --policy-kwargs")
     env_id = task_spec(args.env_id).env_id
-    sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors)
+    sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
     env_kwargs = {n: v for n, v in sensing.items() if v is not None} | BACKEND | given
@@ -199,6 +203,11 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     env_id = task_spec(config["env_id"]).env_id
     trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
     sensing = {name: config[name] for name in SENSING}
+    if args.sensor not in (None, learnt := trained.get("sensor", DEFAULT_SENSOR)):
+        raise InvalidArgumentError(
+            f"--sensor {args.sensor}: the demonstrations of {checkpoint} were recorded with {learnt}; leave it out, or give "
+            f'--env-kwargs \'{{"sensor": "{args.sensor}"}}\' if another sensor is meant'
+        )
     _name_differences(trained | sensing, given)
     device = checked_device(args.device)
     if args.batch_size is not None and args.batch_size < 1:

@@ -1,10 +1,17 @@
-"""Gel-based tactile sensor (GelSight) for ManiSkill scenes: depth, mechanics and optics of a pad."""
+"""Gel-based tactile sensors (GelSight, DIGIT) for ManiSkill scenes: depth, mechanics and optics of a pad."""
 
 from .config import GelConfig as GelConfig
+from .config import HousingConfig as HousingConfig
+from .config import Light as Light
+from .config import LightsConfig as LightsConfig
 from .config import OpticsConfig as OpticsConfig
 from .config import TactileSensorConfig as TactileSensorConfig
 from .config import TouchRandomization as TouchRandomization
-from .config import gelsight_mini as gelsight_mini
-from .config import gelsight_r15 as gelsight_r15
-from .config import with_options as with_options
+from .config_fields import with_options as with_options
+from .imperfection_config import ImperfectionConfig as ImperfectionConfig
+from .registry import digit as digit
+from .registry import gelsight_mini as gelsight_mini
+from .registry import gelsight_r15 as gelsight_r15
+from .registry import sensor_config as sensor_config
+from .registry import sensor_names as sensor_names
 from .tactile_sensor import TactileSensor as TactileSensor

@@ -68,7 +68,8 @@ class TactileSensor(BaseSensor):
         if config.backend == "sapien":
             return CameraDepth(config, self.scene, self.pad)
         # "auto": rays are faster than the camera on the CPU, and need no renderer
-        return RaycastDepth(self.scene, self.pad, config.pad_pose, config.gel.size, self._unfelt_links())
+        gel = config.gel
+        return RaycastDepth(self.scene, self.pad, config.pad_pose, gel.size, self._unfelt_links(), gel.max_sag)
 
     def _unfelt_links(self) -> set[str]:
         """Names of the links that the gel cannot touch: its own finger and all links between it and the robot's base."""
@@ -83,9 +84,18 @@ class TactileSensor(BaseSensor):
         """Whether `scene.update_render` must be called before `capture`."""
         return isinstance(self._depth, CameraDepth)
 
+    @property
+    def drawn_imperfections(self) -> dict[str, torch.Tensor]:
+        """What the present episodes drew of the sensor's imperfections, (N, ...) each; empty for a perfect sensor."""
+        return self.model.drawn_imperfections
+
     def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None) -> None:
         """Begin an episode in these environments without shear; noise and randomization follow from the seeds (0)."""
         self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
+
+    def forget_readings(self, env_idx: torch.Tensor) -> None:
+        """Let the next observation of these environments be the first one that imperfections remember."""
+        self.model.forget_readings(env_idx)
 
     def wrench(self) -> torch.Tensor:
         """Force and moment (N, 6), N and N m, of the world on the pad, about the pad frame's origin, in the pad frame."""
@@ -101,7 +111,8 @@ class TactileSensor(BaseSensor):
 
         `rgb`: uint8 (N, 240, 320, 3). `force_field`: float32 (N, 10, 14, 3), N per taxel, pad frame, force of the object on the
         gel: normal (>= 0, into the gel), shear along increasing rows, shear along increasing columns. `penetration`: float32
-        (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`.
+        (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`. Sizes are those of the sensor's
+        configuration.
         """
         return dict(self._obs)
 

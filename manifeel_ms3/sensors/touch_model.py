@@ -9,7 +9,8 @@ import torch.nn.functional as F  # noqa: N812 (torch's own usage)
 
 from .config import GelConfig, TactileSensorConfig
 from .depth.raycast import Window
-from .mechanics.contact import ContactGrid, depth_below_face, solve_indentation, solve_shear
+from .imperfections import Imperfections
+from .mechanics.contact import MAX_TILT, ContactGrid, depth_below_face, solve_indentation, solve_shear
 from .mechanics.taxels import MIN_SUM, Taxels, tacsl_field
 from .optics.tacrgb import Optics
 from .warp_device import use_torch_threads_for_warp
@@ -72,7 +73,15 @@ class TouchModel:
         self.optics = Optics(config, self.grid, num_pads, device) if "rgb" in outputs else None
         self._computes_forces = "force_field" in outputs and config.units == "newton"
         self._bristle = torch.zeros(num_pads, len(self.cells), 2, dtype=torch.float64, device=device)
+        places = (self.cells, self.pixels, self.taxels.centres.flatten(0, 1))
+        self._cell_sag, self._pixel_sag, self._taxel_sag = (_sag(config.gel, points) for points in places)
         self._gel = GelProperties.nominal(config.gel, num_pads, device)
+        self._imperfections = None if config.imperfections.is_none else Imperfections(config, num_pads, device)
+
+    @property
+    def drawn_imperfections(self) -> dict[str, torch.Tensor]:
+        """What the present episodes drew of the imperfections (`ImperfectionConfig.draw`); empty for a perfect sensor."""
+        return {} if self._imperfections is None else self._imperfections.drawn
 
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:
         """Begin an episode on these pads: no shear, and gel and light drawn anew from the seeds (one for each pad)."""
@@ -84,6 +93,13 @@ class TouchModel:
         self._gel.friction[pads] = gel.friction * friction
         if self.optics is not None:
             self.optics.reset(pads, seeds)
+        if self._imperfections is not None:
+            self._imperfections.reset(pads, seeds)
+
+    def forget_readings(self, pads: torch.Tensor) -> None:
+        """Let the next observation of these pads be the first one that imperfections remember."""
+        if self._imperfections is not None:
+            self._imperfections.forget(pads)
 
     def observe(self, depth: Depth, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
         """Advance by one control step and return the observation, as described in `TactileSensor.get_obs`.
@@ -95,9 +111,21 @@ class TouchModel:
         with use_torch_threads_for_warp():
             return self._observe(depth, wrench)
 
+    def heights(self, depth: Depth) -> torch.Tensor:
+        """Height (N, C), m, of what is near, over the untouched face at the cells."""
+        return _over_face(depth.heights(self.cells), self._cell_sag)
+
+    def contact_plane(self, height: torch.Tensor, wrench: torch.Tensor) -> torch.Tensor:
+        """Depth and tilts (N, 3) at which the gel carries the wrench, for heights from `heights` (`solve_indentation`)."""
+        gel = self.config.gel
+        slope = max(
+            c * extent / 2 for c, extent in zip(gel.curvature, gel.size, strict=True)
+        )  # an object may lie on a dome's side
+        return solve_indentation(height, wrench, self.grid, self._gel.normal_stiffness, MAX_TILT + slope)
+
     def _observe(self, depth: Depth, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
-        height = depth.heights(self.cells)
-        plane = solve_indentation(height, wrench, self.grid, self._gel.normal_stiffness)
+        height = self.heights(depth)
+        plane = self.contact_plane(height, wrench)
         below = depth_below_face(height.double(), plane, self.grid.x, self.grid.y)
         obs: dict[str, torch.Tensor] = {}
         bristle = None
@@ -110,10 +138,18 @@ class TouchModel:
                 obs["penetration"] = self._mean_depth(below.clamp(0.0, self.config.gel.max_penetration), cell_force)
         if "force_field" in self.outputs and self.config.units == "tacsl":
             obs |= self._tacsl_observation(cast(MovingDepth, depth), plane)
+        if self._imperfections is not None and "force_field" in obs:
+            obs["force_field"] = self._imperfections.sense_forces(obs["force_field"])
         if self.optics is not None:
-            surface = self.optics.surface(self._pixel_penetration(depth, plane, below))
-            obs["rgb"] = self.optics.shade(surface, bristle)
-        return obs
+            obs["rgb"] = self._image(self.optics, self._pixel_penetration(depth, plane, below), bristle)
+        return obs if self._imperfections is None else self._imperfections.delayed(obs)
+
+    def _image(self, optics: Optics, penetration: torch.Tensor, bristle: torch.Tensor | None) -> torch.Tensor:
+        """TacRGB (N, H, W, 3) of the penetration (N, H, W), m."""
+        if self._imperfections is not None:
+            penetration = self._imperfections.recovered_surface(penetration)
+            self._imperfections.disturb(optics)
+        return optics.shade(optics.surface(penetration), bristle)
 
     def _slide(self, cell_force: torch.Tensor, wrench: torch.Tensor) -> torch.Tensor:
         """Shear force (N, C, 2), N, of the cells; their deflections are kept for the next step."""
@@ -130,6 +166,7 @@ class TouchModel:
     def _tacsl_observation(self, depth: MovingDepth, plane: torch.Tensor) -> dict[str, torch.Tensor]:
         centres = self.taxels.centres.flatten(0, 1).float()
         height, velocity = depth.sliding(centres)
+        height = _over_face(height, self._taxel_sag)
         below = depth_below_face(height, plane, centres[:, 0], centres[:, 1]).clamp(0.0, self.config.gel.max_penetration)
         shape = self.config.taxel_shape
         return dict(force_field=tacsl_field(below, velocity).unflatten(1, shape), penetration=below.unflatten(1, shape))
@@ -138,9 +175,21 @@ class TouchModel:
         """Penetration (N, H, W), m, at the pixels; depth is taken only where the cells say that something may be near."""
         nearest = F.max_pool2d(below.float().unflatten(1, self.grid.shape)[:, None], 3, stride=1, padding=1)[:, 0]
         window = Window(nearest > -LOOK_MARGIN, self.config.gel.size)
-        height = depth.heights(self.pixels, window)
+        height = _over_face(depth.heights(self.pixels, window), self._pixel_sag)
         below = depth_below_face(height, plane, self.pixels[:, 0], self.pixels[:, 1])
         return below.clamp(0.0, self.config.gel.max_penetration).unflatten(1, self.config.image_shape)
+
+
+def _sag(gel: GelConfig, points: torch.Tensor) -> torch.Tensor | None:
+    """Depth (C,), m, of the untouched face under its highest point at points (C, 2) of it; None for a flat face."""
+    if gel.is_flat:
+        return None
+    return torch.as_tensor(gel.sag(*points.double().cpu().numpy().T), dtype=torch.float32, device=points.device)
+
+
+def _over_face(height: torch.Tensor, sag: torch.Tensor | None) -> torch.Tensor:
+    """Height (N, C), m, over the untouched face, of a height over the plane through the face's highest point."""
+    return height if sag is None else height - sag
 
 
 def pixel_grid(config: TactileSensorConfig, device: torch.device) -> torch.Tensor:

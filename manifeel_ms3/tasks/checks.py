@@ -1,10 +1,11 @@
 """Checks of the arguments that a task's environment is made and reset with."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import torch
+from mani_skill.sensors.camera import CameraConfig
 
 from manifeel_ms3.arguments import by_name, is_number
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
@@ -13,7 +14,9 @@ Limits = Mapping[str, tuple[float, str]]
 """The largest half range that can be played, by the name of a randomization's field, and what happens beyond it."""
 
 
-def checked_randomization(env_name: str, kind: Any, overrides: Any, limits: Limits) -> Any:
+def checked_randomization(
+    env_name: str, kind: Any, overrides: Any, limits: Limits, argument: str = "randomization", example: str = "socket_xy"
+) -> Any:
     """Make a task's randomization from the fields that a caller overrides.
 
     Args:
@@ -21,19 +24,21 @@ def checked_randomization(env_name: str, kind: Any, overrides: Any, limits: Limi
         kind: Dataclass of the randomization.
         overrides: Half ranges by field name.
         limits: Largest half ranges by field name.
+        argument: Name of the argument that holds the fields, for messages.
+        example: Name of a field, for messages.
 
     Raises:
         InvalidArgumentError: A field is unknown, or its value is no number, negative or too large.
     """
     known = kind.__dataclass_fields__
-    for name, value in by_name("randomization", overrides, "dict(socket_xy=0.01)").items():
+    for name, value in by_name(argument, overrides, f"dict({example}=0.01)").items():
         if name not in known:
-            raise InvalidArgumentError(f"randomization[{name!r}] is unknown for {env_name}; known: {list(known)}")
+            raise InvalidArgumentError(f"{argument}[{name!r}] is unknown for {env_name}; known: {list(known)}")
         if not (is_number(value) and value >= 0):
-            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} must be a finite number >= 0")
         limit, reason = limits.get(name, (np.inf, ""))
         if value > limit:
-            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
     return kind(**overrides)
 
 
@@ -64,3 +69,49 @@ def check_seed(seed: Any) -> None:
         raise InvalidArgumentError(
             f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one such number for each environment"
         )
+
+
+def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[str]) -> tuple[dict, dict]:
+    """Split ManiSkill's `sensor_configs` into those of the cameras and those of the tactile pads.
+
+    Args:
+        given: Fields to change by the name of a sensor, and fields to change of every camera. Fields of a pad are nested dicts
+            or have dotted names.
+        cameras: Names of the cameras.
+        pads: Names of the pads.
+
+    Returns:
+        The cameras' part, and for each pad its fields by dotted name.
+
+    Raises:
+        InvalidArgumentError: A name is neither that of a sensor nor of a camera's field.
+    """
+    example = 'dict(wrist=dict(width=128), tactile_right={"optics.noise": 2.0})'
+    fields = [*CameraConfig.__dataclass_fields__, "use_stereo_depth"]
+    of_cameras, of_pads = {}, {}
+    for name, value in by_name("sensor_configs", given, example).items():
+        if name in pads:
+            of_pads[name] = dict(_dotted(by_name(f"sensor_configs[{name!r}]", value, example)))
+        elif name in cameras:
+            of_cameras[name] = dict(by_name(f"sensor_configs[{name!r}]", value, example))  # a copy, which ManiSkill changes
+            if unknown := [key for key in value if key not in fields]:
+                raise InvalidArgumentError(
+                    f"sensor_configs[{name!r}]: {unknown} are no fields of a camera; choose from {fields}"
+                )
+        elif name in fields:
+            of_cameras[name] = value
+        else:
+            raise InvalidArgumentError(
+                f"sensor_configs[{name!r}] is neither a sensor of this environment {[*cameras, *pads]} nor a field of every "
+                f"camera {fields}"
+            )
+    return of_cameras, of_pads
+
+
+def _dotted(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Leaves of nested options by dotted names: ("optics.noise", 2.0) of {"optics": {"noise": 2.0}}."""
+    for name, value in options.items():
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

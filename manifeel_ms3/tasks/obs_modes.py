@@ -7,7 +7,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 STATE_TOKENS = ("state", "state_dict")
 WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")
-"""ManiSkill's names of whole modes; only "rgbd" may be joined with touch."""
+"""ManiSkill's names of whole modes; "rgbd" and "pointcloud" may be joined with touch."""
 
 
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
@@ -25,7 +25,7 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
         raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} stands more than once")
     own = ["rgb+depth" if token == "rgbd" and len(tokens) > 1 else token for token in tokens if token not in TACTILE_TOKENS]
     alone = [token for token in own if token in WHOLE_MODES]
-    if alone and len(tokens) > 1:
+    if alone and len(tokens) > 1 and own != ["pointcloud"]:
         raise InvalidArgumentError(
             f"obs_mode={obs_mode!r}: {alone[0]!r} stands alone; join 'rgb', 'depth', ... with touch instead"
         )

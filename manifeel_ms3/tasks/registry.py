@@ -69,8 +69,7 @@ class TaskSpec:
     @property
     def gym_id(self) -> str:
         """Id after the module that gymnasium is to import for it, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
-        package, module = __name__.partition(".")[0], self.env_class.__module__
-        return f"{package if module.startswith(f'{package}.') else module}:{self.env_id}"
+        return gym_id(self.env_id, self.env_class)
 
     @property
     def policy_camera(self) -> str:
@@ -184,6 +183,12 @@ def evaluation_seeds(count: int) -> list[int]:
     if count < 1:
         raise InvalidArgumentError(f"{count} evaluation episodes are asked for; at least 1 is needed")
     return list(range(FIRST_EVALUATION_SEED, FIRST_EVALUATION_SEED + count))
+
+
+def gym_id(env_id: str, env_class: type) -> str:
+    """Id after the module that gymnasium is to import for it, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
+    package, module = __name__.partition(".")[0], env_class.__module__
+    return f"{package if module.startswith(f'{package}.') else module}:{env_id}"
 
 
 def short_name(env_id: str) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.observations import sensor_data_to_pointcloud
 from mani_skill.sensors.camera import Camera
 from mani_skill.utils import common
 from mani_skill.utils.visualization.misc import tile_images
@@ -40,10 +41,17 @@ class SensingEnv(BaseEnv):
         }
         self._touch_is_fresh = False
 
+    def _drawn_imperfections(self) -> dict[str, dict[str, dict[str, torch.Tensor]]]:
+        """An entry `imperfections` of `info`: what the episodes drew, by pad and name; nothing for perfect sensors."""
+        drawn = {name: sensor.drawn_imperfections for name, sensor in self._tactile_sensors.items()}
+        return dict(imperfections=drawn) if any(drawn.values()) else {}
+
     def get_obs(self, info: dict | None = None, unflattened: bool = False):
         if not self._tactile_outputs:
             return super().get_obs(info, unflattened)
         obs = self._get_obs_with_sensor_data(self.get_info() if info is None else info)
+        if self._obs_mode == "pointcloud":
+            obs = sensor_data_to_pointcloud(obs, self._sensors)
         return obs if unflattened else self._flatten_raw_obs(obs)
 
     def _flatten_raw_obs(self, obs: Any):
@@ -93,3 +101,11 @@ class SensingEnv(BaseEnv):
     def render_all(self):
         sensors = self.render_sensors()
         return torch.cat(same_height([self.render_rgb_array(), sensors]), dim=2)
+
+    def print_sim_details(self):
+        super().print_sim_details()
+        for name, config in self._tactile_configs.items():
+            if self._tactile_outputs:
+                pixels, taxels = (" x ".join(map(str, shape)) for shape in (config.image_shape, config.taxel_shape))
+                observed = dict(rgb=f"TacRGB {pixels} pixels", force_field=f"TacFF {taxels} taxels")
+                print(f"{name}: {', '.join(observed[output] for output in self._tactile_outputs)}")  # noqa: T201

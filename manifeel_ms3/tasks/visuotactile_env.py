@@ -3,51 +3,45 @@
 # pyright: reportArgumentType=false
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import sapien
 import torch
-from mani_skill.sensors.camera import CameraConfig
+from gymnasium.envs.registration import EnvSpec
+from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 
 from manifeel_ms3.agents import PandaGelSight
+from manifeel_ms3.agents.fingers import Finger
 from manifeel_ms3.arguments import by_name, checked_action, one_of, several_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import (
     FORKED,
     NO_RENDERER,
+    announce_first_image,
     available_render_backend,
     renderer_lost,
     use_one_thread_after_fork,
 )
-from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
-from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, drawn_sizes, fine_shadow, presentation_shader
-from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
-from manifeel_ms3.sensors import gelsight_r15, with_options
+from manifeel_ms3.rendering.presentation import drawn_sizes
+from manifeel_ms3.rendering.randomization import LARGEST, VisualRandomization
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .bench import build_bench
-from .checks import check_num_envs, check_seed, checked_randomization
+from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
-from .sensing import SensingEnv
-from .viewpoints import looking_at, looking_down
+from .registry import gym_id
+from .scenery import LIGHTING, QUALITIES, SceneryEnv
+from .states import unflattened
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
-LIGHTING = {"normal": 1.0, "dim": 0.05}
-"""Share of the normal light; the paper gives no figure for its dim light."""
 HOLD_SECONDS = 0.5
 """Time for which a goal must hold until the episode is a success, in s."""
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s."""
-IMAGE_SIZE = 256
-"""Width and height of the cameras' images, in pixels (public code of the paper)."""
-FIELD_OF_VIEW = np.deg2rad(75)
-"""Field of view of the cameras, in rad (public code of the paper)."""
-FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
-"""Links whose shadow falls beside what the shadow map covers."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
@@ -57,14 +51,14 @@ CONTACTS: dict[str, Any] = dict(
 """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
 
 
-class VisuotactileEnv(SensingEnv):
-    """Base class of the ManiFeel tasks: a Panda with two GelSight fingers at the origin of a table, x ahead, z up.
+class VisuotactileEnv(SceneryEnv):
+    """Base class of the ManiFeel tasks: a Panda with two tactile fingers at the origin of a table, x ahead, z up.
 
     The observation mode joins ManiSkill's modes with `tacrgb` and `tacff` by "+". An observation holds what the mode asks for:
 
     - `sensor_data[camera]`: `rgb` uint8 (N, 256, 256, 3) and ManiSkill's other textures;
     - `sensor_data["tactile_left" | "tactile_right"]`: `rgb` uint8 (N, 240, 320, 3); `force_field` float32 (N, 10, 14, 3), N per
-      taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`);
+      taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`); sizes of the default sensor;
     - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Privileged state is in the state modes alone.
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
@@ -83,11 +77,18 @@ class VisuotactileEnv(SensingEnv):
             images have 768 x 768 pixels, and take about a second each on a CPU.
         cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
         tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
+        sensor: Sensor on both fingers: "gelsight_r15", "gelsight_mini", "digit", or one that another package registers.
         tactile: Fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+        sensor_configs: ManiSkill's: fields to change of one sensor, by its name, or of every camera. Pads are sensors, too:
+            `dict(width=128, wrist=dict(fov=1.2), tactile_right={"optics.noise": 2.0})`.
+        imperfections: Amounts of `ImperfectionConfig` by name, such as `{"hysteresis": 0.2, "delay": (0, 3)}`; the entry
+            "imperfections" of `info` holds what the episode drew of them, by pad.
         lighting: "normal" or "dim" (5 %).
         quality: Quality of the cameras' images: "normal", or "fast", which leaves out the shadow.
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
+        visual_randomization: Fields of `VisualRandomization` to override, by name: `dict(light_level=0.3)`. Looks are drawn
+            from the episode's seed, and `info["looks"]` holds them; by default they are the same in every episode.
         kwargs: Other arguments of ManiSkill's `BaseEnv`.
 
     Raises:
@@ -110,11 +111,8 @@ class VisuotactileEnv(SensingEnv):
     """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
     max_reward = 4.0
     """Largest value of the dense reward."""
-    front_camera_at = (0.68, 0.0, 0.15)
-    """Position of the front camera, in m (public code of the paper)."""
-    side_camera_at = (0.5, -0.17, 0.17)
-    """Position of the side camera, in m (public code of the paper)."""
     agent: PandaGelSight
+    _spec: EnvSpec | None = None
 
     def __init__(
         self,
@@ -126,23 +124,32 @@ class VisuotactileEnv(SensingEnv):
         human_render_camera_configs: Mapping[str, Any] | None = None,
         cameras: Iterable[str] | None = None,
         tactile_sensors: Iterable[str] = ("right",),
+        sensor: str = DEFAULT_SENSOR,
         tactile: Mapping[str, Any] | None = None,
+        sensor_configs: Mapping[str, Any] | None = None,
+        imperfections: Mapping[str, Any] | None = None,
         lighting: str = "normal",
         quality: str = "normal",
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
+        visual_randomization: dict[str, float] | None = None,
         **kwargs,
     ):
         own_mode, self._tactile_outputs = split_obs_mode(obs_mode or "state")
         self._full_obs_mode = obs_mode or "state"
         self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
         self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
-        self._tactile_configs = {
-            f"tactile_{side}": with_options(gelsight_r15(f"tactile_{side}", f"gel_{side}"), tactile or {})
-            for side in self._sides
+        self.sensor = sensor
+        names = {side: f"tactile_{side}" for side in SIDES}
+        camera_configs, own = split_sensor_configs(sensor_configs or {}, self._camera_names, [names[s] for s in self._sides])
+        configs = {
+            side: task_sensor(sensor, name, f"gel_{side}", {**(tactile or {}), **own.get(name, {})}, imperfections)
+            for side, name in names.items()
         }
+        self._tactile_configs = {names[side]: configs[side] for side in self._sides}
+        self._finger = Finger.of(configs["right"])
         self._lighting = one_of("lighting", lighting, LIGHTING)
-        self._quality = one_of("quality", quality, SHADOWS)
+        self._quality = one_of("quality", quality, QUALITIES)
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -150,12 +157,22 @@ class VisuotactileEnv(SensingEnv):
         self.randomization = checked_randomization(
             type(self).__name__, self.Randomization, randomization or {}, self._largest_ranges()
         )
+        self.visual_randomization = checked_randomization(
+            type(self).__name__, VisualRandomization, visual_randomization or {}, LARGEST, "visual_randomization", "light_level"
+        )
         one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
         check_num_envs(kwargs.get("num_envs", 1))
+        if visual_randomization and (count := kwargs.get("num_envs", 1)) > 1:
+            raise InvalidArgumentError(
+                f"visual_randomization={visual_randomization!r} needs num_envs=1, not {count}: the environments of one process "
+                "look alike; use several processes"
+            )
         use_one_thread_after_fork()
         backend = available_render_backend(render_backend)
         if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
             raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+        if self._wanted_images(own_mode, None):
+            announce_first_image(backend)
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -163,6 +180,7 @@ class VisuotactileEnv(SensingEnv):
             robot_uids=robot_uids,
             render_backend=backend,
             human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
+            sensor_configs=camera_configs,
             **kwargs,
         )
 
@@ -175,6 +193,15 @@ class VisuotactileEnv(SensingEnv):
     @property
     def obs_mode(self) -> str:
         return self._full_obs_mode
+
+    @property
+    def spec(self) -> EnvSpec | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Specification of gymnasium. Its id names the module to import, for ManiSkill's tools, which make it from a file."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = replace(spec, id=gym_id(spec.id, type(self))) if spec and ":" not in spec.id else spec
 
     # ---------------------------------------------------------------- for tasks to define
 
@@ -224,52 +251,19 @@ class VisuotactileEnv(SensingEnv):
             scene_config=SceneConfig(**self.contacts),
         )
 
-    @property
-    def _default_sensor_configs(self):
-        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
-        return [
-            CameraConfig(
-                name,
-                looking_down(*views[name]),
-                IMAGE_SIZE,
-                IMAGE_SIZE,
-                FIELD_OF_VIEW,
-                near=0.01,
-                far=10,
-                shader_config=camera_shader(),
-            )
-            for name in self._camera_names
-            if name in views
-        ]
-
-    @property
-    def _default_human_render_camera_configs(self):
-        pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
-        drawn, view = SIZE * SUPERSAMPLING, np.deg2rad(45)
-        return CameraConfig("render_camera", pose, drawn, drawn, view, near=0.01, far=10, shader_config=presentation_shader())
-
-    def render_rgb_array(self, camera_name: str | None = None):
-        with fine_shadow(self._lamps, SHADOWS[self._quality]):
-            return super().render_rgb_array(camera_name)
-
     def _load_agent(self, options: dict):
-        super()._load_agent(options, sapien.Pose())
+        # not by its name in `robot_uids`, by which ManiSkill makes robots without arguments
+        self.agent = PandaGelSight(
+            self.scene, self._control_freq, self._control_mode, initial_pose=sapien.Pose(), finger=self._finger
+        )
         self.agent.mounted_cameras = tuple(name for name in self._camera_names if name == "wrist")
 
     def _load_scene(self, options: dict):
-        build_bench(self.scene)
+        self._build_bench()
         self._load_task()
 
-    def _setup_sensors(self, options: dict):
-        set_picture_formats()
-        super()._setup_sensors(options)
-
-    def _load_lighting(self, options: dict):
-        self._lamps = add_lights(self.scene, LIGHTING[self._lighting], SHADOWS[self._quality])
-        links = self.agent.robot.links_map
-        cast_no_shadow([self.scene.actors["table"], self.scene.actors["floor"], *(links[name] for name in FAR_LINKS)])
-
     def _after_reconfigure(self, options: dict):
+        self._make_random_looks()
         self._make_tactile_sensors()
         self._measured: dict[str, torch.Tensor] | None = None
         self._steps_at_goal = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
@@ -293,6 +287,8 @@ class VisuotactileEnv(SensingEnv):
             return obs, info
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
         self._settle(env_idx)
+        for sensor in self._tactile_sensors.values():
+            sensor.forget_readings(env_idx)  # those before the grip had settled
         info = self.get_info() | dict(reconfigure=info["reconfigure"])
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
@@ -316,6 +312,7 @@ class VisuotactileEnv(SensingEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict):
         with torch.device(self.device):
             self._initialize_task(env_idx)
+        self._draw_looks(int(self._episode_seed[0]))
         self._steps_at_goal[env_idx] = 0
         self._success_paper[env_idx] = False
         self._contact_force[env_idx] = 0.0
@@ -348,13 +345,19 @@ class VisuotactileEnv(SensingEnv):
             self.agent.set_controller_state(state["controller"])
         self._touch_is_fresh, self._measured = False, None
 
+    def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
+        """Set the state from the vectors (N, D) of `get_state`, which hold the controller's targets, too."""
+        self.set_state_dict(unflattened(common.to_tensor(state, self.device), self._init_raw_state), env_idx)
+
     def evaluate(self) -> dict:
         measures, self._measured = self._measured or self.measure(), None
         held = self._steps_at_goal >= round(HOLD_SECONDS * self._control_freq)
         info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
         if self.paper_goal_reached(measures) is not None:
             info["success_paper"] = self._success_paper.clone()
-        return info
+        if self._looks:
+            info["looks"] = dict(self._looks)
+        return info | self._drawn_imperfections()
 
     # ---------------------------------------------------------------- observation
 

@@ -11,6 +11,12 @@ ACTION_DIMS = {
     "pd_ee_delta_pose_fixed_roll_pitch": 7,
     "pd_ee_delta_pose_fixed_rotation": 7,
     "pd_ee_delta_yaw": 5,
+    "pd_ee_pose": 7,
+    "pd_ee_pose_fixed_gripper": 6,
+    "pd_joint_pos": 8,
+    "pd_joint_pos_fixed_gripper": 7,
+    "pd_joint_delta_pos": 8,
+    "pd_joint_target_delta_pos": 8,
 }
 
 
@@ -140,3 +146,27 @@ def test_out_of_range_actions_are_clipped(env):
     env.reset(seed=0)
     env.step(np.ones(6))
     assert torch.equal(env.unwrapped.get_state(), clipped)
+
+
+def test_an_absolute_pose_is_reached_and_never_far_ahead(make_env):
+    env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_pose_fixed_gripper")
+    env.reset(seed=0)
+    place, facing = tool(env)
+    goal = np.r_[place + np.array([0.02, -0.01, 0.05]), facing.as_euler("XYZ")]
+    for _ in range(15):
+        env.step(goal)
+    reached, turned = tool(env)
+    assert reached == pytest.approx(goal[:3], abs=2e-4)
+    assert (turned * facing.inv()).magnitude() < 2e-3
+    env.step(np.r_[goal[:3] - np.array([0, 0, 1.0]), goal[3:]])
+    fallen, _ = tool(env)
+    assert 0.01 < reached[2] - fallen[2] < 0.024  # at most the lead that an absolute target may have
+
+
+def test_joint_targets_are_reached(make_env):
+    env = make_env(obs_mode="none", render_backend="none", control_mode="pd_joint_pos_fixed_gripper")
+    env.reset(seed=0)
+    goal = env.unwrapped.agent.robot.get_qpos()[0, :7].numpy() + 0.05
+    for _ in range(15):
+        env.step(goal)
+    assert env.unwrapped.agent.robot.get_qpos()[0, :7].numpy() == pytest.approx(goal, abs=2e-3)

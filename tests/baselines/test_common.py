@@ -11,6 +11,7 @@ from baselines.common.dataset import SequenceDataset, read_episodes, recorded_en
 from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
 from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE, observation_spec, prepare, quaternion_pose, rotation_6d_pose
+from baselines.common.policy import PolicyConfig, make_action_network
 from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError
@@ -241,8 +242,10 @@ def test_unknown_encoder_names_those_there_are():
             ObservationEncoder(EncoderConfig(**wrong), spec, 2)
 
 
-def test_unet_maps_actions_to_noise_and_uses_step_and_condition():
-    net = ConditionalUnet1D(6, 10, down_dims=(16, 32, 64)).eval()
+@pytest.mark.parametrize("kind", ["unet", "mlp"])
+def test_action_networks_map_actions_to_noise_and_use_step_and_condition(kind):
+    config = PolicyConfig(action_network=kind, down_dims=(16, 32, 64), mlp_width=32)
+    net = make_action_network(config, action_dim=6, condition_dim=10).eval()
     actions, condition = torch.randn(3, 16, 6), torch.randn(3, 10)
     out = net(actions, torch.tensor([0, 50, 99]), condition)
     assert out.shape == actions.shape

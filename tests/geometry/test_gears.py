@@ -18,7 +18,7 @@ from manifeel_ms3.geometry.gears import (
     tooth_polygon,
 )
 from manifeel_ms3.tasks.insertion.gear_assembly import GearAssemblyEnv
-from tests.sensors.bench import PadBench
+from manifeel_ms3.verification.press import PadBench
 
 SPEED = 1.0  # rad/s
 

@@ -22,8 +22,8 @@ from manifeel_ms3.geometry import (
 from manifeel_ms3.geometry.balls import ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import battery, bowl, container
 from manifeel_ms3.geometry.gears import neighbour_gear
+from manifeel_ms3.verification.press import PadBench
 from tests.conftest import needs_renderer
-from tests.sensors.bench import PadBench
 
 PARTS = [
     *(part for fit in (*(make(name) for make in (peg_fit, usb_fit, power_fit, gear_fit) for name in FITS), reorientation_fit())

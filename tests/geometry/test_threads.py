@@ -11,7 +11,7 @@ from manifeel_ms3.geometry.threads import external_mesh, internal_mesh, iso_metr
 from manifeel_ms3.tasks.screwing.base import ScrewingEnv
 from manifeel_ms3.tasks.screwing.bulb_installation import BulbInstallationEnv
 from manifeel_ms3.tasks.screwing.nut_bolt_assembly import NutBoltAssemblyEnv
-from tests.sensors.bench import PadBench
+from manifeel_ms3.verification.press import PadBench
 
 
 def nut_on_thread(height: float) -> float:

@@ -1,4 +1,4 @@
-"""Makes the compact copy of Taxim's R1.5 calibration that the tests read: `python -m tests.sensors.make_calibration POLYCALIB`.
+"""Makes the compact copy of Taxim's R1.5 calibration in `data`: `python -m tests.sensors.make_calibration POLYCALIB`.
 
 POLYCALIB is the R1.5's `polycalib.npz` of Taxim's code (MIT License, see NOTICE). Only what the tests read is kept: the slope
 bins up to 1.2 rad, in int16 relative to the greatest coefficient of each term. Colours change by 0.01 grey levels at most.
@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from manifeel_ms3.paths import data_dir
 from manifeel_ms3.sensors.optics.taxim_table import TABLE_CHANNELS, read_table
 
-CALIBRATION = Path(__file__).with_name("gelsight_r15_polycalib_subset.npz")
+CALIBRATION = data_dir() / "gelsight_r15_polycalib_subset.npz"
 MAX_SLOPE = 1.2  # rad, above all slopes that the tests press or fit
 
 

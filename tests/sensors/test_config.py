@@ -3,9 +3,21 @@
 import numpy as np
 import pytest
 
-from manifeel_ms3.sensors import GelConfig, OpticsConfig, TouchRandomization, gelsight_mini, gelsight_r15, with_options
+from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.sensors import (
+    GelConfig,
+    HousingConfig,
+    ImperfectionConfig,
+    OpticsConfig,
+    TouchRandomization,
+    gelsight_r15,
+    sensor_config,
+    sensor_names,
+    with_options,
+)
 from manifeel_ms3.sensors.optics.shader import Shader
 from manifeel_ms3.sensors.optics.taxim_table import read_table
+from manifeel_ms3.sensors.registry import task_sensor
 
 
 @pytest.mark.parametrize(
@@ -24,11 +36,17 @@ from manifeel_ms3.sensors.optics.taxim_table import read_table
         (dict(optics=OpticsConfig(noise=-1.0)), "optics.noise"),
         (dict(optics=OpticsConfig(marker_pitch=0.0)), "optics.marker_pitch"),
         (dict(randomization=TouchRandomization(stiffness=1.0)), "randomization.stiffness"),
+        (dict(gel=GelConfig(curvature=(60.0, 60.0)), housing=HousingConfig(protrusion=0.02)), "folds"),
+        (dict(gel=GelConfig(curvature=(30.0, 30.0))), "housing.protrusion"),
+        (dict(gel=GelConfig(curvature=(-1.0, 0.0))), "gel.curvature"),
+        (dict(imperfections=ImperfectionConfig(hysteresis=1.0)), "imperfections.hysteresis"),
+        (dict(imperfections=ImperfectionConfig(noise=-0.1)), "imperfections.noise"),
+        (dict(imperfections=ImperfectionConfig(gain=(0.3, 0.1))), "imperfections.gain"),
     ],
 )
 def test_bad_value_is_named(overrides, field):
     with pytest.raises(ValueError, match=field):
-        gelsight_r15("touch", "gel_right", **overrides)
+        sensor_config("gelsight_r15", "touch", "gel_right", **overrides)
 
 
 def test_options_by_dotted_name():
@@ -41,9 +59,31 @@ def test_options_by_dotted_name():
         with_options(config, {"gel.thickness": -1.0})
 
 
-def test_presets_are_valid():
-    assert gelsight_r15("a", "b").taxel_shape == (10, 14)
-    assert gelsight_mini("a", "b").pixel_size == 6.5e-5
+def test_sensors_by_name():
+    assert sensor_names()[:3] == ["gelsight_r15", "gelsight_mini", "digit"]
+    mini, digit = (sensor_config(name, "a", "b") for name in ("gelsight_mini", "digit"))
+    assert np.array(mini.image_shape) * mini.pixel_size == pytest.approx([0.0143, 0.0186], rel=0.02)  # the data sheet's window
+    assert digit.gel.max_sag == pytest.approx(0.005, rel=1e-3)  # TACTO's
+    with pytest.raises(UnknownNameError, match=r"choose from \['gelsight_r15', 'gelsight_mini', 'digit'"):
+        sensor_config("biotac", "a", "b")
+
+
+def test_sag_is_that_of_a_sphere():
+    gel = GelConfig(size=(0.02, 0.03), curvature=(20.0, 20.0))
+    x, y = np.array([0.0, 4e-3, -9e-3]), np.array([0.0, 7e-3, 15e-3])
+    assert gel.sag(x, y) == pytest.approx(0.05 - np.sqrt(0.05**2 - x**2 - y**2))
+
+
+def test_imperfections_take_a_number_or_a_range_of_known_names():
+    assert ImperfectionConfig(hysteresis=0.2).hysteresis == (0.2, 0.2)
+    config = task_sensor("digit", "a", "b", {"imperfections.delay": 2}, {"gain": [0.0, 0.1]})
+    assert (config.imperfections.delay, config.imperfections.gain) == ((2, 2), (0.0, 0.1))
+    with pytest.raises(UnknownNameError, match=r"lag.*hysteresis.*delay.*crosstalk"):
+        task_sensor("digit", "a", "b", None, {"lag": 1})
+    with pytest.raises(ValueError, match="whole number"):
+        task_sensor("digit", "a", "b", None, {"delay": 1.5})
+    with pytest.raises(ValueError, match=r"imperfections\.crosstalk"):
+        task_sensor("digit", "a", "b", None, {"crosstalk": "much"})
 
 
 def test_missing_and_malformed_calibration(tmp_path):

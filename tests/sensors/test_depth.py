@@ -7,10 +7,10 @@ import trimesh
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.errors import InvalidFileError, MachineError
-from manifeel_ms3.sensors import TactileSensor, gelsight_r15
+from manifeel_ms3.sensors import TactileSensor, sensor_config
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
+from manifeel_ms3.verification.press import PadBench
 from tests.conftest import needs_renderer
-from tests.sensors.bench import PadBench
 
 from . import shapes
 
@@ -76,7 +76,7 @@ def shape_env(request, tmp_path_factory):
 
 
 def heights(env: PadBench, backend: str) -> tuple[np.ndarray, np.ndarray]:
-    sensor = TactileSensor(gelsight_r15("tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
+    sensor = TactileSensor(sensor_config(env.sensor, "tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
     env.scene.update_render()
     sensor._depth.look()
     return sensor._depth.heights(sensor.model.pixels)[0].numpy(), sensor.model.pixels.double().numpy()
@@ -104,6 +104,36 @@ def test_backends_agree_within_five_micrometres(shape_env, figure):
     camera, _ = heights(env, "sapien")
     near = height(pixels[:, 0] - 1e-3, pixels[:, 1] - 2e-3) + DEEP > -1.5e-3
     figure("depth backends, micrometres RMS apart", 1e6 * np.sqrt(((rays - camera)[near] ** 2).mean()), at_most=5)
+
+
+@needs_renderer
+@pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
+def test_a_ball_is_seen_over_the_face_of_other_sensors(sensor, figure, tmp_path):
+    trimesh.creation.icosphere(subdivisions=6, radius=BALL).export(tmp_path / "ball.glb")  # SAPIEN draws its own with facets
+
+    def build(env):
+        builder = env.scene.create_actor_builder()
+        builder.add_visual_from_file(str(tmp_path / "ball.glb"), material=RenderMaterial(base_color=[1, 0, 0, 1]))
+        builder.initial_pose = sapien.Pose([0, 0, 2])
+        return [builder.build_kinematic("ball")]
+
+    env = PadBench(build, obs_mode="rgb", cameras=("wrist",), sensor=sensor)
+    x, y, curvature = 6e-3, -8e-3, sensor_config(sensor, "a", "b").gel.curvature[0]
+    sag = (1 - np.sqrt(1 - curvature**2 * (x**2 + y**2))) / curvature if curvature else 0.0
+    env.place(env.objects[0], sapien.Pose([x, y, BALL - DEEP - sag]))
+    for backend in ("raycast", "sapien"):
+        pad = TactileSensor(sensor_config(sensor, "tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
+        env.scene.update_render()
+        pad._depth.look()
+        cells = pad.model.cells.double().numpy()
+        r2 = (cells**2).sum(1)
+        face = (1 - np.sqrt(1 - curvature**2 * r2)) / curvature if curvature else np.zeros(len(cells))
+        expected = ball_height(cells[:, 0] - x, cells[:, 1] - y) + DEEP + sag - face
+        near = expected > -1e-3
+        error = (pad.model.heights(pad._depth)[0].numpy() - expected)[near]
+        assert near.sum() > 100
+        figure(f"ball over the {sensor}'s face, {backend}, micrometres RMS", 1e6 * np.sqrt((error**2).mean()), at_most=5)
+    env.close()
 
 
 def test_several_objects_and_the_table_are_felt_without_registration_or_renderer():
@@ -149,5 +179,5 @@ def test_empty_mesh_is_named():
 def test_sapien_backend_without_renderer_says_what_to_do():
     env = PadBench(obs_mode="state", render_backend="none")
     with pytest.raises(MachineError, match="backend='raycast'"):
-        TactileSensor(gelsight_r15("touch", "gel_right", backend="sapien"), env.scene, env.agent.robot)
+        TactileSensor(sensor_config("digit", "touch", "gel_right", backend="sapien"), env.scene, env.agent.robot)
     env.close()

@@ -86,7 +86,7 @@ def test_state_modes(make_env):
 
 @pytest.mark.parametrize(
     ("mode", "word"),
-    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+tacff", "stands alone"), ("", "unknown")],
+    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+rgb", "stands alone"), ("", "unknown")],
 )
 def test_bad_obs_modes_name_what_is_known(mode, word):
     with pytest.raises(ValueError, match=word):
@@ -102,6 +102,9 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(lighting="disco"), "dim"),
         (dict(tactile={"optics.nose": 1.0}), "optics.nose"),
         (dict(tactile={"gel.thickness": 0.0}), "gel.thickness"),
+        (dict(sensor_configs=dict(tactile_left=dict(units="tacsl"))), r"neither a sensor.*'wrist', 'tactile_right'"),
+        (dict(sensor_configs=dict(tactile_right=dict(optics=dict(nose=1.0)))), "optics.nose"),
+        (dict(sensor_configs=dict(wrist=dict(widht=64))), "'widht'. are no fields of a camera; choose from"),
         (dict(occlusion=True), "nothing that could occlude"),
         (dict(fit="snug"), "tight"),
         (dict(randomization=dict(colour=1.0)), "socket_xy"),
@@ -229,3 +232,45 @@ def test_force_field_equals_the_wrench_and_the_weight(make_env):
             total += rotation @ torch.tensor([field[1], field[2], -field[0]])
         weight = float(base.plug.mass[0]) * 9.81
         assert total.tolist() == pytest.approx([0, 0, -weight], abs=0.02 * weight)
+
+
+def test_sensor_configs_reach_pads_as_well(make_env):
+    pad = dict(units="tacsl", optics=dict(noise=2.0))
+    env = make_env(obs_mode="tacff", render_backend="none", sensor_configs=dict(tactile_right=pad, width=64)).unwrapped
+    config = env._tactile_sensors["tactile_right"].config
+    assert (config.units, config.optics.noise) == ("tacsl", 2.0)
+
+
+@needs_renderer
+def test_a_pointcloud_can_be_joined_with_touch(make_env, capsys):
+    env = make_env(obs_mode="pointcloud+tacff", sensor_configs=dict(width=32, height=32))
+    obs, _ = env.reset(seed=0)
+    assert obs["pointcloud"]["xyzw"].shape == (1, 32 * 32, 4)
+    assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (1, 10, 14, 3)
+    env.unwrapped.print_sim_details()
+    said = capsys.readouterr().out
+    assert "RGBD(32x32)" in said
+    assert "tactile_right: TacFF 10 x 14 taxels" in said
+
+
+@pytest.mark.parametrize("mode", ["pd_ee_delta_pose_fixed_gripper", "pd_joint_target_delta_pos"])
+def test_a_flat_state_holds_the_targets_of_arm_and_gripper(make_env, mode):
+    """The same actions from the same state end in the same state, in an environment that was somewhere else before."""
+    first, second = (make_env(obs_mode="none", render_backend="none", control_mode=mode) for _ in range(2))
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-0.3, 0.3, (8, *first.action_space.shape))
+    ends = []
+    first.reset(seed=0)
+    for action in actions[:4]:
+        first.step(action)
+    state = first.unwrapped.get_state()
+    for env, seed in ((first, 0), (second, 1)):
+        env.reset(seed=seed)
+        env.unwrapped.set_state(state)
+        assert env.unwrapped.get_state() == pytest.approx(state, abs=1e-6)
+        for action in actions[4:]:
+            env.step(action)
+        ends.append(env.unwrapped.get_state())
+    assert ends[0] == pytest.approx(ends[1], abs=1e-3)
+    with pytest.raises(ValueError, match=r"get_state returns \(N, "):
+        first.unwrapped.set_state(state[:, :-1])

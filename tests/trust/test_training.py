@@ -13,9 +13,20 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from baselines.common.checkpoint import TRAINING, WEIGHTS, make_last, newest_checkpoint, prune, read_tensors, save_checkpoint
+from baselines.common.checkpoint import (
+    TRAINING,
+    WEIGHTS,
+    make_last,
+    newest_checkpoint,
+    pack,
+    prune,
+    read_tensors,
+    save_checkpoint,
+    unpack,
+)
 from baselines.common.run_log import entries_until
 from manifeel_ms3.errors import FileExistsAlreadyError, InUseError, InvalidArgumentError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.files import FileWriteError
 from tests.trust.tiny_training import STEPS, finished, require_whole, start, tiny_args, train
 
@@ -230,3 +241,32 @@ def test_a13_an_evaluation_does_not_import_from_the_current_folder(undisturbed, 
     assert not (tmp_path / "executed").exists(), (tmp_path / "executed").read_text()
     assert done.returncode == 0, (done.stderr, said)
     assert (tmp_path / "evaluations/00000040.json").is_file()
+
+
+# -------------------------------------------------------------------- damaged
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda state: state.pop("random"),
+        lambda state: state.update({"optimizer.x.exp_avg": torch.zeros(2)}),
+        lambda state: state.update({"optimizer.99.exp_avg": torch.zeros(2)}),
+        lambda state: state.update({"optimizer": torch.zeros(2), "optimizer.": torch.zeros(2)}),
+        lambda state: state.update({"random": torch.zeros(3)}),
+        lambda state: state.pop("model.bias"),
+    ],
+    ids=["no random state", "a parameter without a number", "an unknown parameter", "no parameter", "another type", "a weight"],
+)
+def test_a_damaged_state_of_training_is_refused_in_one_line(harm, tmp_path):
+    model = torch.nn.Linear(2, 1)
+    optimizer = torch.optim.AdamW(model.parameters())
+    model(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    state = pack(optimizer, model)
+    unpack(state, optimizer, model, tmp_path)
+    harm(state)
+    with pytest.raises(CheckpointError) as refused:
+        unpack(state, optimizer, model, tmp_path)
+    assert str(tmp_path) in str(refused.value)
+    assert "\n" not in str(refused.value)

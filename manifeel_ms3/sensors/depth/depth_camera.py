@@ -49,16 +49,16 @@ class CameraDepth:
                 f"tactile sensor {sensor.uid!r} has backend='sapien', which needs a renderer, and this scene has none; "
                 "use backend='raycast', or give gym.make a render_backend"
             )
-        pixel = sensor.pixel_size
+        pixel, self._start = sensor.pixel_size, START + sensor.gel.max_sag
         rows, cols = (2 * math.ceil(extent / 2 / pixel) for extent in sensor.gel.size)
         config = CameraConfig(
             f"{sensor.uid}_depth",
-            pose=Pose.create(sensor.pad_pose * sapien.Pose([0, 0, -START], PAD_TO_CAMERA)),
+            pose=Pose.create(sensor.pad_pose * sapien.Pose([0, 0, -self._start], PAD_TO_CAMERA)),
             width=cols,
             height=rows,
             fov=1.0,
             near=NEAR,
-            far=START + REACH,
+            far=self._start + REACH,
             mount=pad,
             shader_config=FLOAT_POSITION,
         )
@@ -67,13 +67,14 @@ class CameraDepth:
         self.half_size = torch.tensor([rows, cols], device=scene.device) * pixel / 2
         right, top = cols * pixel / 2, rows * pixel / 2
         for component in self.camera.camera._render_cameras:
-            component.set_orthographic_parameters(NEAR, START + REACH, -right, right, -top, top)
+            component.set_orthographic_parameters(NEAR, self._start + REACH, -right, right, -top, top)
 
     def look(self) -> None:
         """Render depth; the scene's render state must be up to date (`scene.update_render`)."""
         self.camera.capture()
         depth = -self.camera.get_obs(rgb=False, depth=False, position=True, segmentation=False)["position"][..., 2]
-        self._height = torch.where(depth > 0, START - depth, torch.full_like(depth, -REACH))[:, None]  # (N, 1, rows, cols)
+        height = torch.where(depth > 0, self._start - depth, torch.full_like(depth, -REACH))
+        self._height = height[:, None]  # (N, 1, rows, cols)
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
         """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH if there is none."""

@@ -164,10 +164,17 @@ class MeshRays:
         meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are stored once.
         size: Size of the pads' face, m.
         device: Device on which rays are cast.
+        sag: Depth of a domed face's corners under its highest point, m: rays start so much deeper.
     """
 
-    def __init__(self, meshes: Sequence[Sequence[trimesh.Trimesh | None]], size: tuple[float, float], device: torch.device):
-        self.device = device
+    def __init__(
+        self,
+        meshes: Sequence[Sequence[trimesh.Trimesh | None]],
+        size: tuple[float, float],
+        device: torch.device,
+        sag: float = 0.0,
+    ):
+        self.device, self._start = device, START + sag
         shape = (len(meshes[0]), len(meshes))
         ids, low, high = torch.zeros(shape, dtype=torch.int64), torch.zeros(*shape, 3), torch.zeros(*shape, 3)
         self._meshes: dict[bytes, wp.Mesh] = {}
@@ -177,7 +184,8 @@ class MeshRays:
                     ids[n, b] = self._upload(mesh).id
                     low[n, b], high[n, b] = torch.tensor(mesh.bounds, dtype=torch.float32)
         self._boxes = [t.to(device) for t in (ids, low, high)]
-        self._swept = wp.vec3f(0.0, 0.0, (REACH - START) / 2), wp.vec3f(size[0] / 2, size[1] / 2, (REACH + START) / 2)
+        middle, half = (REACH - self._start) / 2, (REACH + self._start) / 2
+        self._swept = wp.vec3f(0.0, 0.0, middle), wp.vec3f(size[0] / 2, size[1] / 2, half)
         self._count = torch.zeros(shape[0], dtype=torch.int32, device=device)
         self._near = torch.zeros(shape, dtype=torch.int32, device=device)
         self._near_ids = torch.zeros(shape, dtype=torch.int64, device=device)
@@ -208,7 +216,8 @@ class MeshRays:
         """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH if there is none."""
         height = torch.empty(len(self._near), len(grid), device=self.device)
         where, size = (self._everywhere, (1.0, 1.0)) if window is None else (window.open, window.size)
-        inputs = [*self._found(), wp.from_torch(grid, dtype=wp.vec2f), wp.from_torch(where), wp.vec2f(*size), START, REACH]
+        face = [wp.from_torch(grid, dtype=wp.vec2f), wp.from_torch(where), wp.vec2f(*size)]
+        inputs = [*self._found(), *face, self._start, REACH]
         launch_split(_cast, tuple(height.shape), inputs, [wp.from_torch(height)], self.device)
         return height
 
@@ -222,7 +231,7 @@ class MeshRays:
         height = torch.empty(len(self._near), len(grid), device=self.device)
         velocity = torch.empty(*height.shape, 2, device=self.device)
         motion = wp.from_torch(twist.contiguous(), dtype=wp.spatial_vectorf)
-        inputs = [*self._found(), self._near, motion, wp.from_torch(grid, dtype=wp.vec2f), START, REACH]
+        inputs = [*self._found(), self._near, motion, wp.from_torch(grid, dtype=wp.vec2f), self._start, REACH]
         self._launch(_cast_moving, height.shape, inputs, [height, wp.from_torch(velocity, dtype=wp.vec2f)])
         return height, velocity
 
@@ -251,13 +260,23 @@ class RaycastDepth:
         pad_pose: Pose of the pad frame in that link's frame.
         size: Size of the face, m.
         excluded: Names of the links that are not felt.
+        sag: Depth of a domed face's corners under its highest point, m.
     """
 
-    def __init__(self, scene: ManiSkillScene, pad: Link, pad_pose: sapien.Pose, size: tuple[float, float], excluded: set[str]):
+    def __init__(
+        self,
+        scene: ManiSkillScene,
+        pad: Link,
+        pad_pose: sapien.Pose,
+        size: tuple[float, float],
+        excluded: set[str],
+        sag: float = 0.0,
+    ):
         self.pad, self.device = pad, torch.device(scene.device)
         self._pad_pose = pad_pose
         self.surfaces = scene_surfaces(scene, excluded)
-        self._rays = MeshRays([_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces], size, self.device)
+        meshes = [_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces]
+        self._rays = MeshRays(meshes, size, self.device, sag)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
         self._world[..., 3] = 1.0
         self._moving = [b for b, surface in enumerate(self.surfaces) if not _is_static(surface.body)]

@@ -16,7 +16,7 @@ import warp as wp
 from manifeel_ms3.sensors.warp_device import warp_device
 
 # Physical limits of the model (chosen)
-MAX_TILT = wp.constant(wp.float64(0.087))  # rad, 5 degrees: a larger moment comes from outside the pad's view
+MAX_TILT = 0.087  # rad, 5 degrees, on a flat face: a larger moment comes from outside the pad's view
 MAX_GAP = wp.constant(wp.float64(3.0e-3))  # m: the measured force does not press on geometry further from the face
 MIN_FORCE = wp.constant(wp.float64(1.0e-3))  # N: below it the pad counts as untouched
 # Numerics of the two Newton methods (chosen; tests/sensors compares the results with closed forms)
@@ -56,7 +56,9 @@ class ContactGrid:
         return cls(xx.flatten().contiguous(), yy.flatten().contiguous(), (rows, cols), size[0] * size[1] / (rows * cols))
 
 
-def solve_indentation(height: torch.Tensor, wrench: torch.Tensor, grid: ContactGrid, stiffness: torch.Tensor) -> torch.Tensor:
+def solve_indentation(
+    height: torch.Tensor, wrench: torch.Tensor, grid: ContactGrid, stiffness: torch.Tensor, max_tilt: float = MAX_TILT
+) -> torch.Tensor:
     """Plane (N, 3) to add to a surface's height so that what sticks out of the gel's face carries the measured load.
 
     Virtual indentation: only the object's shape matters; how deep it sits follows from the force. Find the depth d, m,
@@ -69,9 +71,10 @@ def solve_indentation(height: torch.Tensor, wrench: torch.Tensor, grid: ContactG
         wrench: (N, 6) float64, N and N m, force and moment of the object on the pad about the pad frame's origin.
         grid: The C cells.
         stiffness: (N,) float64, K, N/m^3.
+        max_tilt: Largest tilt along each axis, rad.
     """
     plane = torch.empty(len(height), 3, dtype=torch.float64, device=height.device)
-    _launch(_indent, grid, height, [height, wrench, stiffness, grid.x, grid.y, grid.area], [plane])
+    _launch(_indent, grid, height, [height, wrench, stiffness, grid.x, grid.y, grid.area, max_tilt], [plane])
     return plane
 
 
@@ -182,6 +185,7 @@ def _indent(
     x: wp.array(dtype=wp.float64),
     y: wp.array(dtype=wp.float64),
     area: wp.float64,
+    max_tilt: wp.float64,
     plane: wp.array2d(dtype=wp.float64),
 ):
     n, lane = wp.tid()
@@ -207,7 +211,7 @@ def _indent(
             total = _total(part)
             old = move
             move += _newton_step(total, load - wp.vec3d(total[0], total[1], total[2]))
-            most = MAX_TILT * LEVER
+            most = max_tilt * LEVER
             move = wp.vec3d(move[0], wp.clamp(move[1], -most, most), wp.clamp(move[2], -most, most))
             if wp.length(move - old) < CONVERGED:
                 break

@@ -1,12 +1,14 @@
-"""Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.optics.fit_shader {table,presses} ...`.
+"""Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.optics.fit_shader {table,presses,pack} ...`.
 
 It is fitted to a table in Taxim's format, or to images of presses of a ball of known radius: a folder with `background.png`
-(untouched gel), the images, and `presses.csv`, which has the columns `file,row,col,radius` (the contact circle in pixels).
+(untouched gel), the images, and `presses.csv`, which has the columns `file,row,col,radius` (the contact circle in pixels); or a
+file with such images, `dataPack.npz` in Taxim's format.
 """
 
 import csv
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -19,6 +21,7 @@ from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 from .taxim_table import fit_table, read_table
 
+SHIFTS = (8, 4, 2)  # pixels: steps of the search for a circle's middle, by up to two steps each (chosen)
 RIDGE = 1e-6  # share of the mean diagonal (chosen): coefficients of slopes and places that no press reached stay at zero
 
 
@@ -34,22 +37,46 @@ class Table:
     """Rows and columns of the sensor's image: the table's image, laid on its side."""
 
 
-@dataclass
-class Presses:
-    """Fit the shader to images of ball presses."""
+@dataclass(kw_only=True)
+class BallPresses:
+    """What is known of ball presses besides their images."""
 
-    folder: Path
-    """Path of the folder with background.png, presses.csv and the images."""
     ball_radius: float
     """Radius of the ball, m."""
     pixel_size: float
     """Size of a pixel on the gel's face, m."""
     out: Path
     """Path of the shader file that is written."""
+    uniform: bool = False
+    """Let colours change alike all over the image, for presses that cover only a part of it; what changes alike in all
+    directions is then taken for an effect of the depth, and left out."""
+    refine: bool = False
+    """Shift each contact circle to where the other presses' colours fit best, for circles that were drawn by hand."""
+
+
+@dataclass(kw_only=True)
+class Presses(BallPresses):
+    """Fit the shader to images of ball presses."""
+
+    folder: Path
+    """Path of the folder with background.png, presses.csv and the images."""
+
+
+@dataclass(kw_only=True)
+class Pack(BallPresses):
+    """Fit the shader to the images of ball presses in a dataPack.npz in Taxim's format."""
+
+    pack: Path
+    """Path of the file: an npz with f0, imgs (BGR), touch_center (column, row) and touch_radius (pixels)."""
 
 
 def fit_presses(
-    background: np.ndarray, images: np.ndarray, circles: np.ndarray, ball_radius: float, pixel_size: float
+    background: np.ndarray,
+    images: np.ndarray,
+    circles: np.ndarray,
+    ball_radius: float,
+    pixel_size: float,
+    uniform: bool = False,
 ) -> Shader:
     """Shader of a gel, fitted to presses of a ball.
 
@@ -61,6 +88,7 @@ def fit_presses(
         circles: (P, 3), row, column and radius of the contact, pixels.
         ball_radius: Radius of the ball, m.
         pixel_size: Size of a pixel on the gel's face, m.
+        uniform: Whether colours change alike all over the image, and not at all where that is independent of the direction.
 
     Raises:
         InvalidArgumentError: A contact circle is larger than the ball, or the images have different shapes.
@@ -76,20 +104,67 @@ def fit_presses(
         )
     row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
     place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
-    columns = FOURIER_TERMS * (len(KNOTS) - 1) * PLACE_TERMS
+    # the first term over places, and over directions, is 1
+    first, used = (1, 1) if uniform else (0, PLACE_TERMS)
+    columns = (FOURIER_TERMS - first) * (len(KNOTS) - 1) * used
     normal, right = np.zeros((columns, columns)), np.zeros((columns, 3))
     for image, (middle_row, middle_col, radius) in zip(images, circles, strict=True):
-        y, x = (row - middle_row) * pixel_size, (col - middle_col) * pixel_size
-        r2 = x * x + y * y
-        inside = r2 < (radius * pixel_size) ** 2
-        slope = np.sqrt(r2[inside] / (ball_radius**2 - r2[inside]))
-        phi = np.arctan2(-x[inside], -y[inside])  # the surface rises, into the gel, towards the middle
-        design = np.einsum("nf,nk,nq->nfkq", fourier_terms(phi), slope_terms(slope), place[inside]).reshape(-1, columns)
+        inside, slope, phi = _pressed(row - middle_row, col - middle_col, radius, ball_radius, pixel_size)
+        terms = (fourier_terms(phi)[:, first:], slope_terms(slope), place[inside, :used])
+        design = np.einsum("nf,nk,nq->nfkq", *terms).reshape(-1, columns)
         normal += design.T @ design
         right += design.T @ (image[inside].astype(float) - background[inside])
     weights = np.linalg.solve(normal + RIDGE * np.trace(normal) / columns * np.eye(columns), right)
     flat = np.linalg.lstsq(place.reshape(-1, PLACE_TERMS), background.reshape(-1, 3).astype(float), rcond=None)[0]
-    return Shader(weights.T.reshape(3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS), flat.T)
+    fitted = np.zeros((3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS))
+    fitted[:, first:, :, :used] = weights.T.reshape(3, FOURIER_TERMS - first, len(KNOTS) - 1, used)
+    return Shader(fitted, flat.T)
+
+
+def _pressed(
+    row: np.ndarray, col: np.ndarray, radius: float, ball_radius: float, pixel_size: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (H, W) within a contact circle of `radius` pixels, and the gradient's size and direction (n,) in them.
+
+    `row` and `col` (H, W) are distances from the circle's middle, pixels.
+    """
+    y, x = row * pixel_size, col * pixel_size
+    r2 = x * x + y * y
+    inside = r2 < (radius * pixel_size) ** 2
+    slope = np.sqrt(r2[inside] / (ball_radius**2 - r2[inside]))
+    return inside, slope, np.arctan2(-x[inside], -y[inside])  # the surface rises, into the gel, towards the middle
+
+
+def refined_circles(
+    background: np.ndarray,
+    images: np.ndarray,
+    circles: np.ndarray,
+    ball_radius: float,
+    pixel_size: float,
+    uniform: bool = False,
+) -> np.ndarray:
+    """The contact circles, their middles shifted to where the shader of half of the presses fits the other half best.
+
+    Arguments are those of `fit_presses`.
+    """
+    circles, rows, cols = circles.astype(float), *background.shape[:2]
+    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
+    place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)
+
+    def misfit(shader: Shader, press: int, middle: np.ndarray) -> float:
+        inside, slope, phi = _pressed(row - middle[0], col - middle[1], circles[press, 2], ball_radius, pixel_size)
+        terms = (fourier_terms(phi), slope_terms(slope), place[inside])
+        change = np.einsum("cfkq,nf,nk,nq->nc", shader.weights, *terms, optimize=True)
+        return float((change - (images[press][inside].astype(float) - background[inside])).var(axis=0).sum())
+
+    for step in SHIFTS:
+        grid = step * np.array(list(product(range(-2, 3), repeat=2)))
+        for half in (0, 1):
+            shader = fit_presses(background, images[1 - half :: 2], circles[1 - half :: 2], ball_radius, pixel_size, uniform)
+            for press in range(half, len(images), 2):
+                middles = circles[press, :2] + grid
+                circles[press, :2] = min(middles, key=lambda middle, p=press, s=shader: misfit(s, p, middle))
+    return circles
 
 
 def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -109,6 +184,23 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return _read_image(folder / "background.png"), np.stack([_read_image(folder / p["file"]) for p in presses]), circles
 
 
+def read_pack(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Background, images and circles of a dataPack.npz, in the form that `fit_presses` expects.
+
+    Raises:
+        InvalidFileError: The file is missing or does not have Taxim's format.
+    """
+    try:
+        with np.load(path) as stored:
+            background, images, centres, radii = (stored[k] for k in ("f0", "imgs", "touch_center", "touch_radius"))
+            circles = np.column_stack([centres[:, ::-1], radii]).astype(float)
+    except (OSError, KeyError, ValueError, IndexError) as error:
+        raise InvalidFileError(
+            f"{path} is no dataPack.npz in Taxim's format ({error}); it must hold f0, imgs, touch_center and touch_radius"
+        ) from error
+    return background[..., ::-1], images[..., ::-1], circles
+
+
 def _read_image(path: Path) -> np.ndarray:
     image = cv2.imread(str(path))
     if image is None:
@@ -116,15 +208,19 @@ def _read_image(path: Path) -> np.ndarray:
     return image[..., ::-1]
 
 
-def main(args: Table | Presses) -> None:
+def main(args: Table | Presses | Pack) -> None:
     """Fit a shader and write it."""
     if isinstance(args, Table):
         shader = fit_table(read_table(args.table), args.image_shape)
     else:
-        shader = fit_presses(*read_presses(args.folder), args.ball_radius, args.pixel_size)
+        background, images, circles = read_pack(args.pack) if isinstance(args, Pack) else read_presses(args.folder)
+        scale = (args.ball_radius, args.pixel_size, args.uniform)
+        if args.refine:
+            circles = refined_circles(background, images, circles, *scale)
+        shader = fit_presses(background, images, circles, *scale)
     args.out.parent.mkdir(parents=True, exist_ok=True)
     shader.save(args.out)
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Table | Presses)))
+    sys.exit(run(main, tyro.cli(Table | Presses | Pack)))

@@ -13,10 +13,11 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own usage)
 import warp as wp
 
-from manifeel_ms3.sensors.config import TactileSensorConfig
+from manifeel_ms3.sensors.config import LightsConfig, TactileSensorConfig
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.warp_device import launch_split, warp_device
 
+from .lights import lamp_shader
 from .shader import FOURIER_TERMS, KNOTS, Shader, place_terms, slope_terms
 from .taxim_table import TABLE_CHANNELS, fit_table, read_table
 
@@ -106,7 +107,8 @@ def _shade(
     moved: wp.array3d(dtype=wp.vec3f),  # (N, h, w) displacement of the skin, pixels (z unused); may be empty
     marker_pitch: float,  # pixels
     marker_radius: float,
-    noise: float,  # standard deviation, grey levels
+    noise: wp.array(dtype=wp.float32),  # (N,), standard deviation, grey levels
+    drift: wp.array(dtype=wp.vec3f),  # (N,), grey levels
     seed: wp.array(dtype=wp.int32),  # (N,), of the episode's noise
     frame: wp.array(dtype=wp.int32),  # (N,), images since the episode's beginning
     image: wp.array3d(dtype=wp.vec3ub),  # (N, H, W)
@@ -131,9 +133,10 @@ def _shade(
         x = _dot_at(float(j) - 0.5 * float(cols - 1) - skin[1], marker_pitch)
         cover = wp.clamp(marker_radius + 0.5 - wp.sqrt(x * x + y * y), 0.0, 1.0)
         colour *= 1.0 - wp.static(MARKER_DARKNESS) * cover
-    if noise > 0.0:
+    colour += drift[n]
+    if noise[n] > 0.0:
         state = wp.rand_init(seed[n], (frame[n] * rows + i) * cols + j)
-        colour += noise * wp.vec3f(wp.randn(state), wp.randn(state), wp.randn(state))
+        colour += noise[n] * wp.vec3f(wp.randn(state), wp.randn(state), wp.randn(state))
     image[n, i, j] = wp.vec3ub(
         wp.uint8(wp.clamp(colour[0] + 0.5, 0.0, 255.0)),
         wp.uint8(wp.clamp(colour[1] + 0.5, 0.0, 255.0)),
@@ -181,7 +184,8 @@ class Optics:
         self.config, self.device = config, device
         optics, shape = config.optics, config.image_shape
         coarse, cell = (shape[0] // COARSE, shape[1] // COARSE), COARSE * config.pixel_size
-        self._response, self._background, to_light = _shading_maps(Path(optics.calibration), shape, device)
+        recipe = (Path(optics.calibration), optics.lights, config.gel.curvature, tuple(shape), config.pixel_size)
+        self._response, self._background, to_light = _shading_maps(*recipe, device)
         self._to_light = wp.array(to_light, dtype=wp.vec2f, device=warp_device(device))
         self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=warp_device(device))
         self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
@@ -193,6 +197,10 @@ class Optics:
         self._gain = torch.ones(num_pads, 3, device=device)
         self._phase = torch.tensor([[1.0, 0.0]], device=device).repeat(num_pads, 1)
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
+        self.noise = torch.full((num_pads,), optics.noise, device=device)
+        """Standard deviation (N,) of the read noise, grey levels."""
+        self.drift = torch.zeros(num_pads, 3, device=device)
+        """Drift (N, 3) of the colours in the next image, grey levels."""
 
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:
         """Begin an episode on these pads: light and noise follow from the seeds, one for each pad."""
@@ -238,7 +246,8 @@ class Optics:
             wp.from_torch(moved, dtype=wp.vec3f),
             optics.marker_pitch / pixel,
             optics.marker_radius / pixel,
-            optics.noise,
+            wp.from_torch(self.noise),
+            wp.from_torch(self.drift, dtype=wp.vec3f),
             wp.from_torch(self._seed),
             wp.from_torch(self._frame),
         ]
@@ -267,28 +276,53 @@ class Optics:
         return F.pad(moved / self.config.pixel_size, (0, 1))
 
 
-def _load_shader(path: Path, image_shape: tuple[int, int]) -> Shader:
-    """The compact shader in a file, or the one that fits the Taxim table in it."""
-    if path.is_file():
+def shader_of(config: TactileSensorConfig) -> Shader:
+    """The compact shader of a sensor.
+
+    Raises:
+        InvalidFileError: Its calibration is missing, or is neither a shader file nor a table in Taxim's format.
+    """
+    optics = config.optics
+    return _shader(Path(optics.calibration), optics.lights, config.gel.curvature, config.image_shape, config.pixel_size)
+
+
+def _shader(
+    calibration: Path,
+    lights: LightsConfig | None,
+    curvature: tuple[float, float],
+    image_shape: tuple[int, int],
+    pixel_size: float,
+) -> Shader:
+    """The shader that the lamps give; without lamps, the one in a file, or the one that fits the Taxim table in it."""
+    if lights is not None:
+        return lamp_shader(lights, curvature, image_shape, pixel_size)
+    if calibration.is_file():
         try:
-            with np.load(path) as stored:
+            with np.load(calibration) as stored:
                 is_table = any(name in stored for name in TABLE_CHANNELS)
         except (OSError, ValueError):
             is_table = False  # `Shader.load` reports what is wrong
         if is_table:
-            return fit_table(read_table(path), image_shape)
-    return Shader.load(path)
+            return fit_table(read_table(calibration), image_shape)
+    return Shader.load(calibration)
 
 
 @functools.lru_cache(maxsize=4)
-def _shading_maps(path: Path, image_shape: tuple[int, int], device: torch.device) -> tuple[wp.array, wp.array, np.ndarray]:
+def _shading_maps(
+    calibration: Path,
+    lights: LightsConfig | None,
+    curvature: tuple[float, float],
+    image_shape: tuple[int, int],
+    pixel_size: float,
+    device: torch.device,
+) -> tuple[wp.array, wp.array, np.ndarray]:
     """The shader at every pixel.
 
     Returns:
         Response (H, W, knot, Fourier term) and background (H, W), RGB each, and the direction (3, 2), along rows and columns,
         from which each channel's light comes.
     """
-    shader = _load_shader(path, image_shape)
+    shader = _shader(calibration, lights, curvature, image_shape, pixel_size)
     rows, cols = image_shape
     place = place_terms(*np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij"))
     response = np.zeros((rows, cols, len(KNOTS), FOURIER_TERMS, 3), np.float32)

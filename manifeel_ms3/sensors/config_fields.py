@@ -1,0 +1,108 @@
+"""Fields of the sensor's configuration: the range of each number, and changes by dotted name."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+from manifeel_ms3.arguments import by_name, is_number
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Range of the number, or of each number, that a field holds; `low` belongs to it unless `high` is infinite."""
+
+    low: float = 0.0
+    high: float = math.inf
+
+    def __contains__(self, number: float) -> bool:
+        return is_number(number) and (self.low < number if math.isinf(self.high) else self.low <= number <= self.high)
+
+    def __str__(self) -> str:
+        return "positive" if math.isinf(self.high) else f"in [{self.low:g}, {self.high:g}]"
+
+
+def positive(default: Any) -> Any:
+    """Dataclass field for positive numbers."""
+    return field(default=default, metadata={"bounds": Bounds()})
+
+
+def within(default: Any, low: float, high: float) -> Any:
+    """Dataclass field for a number, or a tuple of numbers, from `low` to `high`."""
+    return field(default=default, metadata={"bounds": Bounds(low, high)})
+
+
+def amount(high: float) -> Any:
+    """Dataclass field for an amount from 0 to `high`: a pair of which each episode draws its own, or one number for all."""
+    return field(default=(0.0, 0.0), metadata={"bounds": Bounds(0.0, high), "amount": True})
+
+
+def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
+    """Check the fields of a dataclass, and of those in it, against their bounds.
+
+    Raises:
+        InvalidArgumentError: A number is out of its bounds, or a pair is not in rising order; the message names the field.
+    """
+    for entry in dataclasses.fields(config):
+        name, value = prefix + entry.name, getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            check_bounds(value, uid, f"{name}.")
+        bounds = entry.metadata.get("bounds")
+        numbers = value if isinstance(value, Sequence) else (value,)
+        if bounds and any(number not in bounds for number in numbers):
+            raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be {bounds}")
+        if entry.metadata.get("amount") and (len(value) != 2 or value[0] > value[1]):
+            raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be a number, or a pair (least, most)")
+
+
+def with_option(config: Any, path: Sequence[str], value: Any, name: str) -> Any:
+    """A dataclass with one field changed.
+
+    Args:
+        config: The dataclass.
+        path: Names that lead to the field, from the outermost dataclass inwards.
+        value: New value.
+        name: Name of the option in messages.
+
+    Raises:
+        UnknownNameError: The field does not exist; the message lists those that do.
+        InvalidArgumentError: The value is of another type than the field's.
+    """
+    known = {entry.name: entry for entry in dataclasses.fields(config)} if dataclasses.is_dataclass(config) else {}
+    if path[0] not in known:
+        raise UnknownNameError(f"tactile option {name!r}: {path[0]!r} is not a field; choose from {list(known)}")
+    present = getattr(config, path[0])
+    if known[path[0]].metadata.get("amount") and is_number(value):
+        value = (value, value)
+    if len(path) > 1:
+        value = with_option(present, path[1:], value, name)
+    elif not _is_like(value, present):
+        raise InvalidArgumentError(f"tactile option {name!r}: expected a value like {present!r}, not {value!r}")
+    changed: dict[str, Any] = {path[0]: tuple(value) if isinstance(present, tuple) else value}
+    return dataclasses.replace(cast(Any, config), **changed)
+
+
+def with_options(config: Any, options: Mapping[str, Any]) -> Any:
+    """A dataclass with some fields changed, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+
+    Raises:
+        UnknownNameError: A name is not that of a field.
+        InvalidArgumentError: A value is not allowed.
+    """
+    for name, value in by_name("tactile", options, '{"units": "tacsl", "optics.noise": 2.0}').items():
+        config = with_option(config, name.split("."), value, name)
+    return config
+
+
+def _is_like(value: Any, present: Any) -> bool:
+    """Whether `value` has the type, and for a tuple the length, that a field with the value `present` needs."""
+    if isinstance(present, tuple):
+        return isinstance(value, list | tuple) and len(value) == len(present) and all(map(_is_like, value, present))
+    if isinstance(present, float):
+        return is_number(value)
+    if isinstance(present, str | Path):
+        return isinstance(value, str | Path)
+    return type(value) is type(present)

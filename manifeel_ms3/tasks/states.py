@@ -1,0 +1,36 @@
+"""States of an environment as vectors."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+
+from manifeel_ms3.errors import InvalidArgumentError
+
+Tree = Mapping[str, Any]
+"""Nested dicts of tensors (N, D)."""
+
+
+def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
+    """The tree of tensors whose columns, in their order, a flat state has.
+
+    Args:
+        state: Flat states (N, D), as ManiSkill's `get_state` returns them.
+        like: A tree of the same form.
+
+    Raises:
+        InvalidArgumentError: The state has another number of columns than the tree.
+    """
+    widths = [leaf.shape[-1] for leaf in _leaves(like)]
+    if state.ndim != 2 or state.shape[1] != sum(widths):
+        raise InvalidArgumentError(f"a state of shape {tuple(state.shape)} is given; get_state returns (N, {sum(widths)})")
+    return _filled(like, iter(state.split(widths, dim=1)))
+
+
+def _leaves(tree: Tree) -> Iterator[torch.Tensor]:
+    for value in tree.values():
+        yield from _leaves(value) if isinstance(value, Mapping) else [value]
+
+
+def _filled(like: Tree, columns: Iterator[torch.Tensor]) -> dict[str, Any]:
+    return {name: _filled(value, columns) if isinstance(value, Mapping) else next(columns) for name, value in like.items()}

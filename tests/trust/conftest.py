@@ -1,0 +1,31 @@
+"""Fixtures of the tests of trust: a submission, a trajectory file and a secret that nothing may read."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.leaderboard.made_up import made_up
+
+from .files_of_strangers import SAMPLE, SECRET
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    return made_up(tmp_path / "theirs", "Theirs", "PegInsertion", "rgb", 10)
+
+
+@pytest.fixture
+def demo(tmp_path) -> Path:
+    """A copy of the sample's trajectory file, to be spoiled."""
+    for name in ("trajectory.h5", "trajectory.json"):
+        shutil.copy(SAMPLE / name, tmp_path)
+    return tmp_path / "trajectory.h5"
+
+
+@pytest.fixture
+def secret(tmp_path) -> Path:
+    path = tmp_path / "elsewhere/secret.txt"
+    path.parent.mkdir()
+    path.write_bytes(SECRET)
+    return path

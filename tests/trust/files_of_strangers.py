@@ -1,0 +1,27 @@
+"""Files that do harm, for the tests of the readers: copies of the sample, a secret beside them, and a class that runs code."""
+
+import json
+import os
+from pathlib import Path
+
+from tests.conftest import PEG
+
+REPOSITORY = Path(__file__).parents[2]
+SAMPLE = REPOSITORY / "data/sample" / PEG
+LEROBOT = REPOSITORY / "tests/demonstrations/lerobot"
+KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
+SECRET = b"TOP SECRET TEXT OF ANOTHER FILE."
+EXECUTED = "import pathlib; pathlib.Path('executed').touch()\n"
+
+
+class Gadget:
+    """Unpickled, it runs a command."""
+
+    def __reduce__(self):
+        return os.system, ("touch executed",)
+
+
+def rewrite_json(path: Path, change) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))

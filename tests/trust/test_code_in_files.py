@@ -1,0 +1,111 @@
+"""A file that names code has none of it imported or run."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from manifeel_ms3.demonstrations import render_observations, replay, view
+from manifeel_ms3.demonstrations.export import Args
+from manifeel_ms3.demonstrations.export import main as export
+from manifeel_ms3.demonstrations.summary import summary
+from manifeel_ms3.demonstrations.validate import validate
+from manifeel_ms3.errors import ManifeelError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.policy import PolicySource, load_policy
+
+from .files_of_strangers import EXECUTED, REPOSITORY, SAMPLE, rewrite_json
+
+# ------------------------------------------------------------------ A11: checkpoints name policies, never code
+
+
+GADGETS = [
+    {"kind": "site:addsitedir"},
+    {"kind": "os:system"},
+    {"kind": "shutil:rmtree"},
+    {"kind": "baselines.common.agent:PolicyAgent", "policy_class": "gadget:Policy"},
+    *(
+        {"policy_name": name}
+        for name in ("site:addsitedir", "os:system", "gadget", "gadget:Policy", "../gadget", "this", 5, [])
+    ),
+    {"policy_name": "baselines.diffusion_policy.train:SPEC"},
+    {"policy_name": "diffusion_policy", "policy_class": "gadget:Policy", "policy": {"encoder": "gadget:Policy"}},
+]
+
+
+@pytest.mark.parametrize("config", GADGETS, ids=str)
+def test_a11_a_checkpoint_runs_nothing_that_its_config_names(config, tmp_path, monkeypatch):
+    folder = tmp_path / "touch executed"  # what `os:system` once ran
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps(config))
+    (folder / "gadget.pth").write_text(EXECUTED)  # what `site:addsitedir` once ran
+    (tmp_path / "gadget.py").write_text(EXECUTED)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    for load in (lambda: load_policy(folder), PolicySource(checkpoint=folder).make):
+        with pytest.raises(CheckpointError):
+            load()
+    assert (folder / "config.json").is_file()
+    assert not (tmp_path / "executed").exists()
+    assert "gadget" not in sys.modules
+
+
+# ------------------------------------------------------------------ A12: environment ids of files
+
+
+@pytest.fixture
+def gadget(tmp_path, monkeypatch) -> Path:
+    """A folder that is on the path of modules, as the current one is with `python -m`; its module leaves a marker."""
+    (tmp_path / "gadget.py").write_text(EXECUTED)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+def naming(env_id: str, name: str, folder: Path) -> Path:
+    """A trajectory file of a set whose json has this id."""
+    for suffix in (".h5", ".json"):
+        shutil.copy(SAMPLE / f"{name}{suffix}", folder)
+    rewrite_json(folder / f"{name}.json", lambda header: header["env_info"].update(env_id=env_id))
+    about = {"schema": "manifeel-demonstrations-1", "files": {f"{name}.h5": {"success": 2}}}
+    (folder / "manifest.json").write_text(json.dumps(about))
+    return folder / f"{name}.h5"
+
+
+def test_a12_replay_from_the_command_line_imports_no_module_of_the_file(gadget):
+    path = naming("gadget:ManiFeel-PegInsertion-v1", "states", gadget)
+    command = [sys.executable, "-m", "manifeel_ms3.demonstrations.replay", str(path), "--num", "1"]
+    done = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": str(REPOSITORY)}, capture_output=True, text=True, check=False
+    )
+    assert "of 1 episodes succeed again" in done.stdout + done.stderr
+    assert not (gadget / "executed").exists()
+
+
+READ_ENV_ID = {
+    "replay": lambda path: replay.replay(path, 1),
+    "validate": lambda path: validate(path.parent, 1),
+    "render_observations": lambda path: render_observations.main(
+        render_observations.Args(path, path.with_name("out.h5"), "tacff", (), ("right",), num=1)
+    ),
+    "summary": summary,
+    "view": lambda path: view.read_streams(path, 0),
+    "export": lambda path: export(Args(path, "npz", path.with_name("out"))),
+}
+
+
+@pytest.mark.parametrize("env_id", ["gadget:Other-v1", "gadget:ManiFeel-PegInsertion-v1"])
+@pytest.mark.parametrize("command", READ_ENV_ID)
+def test_a12_no_module_that_a_file_names_is_imported(command, env_id, gadget):
+    if command == "render_observations" and "Peg" in env_id:
+        pytest.skip("it renders in worker processes, which the test of the command line stands for")
+    path = naming(env_id, "trajectory" if command in ("view", "export") else "states", gadget)
+    with suppress(ManifeelError):
+        READ_ENV_ID[command](path)
+    assert not (gadget / "executed").exists()
+    assert "gadget" not in sys.modules
