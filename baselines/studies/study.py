@@ -241,7 +241,8 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
         for name, changes in ({"": {}} | grid.perturbations).items():
             env_kwargs = json.dumps(grid.task_args | changes, sort_keys=True)
-            title = f"{train.title}, {name}" if name else train.title
+            what, before_seed, number = train.title.rpartition(", seed ")
+            title = ", ".join(filter(None, (what, name))) + before_seed + number
             yield Job("evaluate", title, settings | dict(env_kwargs=env_kwargs, version=version(PACKAGE)), (train,))
 
 
