@@ -1,7 +1,8 @@
-"""Two policies that ignore what they observe; a trained policy must do better than both.
+"""Policies that have learnt nothing; a trained policy must do better than each of them.
 
-Evaluate them with `manifeel eval`:
+`python -m baselines.floors` measures all of them. One of them is evaluated with `manifeel eval`:
 
+    --policy baselines.references:RandomActions --policy-kwargs '{"env_id": "ManiFeel-PegInsertion-v1"}'
     --policy baselines.references:MeanAction --policy-kwargs '{"demos": "trajectory.h5"}'
     --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/peg/checkpoints/last"}'
 
@@ -14,11 +15,38 @@ from typing import Any
 import numpy as np
 import torch
 
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.tasks.registry import task_spec
 
 from .common.agent import PolicyAgent, build_policy
 from .registry import policy_spec
+
+
+class RandomActions:
+    """Actions that are drawn uniformly from [-1, 1], each component apart, and anew in each step.
+
+    Args:
+        env_id: Id of the task.
+        control_mode: Controller that takes the actions; the task's own if not given.
+    """
+
+    def __init__(self, env_id: str, control_mode: str | None = None):
+        self._size = len(ACTION_AXES[control_mode or task_spec(env_id).env_class.default_control_mode])
+        self._rng = np.random.default_rng(0)
+
+    def reset(self) -> None:
+        """Begin an episode with the seed 0."""
+        self.begin_episode(0)
+
+    def begin_episode(self, seed: int) -> None:
+        """Begin an episode, whose seed draws the actions."""
+        self._rng = np.random.default_rng(seed)
+
+    def act(self, _obs: dict[str, Any]) -> np.ndarray:
+        """A random action (A,)."""
+        return self._rng.uniform(-1.0, 1.0, self._size)
 
 
 class MeanAction:

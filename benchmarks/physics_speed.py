@@ -16,6 +16,7 @@ from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.recording import STATES_FILE
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
 
@@ -28,7 +29,7 @@ class Args:
 
 def real_time_factors(task: str) -> tuple[float, float]:
     """Simulated seconds a second: of the engine alone, of whole steps; all sample demonstrations together."""
-    path = data_dir() / "sample" / task / "states.h5"
+    path = data_dir() / "sample" / task / STATES_FILE
     seconds = np.zeros(3)
     episodes = read_header(path)["episodes"]
     with open_trajectories(path) as file:

@@ -6,6 +6,7 @@ Run `python benchmarks/tactile_speed.py` in the repository's root.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import gymnasium as gym
@@ -17,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.sensors import TactileSensor, gelsight_r15, with_options
+from manifeel_ms3.sensors import TactileSensor, TactileSensorConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.optics.shader import KNOTS, Shader, fourier_terms, slope_terms
 from manifeel_ms3.sensors.touch_model import TouchModel
@@ -31,6 +32,11 @@ MODES = {  # name: outputs and options of the sensor
         ("rgb", "force_field"),
         {"optics.shadow": 0.5, "optics.noise": 2.0, "optics.markers": True},
     ),
+    "TacRGB + TacFF, imperfect": (
+        ("rgb", "force_field"),
+        {f"imperfections.{name}": 0.1 for name in ("hysteresis", "crosstalk", "dead_taxels", "drift", "noise", "gain")}
+        | {"imperfections.delay": 2},
+    ),
 }
 PUSH = (0.5, 0.2, -5.0, 0.0, 0.0, 1e-3)  # N, N m
 TABLE_BINS = 125  # as TacSL's tables have
@@ -38,6 +44,8 @@ TABLE_BINS = 125  # as TacSL's tables have
 
 @dataclass
 class Args:
+    sensors: tuple[str, ...] = ("gelsight_r15", "gelsight_mini", "digit")
+    """Sensors by name."""
     batches: tuple[int, ...] = (1, 8, 64)
     """Numbers of pads that are computed at once."""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
@@ -46,9 +54,9 @@ class Args:
     """Duration of each measurement, s."""
 
 
-def press(shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
+def press(config: TactileSensorConfig, shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
     """Rays of equal pads, each with the shape half a millimetre in its gel."""
-    rays = MeshRays([[shape] * pads], gelsight_r15("touch", "gel_right").gel.size, device)
+    rays = MeshRays([[shape] * pads], config.gel.size, device, config.gel.max_sag)
     deep = torch.tensor([0.0, 0, -5e-4, 0, 0, 0, 1], device=device)
     rays.move(deep.expand(pads, 1, 7), torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device).expand(pads, 7))
     return rays
@@ -99,29 +107,46 @@ def any_table() -> np.ndarray:
     return np.einsum("cfkq,sk,pf->cspq", shader.weights, slope_terms(gradient), fourier_terms(phi))
 
 
-def main(args: Args) -> None:
-    console, device = Console(), torch.device(args.device)
-    name = torch.cuda.get_device_name() if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
-    console.print(name)
-    table = Table("touches", "gives", *(f"{n} at once" for n in args.batches), title="ms per pad")
-    config = gelsight_r15("touch", "gel_right")
+def sensor_table(name: str, args: Args, device: torch.device) -> Table:
+    """Milliseconds per pad of one sensor: alone, in batches, in an environment, and at a reset."""
+    table = Table("touches", "gives", *(f"{n} at once" for n in args.batches), title=f"{name}: ms per pad")
+    config = sensor_config(name, "touch", "gel_right")
     for shape_name, shape in shapes().items():
         for label, (outputs, options) in MODES.items():
             times = []
             for n in args.batches:
                 model = TouchModel(with_options(config, options), n, device, outputs)
-                rays, wrench = press(shape, n, device), torch.tensor(PUSH, dtype=torch.float64, device=device).repeat(n, 1)
+                rays = press(config, shape, n, device)
+                wrench = torch.tensor(PUSH, dtype=torch.float64, device=device).repeat(n, 1)
                 times.append(milliseconds(lambda m=model, p=rays, w=wrench: m.observe(p, w), args.seconds) / n)
             table.add_row(shape_name, label, *(f"{t:.2f}" for t in times))
-    env = gym.make("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none").unwrapped
+    for label, (outputs, options) in MODES.items():
+        times = []
+        for n in args.batches:
+            model = TouchModel(with_options(config, options), n, device, outputs)
+            pads, seeds = torch.arange(n, device=device), np.arange(n)
+            times.append(milliseconds(lambda m=model, p=pads, s=seeds: m.reset(p, s), args.seconds) / n)
+        table.add_row("reset", label, *(f"{t:.3f}" for t in times))
+    env: Any = gym.make("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none", sensor=name).unwrapped
     env.reset(seed=0)
     for label, (outputs, options) in MODES.items():
         sensor = TactileSensor(with_options(config, options), env.scene, env.agent.robot, outputs)
         table.add_row("a held peg, in the environment", label, f"{milliseconds(sensor.capture, args.seconds):.2f}")
-    console.print(table)
+    env.close()
+    return table
 
+
+def main(args: Args) -> None:
+    console, device = Console(), torch.device(args.device)
+    name = torch.cuda.get_device_name() if device.type == "cuda" else f"CPU, {torch.get_num_threads()} threads"
+    console.print(name)
+    for sensor in args.sensors:
+        console.print(sensor_table(sensor, args, device))
+
+    config = gelsight_r15("touch", "gel_right")
     model = TouchModel(config, 1, torch.device("cpu"))
-    rays, wrench = press(shapes()["ball, 20,480 triangles"], 1, torch.device("cpu")), torch.tensor([PUSH], dtype=torch.float64)
+    ball = shapes()["ball, 20,480 triangles"]
+    rays, wrench = press(config, ball, 1, torch.device("cpu")), torch.tensor([PUSH], dtype=torch.float64)
     model.observe(rays, wrench)
     optics, lookup = model.optics, any_table()
     assert optics is not None

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import trimesh
 
-from manifeel_ms3.sensors import GelConfig, gelsight_r15, with_options
+from manifeel_ms3.sensors import GelConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -70,6 +70,36 @@ def gallery() -> None:
     ball = indenters()["ball, 8 mm"][0]
     variants = [{}, {"optics.shadow": 0.6}, {"optics.markers": True}, {"optics.noise": 4.0}]
     _save("options.png", np.hstack([touch(ball, 5.0, (1.0, 1.5), **v)["rgb"].numpy() for v in variants]))
+
+
+SIDE_BY_SIDE = ("ball, 8 mm", "rod, 6 mm", "box, 8 x 12 mm", "M16 thread, 2 mm", "dimples, 0.25 mm")
+PANEL = (160, 213)  # rows and columns of a picture, pixels
+
+
+def side_by_side() -> None:
+    """Draw TacRGB and force field of five objects on three sensors, under the loads of the gallery and shear."""
+    sensors = {"GelSight R1.5": "gelsight_r15", "GelSight Mini": "gelsight_mini", "DIGIT": "digit"}
+    header = [_label("", PANEL[1] // 2, 28)] + [_label(f"{t}: {kind}", PANEL[1], 28) for t in sensors for kind in ("RGB", "FF")]
+    rows = [np.hstack(header)]
+    for name in SIDE_BY_SIDE:
+        mesh, load = indenters()[name]
+        row = [_label(f"{name.replace(', ', chr(10))}\n{load:.0f} N", PANEL[1] // 2, PANEL[0])]
+        for sensor in sensors.values():
+            config = sensor_config(sensor, "touch", "gel")
+            rays = MeshRays([[mesh]], config.gel.size, CPU, config.gel.max_sag)
+            wrench = torch.tensor([[0.0, 0.3 * load, -load, 0.0, 0.0, 1e-3]], dtype=torch.float64)
+            obs = TouchModel(config, 1, CPU).observe(rays, wrench)
+            field = force_field_images(obs["force_field"], config.image_shape)[0].numpy()
+            row += [cv2.resize(p, PANEL[::-1], interpolation=cv2.INTER_AREA) for p in (obs["rgb"][0].numpy(), field)]
+        rows.append(np.hstack(row))
+    _save("sensors.png", np.vstack(rows))
+
+
+def _label(text: str, width: int, height: int) -> np.ndarray:
+    label = np.full((height, width, 3), 255, np.uint8)
+    for k, line in enumerate(text.split("\n")):
+        cv2.putText(label, line, (4, 18 + 20 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    return label
 
 
 def _save(name: str, picture: np.ndarray) -> None:
@@ -139,4 +169,5 @@ def layer_laws() -> None:
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     gallery()
+    side_by_side()
     layer_laws()

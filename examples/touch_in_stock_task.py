@@ -1,19 +1,19 @@
 """A sensor on the left finger of the stock Panda, in ManiSkill's own PickCube: `python examples/touch_in_stock_task.py`."""
 
 import gymnasium as gym
-import sapien
 from mani_skill.envs.tasks import PickCubeEnv
 from mani_skill.utils.registration import register_env
 
-from manifeel_ms3.sensors import TactileSensor, sensor_config
+from manifeel_ms3.sensors import TactileSensor, pad_pose, sensor_config
 
-ON_FINGER = sapien.Pose([0, 0, 0.0465], [0.5**0.5, 0.5**0.5, 0, 0])  # across it x, to its tip z, towards the other finger -y
+LINK = "panda_leftfinger"
+POSE = pad_pose(facing=(0, -1, 0), tip=(0, 0, 1), at=(0, 0, 0.0465))  # on the right finger: facing=(0, 1, 0)
 
 
 @register_env("TouchPickCube-v1", max_episode_steps=50)
 class TouchPickCubeEnv(PickCubeEnv):
     def __init__(self, *args, sensor: str = "gelsight_mini", **kwargs):
-        self.pad = sensor_config(sensor, "touch", "panda_leftfinger", pad_pose=ON_FINGER)
+        self.pad = sensor_config(sensor, "touch", LINK, pad_pose=POSE)
         super().__init__(*args, **kwargs)
 
     def _after_reconfigure(self, options):
@@ -26,7 +26,10 @@ class TouchPickCubeEnv(PickCubeEnv):
 
     def _get_obs_extra(self, info):
         self.touch.capture()
-        return super()._get_obs_extra(info) | self.touch.get_obs()
+        touch = self.touch.get_obs()
+        if self.obs_mode == "state":  # which is a vector
+            touch = dict(force_field=touch["force_field"].flatten(1))
+        return super()._get_obs_extra(info) | touch
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ COMMANDS = {
     "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's figures."),
     "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on the results at hand."),
     "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Check a submission, or build the leaderboard's page."),
+    "verify-sensor": Command("manifeel_ms3.verification.__main__", "Verify a tactile sensor by known loads."),
     "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how similar simulated and real touch are."),
     "audit": Command(
         "manifeel_ms3.analysis.information_audit", "Measure how well each sense answers questions about each task."

@@ -12,7 +12,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import active_children
@@ -58,11 +58,17 @@ class Finished(Generic[Task]):
 
         Raises:
             WorkerDiedError: The process ended before the function returned.
+            WorkFailedError: Worker processes end before they take a task.
         """
         try:
             return self.future.result()
         except ProcessExpired as error:
             raise WorkerDiedError(self.task, error.exitcode) from error
+        except BrokenExecutor as error:
+            raise WorkFailedError(
+                f"the worker processes end as they start ({error}); what they wrote to the terminal says why. Check the "
+                "installation with `manifeel doctor`"
+            ) from error
 
 
 class WorkerPool(Generic[State, Task]):

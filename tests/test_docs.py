@@ -21,6 +21,7 @@ from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
 from tests.conftest import PEG, needs_renderer
+from tests.sample import states_sample
 from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[1]
@@ -96,18 +97,19 @@ def shelf(tmp_path_factory) -> Path:
     """What pages take for granted: recordings, weights, pictures of a real sensor, a policy of one's own."""
     shelf = tmp_path_factory.mktemp("shelf")
     for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
-        states = REPOSITORY / f"data/sample/{task}/states.h5"
+        states = states_sample(task)
         seen = dict(cameras=("wrist",), tactile_sensors=("right",), image_size=64)
         render_observations.main(render_observations.Args(states, shelf / f"{name}.h5", **seen, num=1))
     for suffix in (".h5", ".json"):
         shutil.copy(shelf / f"trajectory{suffix}", shelf / f"peg{suffix}")
-        shutil.copy(states.with_suffix(suffix), shelf)
+        shutil.copy(states.with_suffix(suffix), shelf / f"states{suffix}")
     (shelf / "real_pictures").mkdir()
     with h5py.File(shelf / "trajectory.h5") as file:
         for k, picture in enumerate(file["traj_0/obs/sensor_data/tactile_right/rgb"][:20]):
             cv2.imwrite(str(shelf / f"real_pictures/{k}.png"), picture)
     module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
     (shelf / "my_module.py").write_text(module[1])
+    (shelf / "my_seeds.txt").write_text("734501\n220011\n")
     flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
     evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(

@@ -7,6 +7,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from manifeel_ms3.sensors import pad_pose
+from tests.conftest import needs_renderer
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
@@ -17,20 +20,82 @@ def load(name: str):
     return module
 
 
-def test_touch_in_a_stock_maniskill_task():
-    """The Panda squeezes PickCube's cube: the field is what its finger feels."""
-    load("touch_in_stock_task")
-    code = [line for line in (EXAMPLES / "touch_in_stock_task.py").read_text().splitlines() if line.strip()]
-    assert len(code) < 30
-    env = gym.make("TouchPickCube-v1", obs_mode="state_dict", render_backend="none", control_mode="pd_joint_pos").unwrapped
+def squeeze(env):
+    """Close the fingers on PickCube's cube, and return the last observation."""
     env.reset(seed=0)
     env.cube.set_pose(env.agent.tcp.pose)
     closed = np.r_[env.agent.robot.get_qpos()[0, :7].numpy(), -1.0]
     for _ in range(10):
         obs, *_ = env.step(closed)
+    return obs
+
+
+def test_touch_in_a_stock_maniskill_task():
+    """The Panda squeezes PickCube's cube: the field is what its finger feels."""
+    load("touch_in_stock_task")
+    code = [line for line in (EXAMPLES / "touch_in_stock_task.py").read_text().splitlines() if line.strip()]
+    assert len(code) < 32
+    env = gym.make("TouchPickCube-v1", obs_mode="state_dict", render_backend="none", control_mode="pd_joint_pos").unwrapped
+    obs = squeeze(env)
     field = obs["extra"]["force_field"]
     contact = env.agent.robot.get_net_contact_forces(["panda_leftfinger"])[0, 0].norm().item()
     assert field[..., 0].sum().item() == pytest.approx(contact, rel=0.02)
     assert contact > 5.0
     assert obs["extra"]["rgb"].shape == (1, 240, 320, 3)
     env.close()
+    vector, _ = gym.make("TouchPickCube-v1", obs_mode="state", render_backend="none").reset(seed=0)
+    assert vector.shape[1] > 3 * 12 * 12
+
+
+def test_a_pad_on_the_wrong_side_is_named(monkeypatch, caplog):
+    """The pose of the left finger's pad, on the right finger: the gel is pulled, and reads zero."""
+    example = load("touch_in_stock_task")
+    monkeypatch.setattr(example, "LINK", "panda_rightfinger")
+    env = example.TouchPickCubeEnv(obs_mode="state_dict", render_backend="none", control_mode="pd_joint_pos")
+    squeeze(env)
+    assert "'touch' is pulled by" in caplog.text
+    assert caplog.text.count("faces away from what it touches") == 1
+    env.close()
+    caplog.clear()
+    across = pad_pose(facing=(0, 1, 0), tip=(0, 0, 1), at=(0, 0, 0.0465))
+    monkeypatch.setattr(example, "POSE", across)
+    env = example.TouchPickCubeEnv(obs_mode="state_dict", render_backend="none", control_mode="pd_joint_pos")
+    assert squeeze(env)["extra"]["force_field"][..., 0].sum().item() > 5.0
+    assert not caplog.text
+    env.close()
+
+
+@needs_renderer
+def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
+    """vla-eval's own loop, server and protocol; the model is a function that stands still and writes down what it is asked."""
+    vla_eval = pytest.importorskip("vla_eval", reason="vla-eval is not installed")
+    from vla_eval.model_servers.predict import PredictModelServer
+    from vla_eval.specs import POSITION_DELTA
+
+    asked = []
+
+    class StandStill(PredictModelServer):
+        def predict(self, obs, ctx):
+            asked.append(obs)
+            return {"actions": np.zeros(6, np.float32)}
+
+        def get_action_spec(self):
+            return {"position": POSITION_DELTA}
+
+        def get_observation_spec(self):
+            return {}
+
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    params = dict(tasks=["ManiFeel-PegInsertion-v1"], obs_mode="rgb+tacrgb+tacff", env_kwargs=dict(max_episode_steps=3))
+    benchmark = dict(benchmark="vla_eval_benchmark:ManiFeelBenchmark", episodes_per_task=2, params=params)
+    (result,) = vla_eval.evaluate(StandStill(), dict(benchmarks=[benchmark]), no_save=True)
+    assert result["mean_success"] == 0.0
+    (task,) = result["tasks"]
+    assert [episode["steps"] for episode in task["episodes"]] == [3, 3]
+    assert len(asked) == 6
+    assert {name: image.shape for name, image in asked[0]["images"].items()} == dict(
+        wrist=(256, 256, 3), tactile_right=(240, 320, 3)
+    )
+    assert asked[0]["task_description"] == "Insert the peg into the hole."
+    assert np.shape(asked[0]["touch"]["right"]) == (10, 14, 3)
+    assert not np.allclose(asked[0]["state"], asked[3]["state"])  # another initial state

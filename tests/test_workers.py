@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
 
@@ -82,6 +82,20 @@ def test_an_exception_ends_tasks_that_run_and_wait():
     with pytest.raises(ZeroDivisionError):
         fail()
     assert time.monotonic() - before < 50
+
+
+class EndsTheProcess:
+    """A state's maker that ends the process that unpickles it, as a module does that no longer imports."""
+
+    def __reduce__(self):
+        return os._exit, (1,)
+
+
+def test_processes_that_end_as_they_start_are_one_error():
+    with pytest.raises(WorkFailedError, match="end as they start"), WorkerPool(1, EndsTheProcess()) as pool:
+        pool.submit(add, 1)
+        for finished in pool.as_finished():
+            finished.result()
 
 
 def test_no_workers_are_refused():

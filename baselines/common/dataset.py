@@ -10,8 +10,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats import MANISKILL_H5, format_of
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations.formats import format_of
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
@@ -55,12 +54,13 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
 def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     """The arguments of the task with which demonstrations were recorded, such as its lighting or fit, by which evaluation goes.
 
-    Formats other than trajectory files do not hold them.
+    LeRobot datasets do not hold them. Zarr stores of the paper's own data stand for the paper's units of touch.
 
     Raises:
         DemonstrationError: Two files were recorded with different arguments.
     """
-    known = [(file, _task_arguments(file)) for file in files if MANISKILL_H5.matches(file)]
+    formats = [(file, format_of(file).env_kwargs) for file in files]
+    known = [(file, _of_task(recorded(file))) for file, recorded in formats if recorded is not None]
     for (first, expected), (second, found) in pairwise(known):
         for name in sorted(expected | found):
             if expected.get(name) != found.get(name):
@@ -71,8 +71,7 @@ def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     return known[0][1] if known else {}
 
 
-def _task_arguments(file: Path) -> dict[str, Any]:
-    recorded = read_header(file)["env_info"]["env_kwargs"]
+def _of_task(recorded: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in recorded.items() if name not in SENSING}
 
 

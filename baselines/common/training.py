@@ -17,10 +17,10 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
-from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.provenance import machine
 
 from .agent import spec_of
 from .background_evaluation import BackgroundEvaluation

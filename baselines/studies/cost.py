@@ -18,8 +18,8 @@ from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
-from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.files import write_json
+from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import task_spec
 
@@ -122,7 +122,8 @@ def _units(job: Job) -> int:
         return settings["episodes"] * settings["checkpoints"]
     args, record = training_args(job), job.needs[0]
     demos = args.num_demos or record.settings["num"]
-    samples = demos * _demonstration_steps(record.settings["env_id"])
+    steps = _demonstration_steps(record.settings["env_id"])
+    samples = demos * max(steps - args.policy.action_horizon + 1, 1)  # as `SequenceDataset` counts them
     return args.steps or default_steps(demos, samples, args.batch_size)
 
 

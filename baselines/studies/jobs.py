@@ -26,10 +26,10 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.journal import OtherEvaluationError
-from manifeel_ms3.evaluation.provenance import machine
 from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.provenance import machine
 
 from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
 from .study import Job

@@ -63,9 +63,8 @@ class Grid:
     """Training seeds."""
     task_args: dict[str, Any] = field(default_factory=dict)
     """Arguments of the tasks that differ from their defaults."""
-    perturbations: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """Further evaluations of each policy, by name, and the arguments of its task in which they differ from its training:
-    {light: {visual_randomization: {light_level: 0.4}}}."""
+    evaluation_args: tuple[dict[str, Any], ...] = ({},)
+    """Further arguments of the tasks in evaluation alone; every policy is evaluated once with each of these sets."""
     demos: int | None = None
     """Number of demonstrations to record of each task; the paper's number if not given."""
     preset: str = "paper"
@@ -230,7 +229,7 @@ def _with_needs(job: Job) -> Iterator[Job]:
 
 
 def _evaluations(grid: Grid) -> Iterator[Job]:
-    """One evaluation for each policy that the grid trains, and one for each of its perturbations."""
+    """The evaluations of each policy that the grid trains."""
     choices = (grid.tasks, grid.policies, grid.obs_modes, grid.encoders, grid.cameras, grid.num_demos, grid.seeds)
     for task, policy, mode, encoder, camera, num_demos, seed in product(*choices):
         if encoder and "tacrgb" not in mode.split("+"):
@@ -239,10 +238,9 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
         train = _training(grid, record, policy, mode, encoder, num_demos, seed)
         settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
-        for name, changes in ({"": {}} | grid.perturbations).items():
-            env_kwargs = json.dumps(grid.task_args | changes, sort_keys=True)
-            what, before_seed, number = train.title.rpartition(", seed ")
-            title = ", ".join(filter(None, (what, name))) + before_seed + number
+        for further in grid.evaluation_args:
+            env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
+            title = ", ".join((train.title, json.dumps(further))) if further else train.title
             yield Job("evaluate", title, settings | dict(env_kwargs=env_kwargs, version=version(PACKAGE)), (train,))
 
 

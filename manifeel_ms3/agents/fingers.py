@@ -17,7 +17,8 @@ from manifeel_ms3.sensors.config import GelConfig, HousingConfig, TactileSensorC
 GEL_CENTRE = 0.082  # m along the finger, for all sensors: the R1.5's gel ends 2 mm short of the tip
 FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 FLATTENED = 5e-4  # m: 2.6 N flatten a dome with a radius of 35 mm so far (F = pi K R d^2)
-CUT = 1e-3  # m under the box: deeper than a grip of 20 N presses the box in, so that the dome then carries nothing
+CUT = 2e-3  # m under the box: deeper than 30 N on two contact points press the box in, so that the dome then carries nothing
+MIDDLE = 0.012  # m: side of the middle box; a golf ball then slips at 0.073 N m under 20 N, where the gel's patch gives 0.093
 DRAWN_POINTS, SOLID_POINTS = 41, 13  # along each side of a dome that is drawn, and that bodies collide with (chosen)
 
 
@@ -37,13 +38,16 @@ class Finger:
     """Extent of the gel across and along the finger, m."""
     curvature: tuple[float, float] = GelConfig.curvature
     """Curvature of the gel's face across and along the finger, 1/m."""
+    grips_round_parts: bool = False
+    """Whether a gel collides as five boxes, its middle and four around it, so that a ball or a bulb touches it in five points
+    instead of one, about which it would spin freely. Flat parts are held by one box as firmly, and at half the cost."""
 
     @classmethod
-    def of(cls, sensor: TactileSensorConfig) -> "Finger":
-        """The finger of a sensor."""
+    def of(cls, sensor: TactileSensorConfig, grips_round_parts: bool = False) -> "Finger":
+        """The finger of a sensor, for parts of one kind."""
         housing, gel = sensor.housing, sensor.gel
         sizes = (housing.width, housing.depth, housing.beyond_gel, housing.protrusion)
-        return cls(*sizes, gel.size, gel.curvature)
+        return cls(*sizes, gel.size, gel.curvature, grips_round_parts)
 
     @property
     def size(self) -> tuple[float, float, float]:
@@ -61,6 +65,18 @@ class Finger:
         sides = (2 * np.sqrt(FLATTENED / c) if c > 0 else s for c, s in zip(self.curvature, self.gel_size, strict=True))
         across, along = (float(min(side, s)) for side, s in zip(sides, self.gel_size, strict=True))
         return across, along, self.protrusion
+
+    def solid_boxes(self, size: tuple[float, float, float]) -> list[tuple[tuple, tuple]]:
+        """Sizes and centres, in the pad frame, m, of the boxes that a gel's flat face of this size collides as."""
+        across, along, high = size
+        middle, z = MIDDLE, -high / 2
+        if not self.grips_round_parts or middle >= min(across, along):
+            return [(size, (0.0, 0.0, z))]
+        boxes: list[tuple[tuple, tuple]] = [((middle, middle, high), (0.0, 0.0, z))]
+        for side in (-1, 1):
+            boxes.append((((across - middle) / 2, along, high), (side * (across + middle) / 4, 0.0, z)))
+            boxes.append(((middle, (along - middle) / 2, high), (0.0, side * (along + middle) / 4, z)))
+        return boxes
 
     def dome(self, points: int, raised: float = 0.0, cut: float = 0.0) -> trimesh.Trimesh:
         """The gel as a convex mesh in the pad frame, m: the face, and the edge of its back.
@@ -107,13 +123,14 @@ def gel_pad(side: str, parent: str, outward: float, finger: Finger, folder: Path
     link = ET.Element("link", name=name)
     centre, colour = (0.0, 0.0, -finger.protrusion / 2), "0.75 0.77 0.8 1"
     if finger.curvature == (0.0, 0.0):
-        _add_box(link, finger.gel_box, centre, colour)
+        _add_box(link, finger.gel_box, centre, colour, tags=("visual",))
     else:
         solid = finger.dome(SOLID_POINTS, FLATTENED, CUT)
         for tag, mesh in (("visual", finger.dome(DRAWN_POINTS)), ("collision", solid)):
             mesh.export(folder / f"gel_{tag}.obj")
             _add_mesh(link, tag, f"gel_{tag}.obj", colour)
-        _add_box(link, finger.flat_box, centre, tags=("collision",))
+    for size, place in finger.solid_boxes(finger.flat_box):
+        _add_box(link, size, place, tags=("collision",))
     _add_inertia(link, mass=GEL_MASS, size=finger.gel_box, centre=centre)
     joint = ET.Element("joint", name=f"{name}_joint", type="fixed")
     ET.SubElement(joint, "parent", link=parent)

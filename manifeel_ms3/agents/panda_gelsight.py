@@ -250,6 +250,12 @@ class PandaGelSight(BaseAgent):
         """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
         return solve_ik(self._kinematics, pose, q0, iterations=IK_STEPS)
 
+    def tool_pose_at(self, joints: torch.Tensor) -> Pose:
+        """Pose of the tool in the base frame, at arm joint angles (1, 7), in rad; of one environment on the CPU."""
+        model = self._kinematics.pmodel
+        model.compute_forward_kinematics(torch.cat([joints[0], self.robot.get_qpos()[0, 7:]]).double().cpu().numpy())
+        return Pose.create(model.get_link_pose(self._kinematics.end_link_idx), device=self.device)
+
     @cached_property
     def _kinematics(self) -> Kinematics:
         """Kinematics of the arm: the controller's own, or one for a controller of joints, which has none."""

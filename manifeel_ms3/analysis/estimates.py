@@ -7,6 +7,7 @@ Checkpoints of one run are no independent samples: they are averaged before anyt
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -77,6 +78,25 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
     drawn = np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides))
     rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
     return _estimate(value, drawn, (first, second), lowest=-1.0), float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
+
+
+def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.ndarray:
+    """Mean success of several conditions in each resample, (conditions, RESAMPLES).
+
+    Training seeds are drawn for each condition apart; initial states alike for all conditions of a task that share them.
+
+    Args:
+        conditions: The id of the task, and the results, of each condition.
+    """
+    rng = np.random.default_rng(0)
+    starts: dict[Any, np.ndarray] = {}
+    drawn = []
+    for task, results in conditions:
+        same = (task, tuple(results.episode_seeds))
+        if same not in starts:
+            starts[same] = _weights(rng, len(results.episode_seeds))
+        drawn.append(_resampled_means(_rates(results), starts[same], rng))
+    return np.array(drawn)
 
 
 def _rates(results: ConditionResults, checkpoints: int | None = None) -> np.ndarray:

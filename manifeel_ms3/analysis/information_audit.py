@@ -22,6 +22,7 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
@@ -299,7 +300,7 @@ class Args:
     """Arguments of the information audit."""
 
     demos: Path = Path("data/demos")
-    """Folder with the recordings of `manifeel dataset`, one trajectory.h5 in a folder of each task."""
+    """Folder with the recordings of `manifeel dataset`, a folder of each task with a trajectory file that has observations."""
     out: Path = Path("runs/audit")
     """Folder for audit.json, audit.md and audit.png."""
 
@@ -316,7 +317,8 @@ def main(args: Args) -> list[ProbeResult]:
     recorded = dict(_recorded_tasks(args.demos))
     if not recorded:
         raise DemonstrationError(
-            f"{args.demos} holds no <task>/trajectory.h5; record with `python -m manifeel_ms3.demonstrations.dataset`"
+            f"{args.demos} holds no <task>/trajectory.*.h5 with observations; record them with "
+            "`python -m manifeel_ms3.demonstrations.dataset`"
         )
     asked = [(probe, spec.env_id, path) for path, spec in recorded.items() for probe in spec.probes]
     results: list[ProbeResult] = []
@@ -334,11 +336,11 @@ def main(args: Args) -> list[ProbeResult]:
 def _recorded_tasks(demos: Path) -> Iterator[tuple[Path, TaskSpec]]:
     """Trajectory files of the tasks that have questions and were recorded; the others are named in the log."""
     for spec in all_tasks().values():
-        path = demos / spec.env_id / "trajectory.h5"
-        if spec.probes and path.is_file():
+        folder = demos / spec.env_id
+        if spec.probes and (path := observed_file(folder)):
             yield path, spec
         elif spec.probes:
-            log.warning("%s is left out: %s does not exist", spec.env_id, path)
+            log.warning("%s is left out: %s holds no recording with observations", spec.env_id, folder)
 
 
 if __name__ == "__main__":

@@ -17,8 +17,10 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
+from manifeel_ms3.tasks.registry import short_name
 
 from .claims import claims_page
 from .condition import Condition, condition_of
@@ -29,6 +31,8 @@ from .paper import reported
 from .paper_beside import runtime_table, similarity_table
 from .presets import setup_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
+from .rank_agreement import rank_table
+from .success_curves import write_curves
 
 log = logging.getLogger(__name__)
 REFERENCES = ("MeanAction", "Untrained")
@@ -44,8 +48,22 @@ HEAD = """# Results
 
 Success is success at any step of an episode, with its interval of 95 % over training seeds and initial states: the mean over
 training seeds, the last checkpoints (at most {last}) and the evaluation episodes; "of" says how many there are of each. "Std"
-is the standard deviation over training seeds. "Settings" names the preset of the policy and what differs from it, "id" is the
+is the standard deviation over training seeds. "Floor" is the highest success of policies that have learnt nothing, where it was
+measured on this revision of the task. "Settings" names the preset of the policy and what differs from it, "id" is the
 hash of everything that makes the condition another one. Cost is that of training, all seeds together.
+"""
+CURVES = """
+![Success over environment steps trained on]({figure})
+
+Success of the checkpoints in the course of training, with intervals of 95 %. An environment step is one recorded step that a
+sample of a batch begins at: gradient steps times batch size. The numbers: [csv]({table}).
+"""
+FLOORS = """
+## Failure floors
+
+Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes: {policies}.
+`python -m baselines.floors` measures them.
+
 """
 LEFT_OUT = """
 Runs with fewer than {episodes} episodes or {steps:,} gradient steps, and runs whose training was stopped, have another purpose:
@@ -74,13 +92,13 @@ class Args:
     results: tuple[Path, ...]
     """Folders with result files, and with the logs of training if there are any."""
     out: Path = Path("docs/results.md")
-    """Path of the Markdown page; its figure goes into the folder images beside it."""
+    """Path of the Markdown page; its figures and their table go into the folder images beside it."""
 
 
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
-    A figure of learning curves that was drawn before stays on the page where the logs of training are not at hand.
+    A figure of the loss in training that was drawn before stays on the page where the logs of training are not at hand.
 
     Raises:
         ResultError: There is no result, or one is broken.
@@ -89,7 +107,11 @@ def main(args: Args) -> Path:
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
-    write_text(args.out, "".join(page(results, figure.relative_to(args.out.parent) if has_figure else None, similarities)))
+    loss = figure.relative_to(args.out.parent) if has_figure else None
+    success = figure.with_name(f"{args.out.stem}_success.png")
+    has_curves = write_curves(results, success, success.with_suffix(".csv"))
+    curves = success.relative_to(args.out.parent) if has_curves else None
+    write_text(args.out, "".join(page(results, loss, similarities, curves)))
     log.info("%s", args.out)
     return args.out
 
@@ -132,13 +154,16 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
     return True
 
 
-def page(results: list[dict[str, Any]], curves: Path | None = None, similarities: Sequence[Path] = ()) -> Iterator[str]:
+def page(
+    results: list[dict[str, Any]], loss: Path | None = None, similarities: Sequence[Path] = (), success: Path | None = None
+) -> Iterator[str]:
     """The Markdown page, part by part.
 
     Args:
         results: Contents of result files.
-        curves: Path of the figure with learning curves, relative to the page; no figure if not given.
+        loss: Path of the figure with the loss in training, relative to the page; no figure if not given.
         similarities: Files that `manifeel similarity` wrote.
+        success: Path of the figure with success in the course of training, beside its csv file; no figure if not given.
     """
     collected = collect(results)
     found = of_the_protocol(collected)
@@ -147,14 +172,18 @@ def page(results: list[dict[str, Any]], curves: Path | None = None, similarities
     yield _table_of_conditions(collected, results)
     if len(found) < len(collected):
         yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
-    if curves:
-        yield f"\n![Loss in training over gradient steps]({curves})\n"
+    if success:
+        yield CURVES.format(figure=success, table=success.with_suffix(".csv"))
+    if loss:
+        yield f"\n![Loss in training over gradient steps]({loss})\n"
     if rows := list(_gains_over_references(found)):
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
+    yield _table_of_floors(collected)
     yield f"{TABLES}\n"
     yield _table_of_the_paper(found)
+    yield rank_table(found)
     yield f"{CLAIMS}\n"
     yield claims_page(found)
     yield runtime_table(results)
@@ -167,21 +196,39 @@ def _table_of_conditions(found: dict[Condition, ConditionResults], results: list
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
         what = (_task(condition), condition.sensing, condition.policy, condition.encoder, condition.num_demos)
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
-        success = (mean_success(here), _deviation(here), here.size, note)
+        success = (mean_success(here), _floor(condition), _deviation(here), here.size, note)
         rows.append((*what, setup_of(condition), f"`{condition.key}`", *success, cost, machines))
     names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
-    return markdown_table((*names, "success", "std", "of", "note", "cost", "on"), rows)
+    return markdown_table((*names, "success", "floor", "std", "of", "note", "cost", "on"), rows)
 
 
 def _table_of_the_paper(found: dict[Condition, ConditionResults]) -> str:
     rows = []
     for table, condition, rate in reported():
         what = (table, condition.task, condition.obs_mode, condition.policy, condition.encoder, condition.num_demos, rate)
+        floor = _floor(condition)
         answers = [(setup, found[here]) for setup, (here,) in answering_all([condition], found).items()]
-        ran = [(mean_success(here), _deviation(here), here.size, setup) for setup, here in answers]
-        rows += [(*what, *cells) for cells in ran or [("not run", None, None, None)]]
+        ran = [(mean_success(here), floor, _deviation(here), here.size, setup) for setup, here in answers]
+        rows += [(*what, *cells) for cells in ran or [("not run", floor, None, None, None)]]
     names = ("table", "task", "sensing", "policy", "TacRGB encoder", "demonstrations", "paper")
-    return markdown_table((*names, "here", "std", "of", "settings"), rows)
+    return markdown_table((*names, "here", "floor", "std", "of", "settings"), rows)
+
+
+def _floor(condition: Condition) -> str | None:
+    floor = highest_floor(condition.env_id, condition.revision, condition.variant)
+    return floor and str(floor)
+
+
+def _table_of_floors(found: dict[Condition, ConditionResults]) -> str:
+    """The floors of the tasks of some conditions; "" where none was measured."""
+    tasks = dict.fromkeys((condition.env_id, condition.revision) for condition, _ in _sorted(found))
+    floors = {task: here for task in tasks if (here := floors_of(*task))}
+    rows = [
+        (short_name(env_id), *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
+        for (env_id, _), here in floors.items()
+    ]
+    policies = "; ".join(f"{name}: {about}" for name, about in POLICIES.items())
+    return f"{FLOORS.format(policies=policies)}{markdown_table(('task', *POLICIES), rows)}" if rows else ""
 
 
 def _deviation(results: ConditionResults) -> str | None:

@@ -1,8 +1,9 @@
 """Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --workers 2`.
 
-Each task has two files: `states.h5` with states and actions alone, and `trajectory.h5` with the same episodes and their
-observations. A `manifest.json` beside the tasks' folders has hashes, versions, seeds and outcomes, which `validate` checks. A
-run that was killed continues where it stopped when the same command is given again.
+Each task has two files with ManiSkill's names: `trajectory.h5` with states and actions alone, and
+`trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5` with the same episodes and their observations. A `manifest.json` beside
+the tasks' folders has hashes, versions, seeds and outcomes, which `validate` checks. A run that was killed continues where it
+stopped when the same command is given again.
 """
 
 import hashlib
@@ -26,6 +27,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import record, render_observations
 from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header
+from .recording import STATES_FILE, trajectory_name
 
 SCHEMA = "manifeel-demonstrations-1"
 """Name and version of the manifest's form."""
@@ -83,7 +85,10 @@ def _record_all(args: Args) -> Path:
     counts = {task: args.num or task_spec(task).paper_demos for task in args.tasks}
     observed = args.obs_mode != "none"
     _check_room(args, counts if observed else {})
-    files = {task: (args.out / task / "states.h5", args.out / task / "trajectory.h5") for task in counts}
+    files = {
+        task: (args.out / task / STATES_FILE, args.out / task / trajectory_name(task, dict(obs_mode=args.obs_mode)))
+        for task in counts
+    }
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
         wanted = [path for paths in files.values() for path in paths[: 1 + observed]]

@@ -39,17 +39,18 @@ def run_episode(
     obs, info = env.reset(seed=seed)
     on_step(obs, info)
     observations, states = [common.to_numpy(obs)], [common.to_numpy(base.get_state_dict())]
-    steps: dict[str, list] = dict(actions=[], terminated=[], truncated=[], success=[], fail=[], contact_force=[])
+    steps: dict[str, list] = dict(actions=[], rewards=[], terminated=[], truncated=[], success=[], fail=[], contact_force=[])
     for action in actions():
         action = action.astype(np.float32)
-        obs, _, terminated, truncated, info = env.step(action)
+        obs, reward, terminated, truncated, info = env.step(action)
         on_step(obs, info)
         observations.append(common.to_numpy(obs))
         states.append(common.to_numpy(base.get_state_dict()))
         flags = dict(terminated=terminated, truncated=truncated, success=info["success"], fail=info["fail"])
         for name, value in (dict(actions=action) | {k: bool(v) for k, v in flags.items()}).items():
             steps[name].append(value)
-        steps["contact_force"].append(np.float32(float(info["contact_force"])))
+        for name, number in dict(rewards=reward, contact_force=info["contact_force"]).items():
+            steps[name].append(np.float32(float(number)))
         if terminated or truncated:
             break
     arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}

@@ -5,6 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -12,10 +13,12 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import progress_bar
 
 from .formats import FORMATS
 from .formats.demonstration_format import Progress
+from .formats.lerobot_writing import write_lerobot
 from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
 
 log = logging.getLogger(__name__)
@@ -32,6 +35,8 @@ class Args:
     """Format: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each episode."""
     out: Path
     """Folder to write; it must not exist yet."""
+    videos: bool = False
+    """Store the cameras' images of a LeRobot dataset as videos, which are smaller and lose a little; touch stays as it is."""
 
 
 def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
@@ -56,15 +61,19 @@ def main(args: Args) -> Path:
 
     Raises:
         DemonstrationError: The file cannot be exported, or the folder exists already.
+        InvalidArgumentError: Videos are asked for in a format that has none.
         MissingExtraError: The library that writes the format is not installed.
     """
+    if args.videos and args.to != "lerobot":
+        raise InvalidArgumentError(f"--videos is for --to lerobot, not for --to {args.to}; leave it out")
     if args.out.exists():
         raise DemonstrationError(f"{args.out} exists already; give another --out, or delete it")
-    partial = args.out.with_name(args.out.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    draft = args.out.with_name(args.out.name + ".partial")
+    shutil.rmtree(draft, ignore_errors=True)
+    write = partial(write_lerobot, videos=True) if args.videos else WRITERS[args.to]
     with progress_bar() as bar:
-        WRITERS[args.to](args.file, partial, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
-    partial.replace(args.out)
+        write(args.file, draft, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
+    draft.replace(args.out)
     log.info("%s", args.out)
     return args.out
 

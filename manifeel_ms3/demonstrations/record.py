@@ -23,7 +23,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
-from .recording import Recorder, Recording, make_header, make_recorder, open_recording
+from .recording import Recorder, Recording, make_header, make_recorder, open_recording, trajectory_name
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,8 @@ class Args:
     seed: int = 0
     """First seed to try. Seeds from 100000 on are for evaluation."""
     out: Path | None = None
-    """Path of the trajectory file to write; data/demos/<task>/trajectory.h5 if not given."""
+    """Path of the trajectory file to write. If not given, it is in data/demos/<task>: trajectory.h5 without observations, and
+    trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5 with observations."""
     obs_mode: str = "rgb+tacrgb+tacff"
     """Observations to record, joined by "+"; "none" records states and actions alone."""
     cameras: tuple[str, ...] = CAMERAS
@@ -58,7 +59,21 @@ class Args:
     @property
     def path(self) -> Path:
         """Path of the trajectory file."""
-        return self.out or Path("data/demos") / self.env_id / "trajectory.h5"
+        return self.out or Path("data/demos") / self.env_id / trajectory_name(self.env_id, self.all_env_kwargs)
+
+    @property
+    def all_env_kwargs(self) -> dict[str, Any]:
+        """Arguments of the environment.
+
+        Raises:
+            InvalidArgumentError: `env_kwargs` is not a json object.
+        """
+        sensing: dict[str, Any] = dict(
+            obs_mode=self.obs_mode, cameras=list(self.cameras), tactile_sensors=list(self.tactile_sensors)
+        )
+        if self.sensor is not None:
+            sensing["sensor"] = self.sensor
+        return dict(obs_mode=self.obs_mode, sim_backend="physx_cpu") | sensing | json_object("--env-kwargs", self.env_kwargs)
 
     @property
     def seeds(self) -> range:
@@ -90,10 +105,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         WorkFailedError: Too many seeds failed, or a worker process died.
     """
     require_demonstrator(args.env_id)
-    path, seeds = args.path, args.seeds
-    sensor = {} if args.sensor is None else dict(sensor=args.sensor)
-    images = sensor | dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
-    env_kwargs = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu") | images | json_object("--env-kwargs", args.env_kwargs)
+    path, seeds, env_kwargs = args.path, args.seeds, args.all_env_kwargs
     header = make_header(args.env_id, env_kwargs) | dict(failed_seeds=[])
     with open_recording(path, header, seeds) as recording:
         if recording.is_complete and len(recording.infos) >= args.num:

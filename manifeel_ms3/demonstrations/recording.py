@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -12,6 +11,7 @@ import gymnasium as gym
 
 from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 from .formats.maniskill_h5 import DemonstrationError, read_header
@@ -29,10 +29,10 @@ from .formats.maniskill_h5_writing import (
     write_index,
 )
 
+STATES_FILE = "trajectory.h5"
+"""Name of a file of states and actions, without observations, as ManiSkill's users expect."""
 SESSION = "session-"
 """Start of the name of the folder into which the workers of one recording session write."""
-PACKAGES = ("manifeel-ms3", "mani-skill", "sapien", "torch")
-"""Packages whose versions a trajectory file names: the outcome of an episode can depend on them."""
 
 
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
@@ -54,9 +54,40 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
         env_info=dict(env_id=spec.gym_id, env_kwargs=kept, max_episode_steps=spec.max_episode_steps),
         source_type="scripted",
         source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
-        versions={name: version(name) for name in PACKAGES},
+        commit_info=None if (commit := git_commit()) is None else dict(commit_id=commit),
+        versions=package_versions(),
         revision=spec.revision,
     )
+
+
+def trajectory_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
+    """Name of a trajectory file as ManiSkill names its own, which tells what the file holds.
+
+    That is "trajectory.{obs_mode}.{control_mode}.{sim_backend}.h5"; a file without observations is "trajectory.h5".
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of the environment.
+
+    Raises:
+        UnknownNameError: The task is not registered.
+    """
+    obs_mode = env_kwargs.get("obs_mode", "none")
+    if obs_mode == "none":
+        return STATES_FILE
+    control_mode = env_kwargs.get("control_mode") or task_spec(env_id).env_class.default_control_mode
+    return f"trajectory.{obs_mode}.{control_mode}.{env_kwargs.get('sim_backend', 'physx_cpu')}.h5"
+
+
+def observed_file(folder: Path) -> Path | None:
+    """The first trajectory file with observations in a folder, in the order of names; None if there is none.
+
+    Files of earlier versions are found, too: there, `trajectory.h5` held observations.
+    """
+    for path in [*sorted(folder.glob("trajectory.*.h5")), folder / STATES_FILE]:
+        if path.is_file() and read_header(path)["env_info"]["env_kwargs"].get("obs_mode", "none") != "none":
+            return path
+    return None
 
 
 @contextmanager
@@ -222,6 +253,8 @@ class Recorder:
     env_id: str
     drafts: Path
     """Folder of the recording session, `Recording.drafts`."""
+    source: gym.Env | None = None
+    """Environment with the controller of the recording that is replayed, if its actions are converted to another."""
 
     def write(self, episode: Episode) -> dict[str, Any]:
         """Write an episode, and return its entry in the json."""
@@ -229,6 +262,9 @@ class Recorder:
         return episode.info | dict(episode_seed=episode.seed)
 
 
-def make_recorder(env_id: str, env_kwargs: dict[str, Any], drafts: Path) -> Recorder:
-    """Make the state of a worker process."""
-    return Recorder(make_env(env_id, **env_kwargs), env_id, drafts)
+def make_recorder(
+    env_id: str, env_kwargs: dict[str, Any], drafts: Path, source_kwargs: dict[str, Any] | None = None
+) -> Recorder:
+    """Make the state of a worker process; `source_kwargs` are the arguments of the environment `Recorder.source`."""
+    source = None if source_kwargs is None else make_env(env_id, **source_kwargs)
+    return Recorder(make_env(env_id, **env_kwargs), env_id, drafts, source)

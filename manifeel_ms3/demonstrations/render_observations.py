@@ -3,6 +3,8 @@
 A file of states and actions is small, and is the form in which demonstrations are shared. Its episodes are functions of seed
 and actions: replayed, they are the same bit for bit, and so are the images of cameras and tactile sensors. Each episode is
 checked against its recorded states. A run that was killed continues where it stopped.
+
+With `--control-mode` the actions are also converted to another controller. Episodes that do not succeed with it are left out.
 """
 
 import logging
@@ -22,6 +24,7 @@ from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
+from .convert_actions import converted
 from .episode import run_episode
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from .recording import Recorder, make_header, make_recorder, open_recording
@@ -45,6 +48,8 @@ class Args:
     """Sides of the tactile sensors to render."""
     image_size: int | None = None
     """Width and height of camera images in pixels; the task's 256 if not given."""
+    control_mode: str | None = None
+    """Controller to which the actions are converted, such as pd_joint_pos; that of the recording if not given."""
     workers: int = 1
     """Number of worker processes."""
     num: int | None = None
@@ -67,23 +72,22 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     source = read_header(args.path)
     if args.path.resolve() == args.out.resolve():
         raise InvalidArgumentError(f"--out {args.out} is the file that is read; give another")
-    env_id = source["env_info"]["env_id"].rpartition(":")[2]
-    env_kwargs = source["env_info"]["env_kwargs"] | dict(
-        obs_mode=args.obs_mode, cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors)
-    )
-    if args.image_size is not None:
-        env_kwargs["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
+    env_id, env_kwargs = source["env_info"]["env_id"].rpartition(":")[2], _env_kwargs(args, source)
     header = make_header(env_id, env_kwargs) | dict(recorded_with=source.get("versions"))
+    source_kwargs = None
+    if args.control_mode is not None:
+        header |= dict(failed_seeds=[])
+        source_kwargs = source["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
     episodes = {episode["episode_seed"]: episode for episode in source["episodes"][: args.num]}
     with open_recording(args.out, header, list(episodes)) as recording:
-        left = [seed for seed in episodes if seed not in recording.infos]
+        left = [seed for seed in episodes if seed not in recording.infos and seed not in recording.failed]
         if recording.is_complete and not left:
             log.info("%s already holds %d episodes", args.out, len(recording.infos))
             return args.out
         recording.begin()
         with (
             episode_counter(f"rendering {env_id}", len(episodes), len(recording.infos), on_episode) as count,
-            WorkerPool(args.workers, partial(make_recorder, env_id, env_kwargs, recording.drafts)) as pool,
+            WorkerPool(args.workers, partial(make_recorder, env_id, env_kwargs, recording.drafts, source_kwargs)) as pool,
         ):
             for seed in left:
                 if seed in recording.kept:
@@ -91,17 +95,37 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
                 else:
                     pool.submit(partial(_render_episode, path=args.path), episodes[seed])
             for finished in pool.as_finished():
-                count(recording.accept(finished.task["episode_seed"], finished.result()))
+                seed, info = finished.task["episode_seed"], finished.result()
+                count(recording.reject(seed) if info is None else recording.accept(seed, info))
+        if recording.failed:
+            log.warning("with %s, %d episodes do not succeed and are left out", args.control_mode, len(recording.failed))
         recording.finish()
     return args.out
 
 
-def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) -> dict[str, Any]:
-    """In a worker process: replay an episode of `path` with observations, and return its entry in the json."""
+def _env_kwargs(args: Args, source: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of the environment that renders: those of the recording, but for what is asked for."""
+    sensing = dict(obs_mode=args.obs_mode, cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
+    asked: dict[str, Any] = {} if args.control_mode is None else dict(control_mode=args.control_mode)
+    if args.image_size is not None:
+        asked["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
+    return source["env_info"]["env_kwargs"] | sensing | asked
+
+
+def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) -> dict[str, Any] | None:
+    """In a worker process: replay an episode of `path` with observations, and return its entry in the json.
+
+    Returns:
+        None if the actions were converted, and do not succeed as those of the recording do.
+    """
     seed = recorded["episode_seed"]
     name = f"traj_{recorded['episode_id']}"
     with open_trajectories(path) as file:
         actions = file[name]["actions"][()]
+    if recorder.source is not None:
+        source = recorder.source
+        episode = run_episode(recorder.env, seed, lambda: converted(actions, seed, source, recorder.env))
+        return recorder.write(episode) if episode.info["success"] >= recorded["success"] else None
     episode = run_episode(recorder.env, seed, lambda: actions)
     with open_trajectories(path) as file:
         difference = _first_difference(file[name]["env_states"], episode.arrays["env_states"])
@@ -114,13 +138,17 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
 
 
 def _first_difference(recorded: Any, replayed: dict[str, Any], name: str = "env_states") -> str | None:
-    """Name of the first array that differs from the recorded one (an h5py.Group of them); None if all are the same."""
-    for key, values in replayed.items():
-        if isinstance(values, dict):
-            difference = _first_difference(recorded[key], values, f"{name}/{key}")
+    """Name of the first recorded array (in an h5py.Group) that is not the same again; None if all are the same.
+
+    Files of earlier versions hold fewer arrays.
+    """
+    for key, values in recorded.items():
+        again = replayed.get(key)
+        if isinstance(again, dict):
+            difference = _first_difference(values, again, f"{name}/{key}")
             if difference is not None:
                 return difference
-        elif key not in recorded or not np.array_equal(recorded[key][()], values):
+        elif again is None or not np.array_equal(values[()], again):
             return f"{name}/{key}"
     return None
 

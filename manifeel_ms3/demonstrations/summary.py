@@ -29,7 +29,7 @@ class Args:
     """Arguments of the command."""
 
     file: tyro.conf.Positional[Path]
-    """Path of the trajectory file."""
+    """Path of the trajectory file; another program's, in ManiSkill's format, is summarized, too."""
     episodes: int = NUM_SHOWN
     """Number of episodes to list one by one."""
 
@@ -65,7 +65,8 @@ def summary(path: Path, num_shown: int = NUM_SHOWN) -> Group:
     header = read_header(path)
     episodes = header["episodes"]
     with open_trajectories(path) as file:
-        forces = [file[f"traj_{episode['episode_id']}/contact_force"][()] for episode in episodes]
+        places = [f"traj_{episode['episode_id']}/contact_force" for episode in episodes]
+        forces = [file[place][()] for place in places if place in file]  # other programs' files have none
         sizes: dict[str, int] = {}
 
         def count(name: str, item: h5py.HLObject) -> None:
@@ -74,12 +75,10 @@ def summary(path: Path, num_shown: int = NUM_SHOWN) -> Group:
                 sizes[part] = sizes.get(part, 0) + item.id.get_storage_size()
 
         file.visititems(count)
-    return Group(
-        _file_table(path, header),
-        _force_table(forces),
-        _episode_table(episodes[:num_shown], forces),
-        _size_table(sizes, len(episodes)),
-    )
+    known = len(forces) == len(episodes)
+    tables = [_file_table(path, header), _episode_table(episodes[:num_shown], forces if known else None)]
+    tables[1:1] = [_force_table(forces)] if known else []
+    return Group(*tables, _size_table(sizes, len(episodes)))
 
 
 def _file_table(path: Path, header: dict) -> Table:
@@ -111,13 +110,17 @@ def _force_table(forces: list[np.ndarray]) -> Table:
     return table
 
 
-def _episode_table(episodes: list[dict], forces: list[np.ndarray]) -> Table:
-    table = Table("episode", "seed", "steps", "success", "peak, N", "contact force over time", title="episodes")
-    top = max((force.max(initial=0) for force in forces), default=0.0)
-    for episode, force in zip(episodes, forces, strict=False):
-        cells = (episode["episode_id"], episode["episode_seed"], episode["elapsed_steps"])
-        success = "yes" if episode["success"] else "no"
-        table.add_row(*map(str, cells), success, f"{force.max(initial=0):.1f}", sparkline(force, top))
+def _episode_table(episodes: list[dict], forces: list[np.ndarray] | None) -> Table:
+    """A row for each episode, with its contact forces where they are known."""
+    table = Table("episode", "seed", "steps", "success", title="episodes")
+    for column in () if forces is None else ("peak, N", "contact force over time"):
+        table.add_column(column)
+    top = max((force.max(initial=0) for force in forces or []), default=0.0)
+    for i, episode in enumerate(episodes):
+        cells = [str(episode[name]) for name in ("episode_id", "episode_seed", "elapsed_steps")]
+        cells += ["yes" if episode["success"] else "no"]
+        cells += [] if forces is None else [f"{forces[i].max(initial=0):.1f}", sparkline(forces[i], top)]
+        table.add_row(*cells)
     return table
 
 

@@ -1,4 +1,7 @@
-"""Check demonstrations against their manifest: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`."""
+"""Check demonstrations: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`.
+
+A folder is checked against its manifest; one trajectory file is checked by itself.
+"""
 
 import logging
 import sys
@@ -26,24 +29,26 @@ log = logging.getLogger(__name__)
 class Args:
     """Arguments of the command."""
 
-    folder: tyro.conf.Positional[Path]
-    """Folder that holds a manifest.json."""
+    path: tyro.conf.Positional[Path]
+    """Folder that holds a manifest.json, or one trajectory file."""
     replay: int = 0
     """Number of episodes of each file to replay from their actions."""
 
 
-def validate(folder: Path, num_replays: int = 0) -> list[str]:
-    """Faults of a set of demonstrations, one line each; an empty list if there are none.
+def validate(path: Path, num_replays: int = 0) -> list[str]:
+    """Faults of a set of demonstrations, or of one file of them, one line each; an empty list if there are none.
 
     Args:
-        folder: Folder that holds the manifest.
+        path: Folder that holds the manifest, or a trajectory file.
         num_replays: Number of episodes of each file to replay from their actions.
 
     Raises:
         DemonstrationError: The folder has no manifest that can be read.
     """
+    if Path(path).is_file():
+        return _problems_of_file(Path(path), {}, num_replays)
     problems = []
-    folder, files = Path(folder), read_manifest(folder)["files"]
+    folder, files = Path(path), read_manifest(path)["files"]
     with progress_bar() as bar:
         for name, entry in bar.track(files.items(), description="checking"):
             problems += [f"{name}: {problem}" for problem in _problems(folder, name, entry, num_replays)]
@@ -55,23 +60,30 @@ def _problems(folder: Path, name: str, entry: dict[str, Any], num_replays: int) 
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
         return [f"a manifest names files in its own folder {folder} alone; get it again from its source"]
+    return _problems_of_file(path, entry, num_replays)
+
+
+def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
+    """Faults of one trajectory file, given what a manifest says of it."""
     replays = []
     try:
-        found = describe(path)
+        episodes = read_header(path)["episodes"]
+        found = describe(path) if entry else {}
         problems = [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in entry if found[key] != entry[key]]
         with open_trajectories(path) as file:
-            for episode in read_header(path)["episodes"]:
+            for episode in episodes:
                 problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
         if num_replays:
             replays = replay(path, num_replays)
     except (ManifeelError, KeyError, OSError) as error:
         return [str(error)]
-    if shared := [seed for seed in found["seeds"] if seed >= FIRST_EVALUATION_SEED]:
+    seeds = [episode["episode_seed"] for episode in episodes]
+    if shared := [seed for seed in seeds if seed >= FIRST_EVALUATION_SEED]:
         problems.append(f"seeds {sorted(shared)} are evaluation seeds; demonstrations use seeds below {FIRST_EVALUATION_SEED}")
-    if len(set(found["seeds"])) < len(found["seeds"]):
+    if len(set(seeds)) < len(seeds):
         problems.append("a seed occurs twice")
-    problems += [f"seed {r.seed} does not come out as recorded (off by {r.deviation})" for r in replays if r.deviation > 0]
-    return problems
+    moved = [replayed for replayed in replays if replayed.deviation > 0]
+    return problems + [f"seed {other.seed} does not come out as recorded (off by {other.deviation})" for other in moved]
 
 
 def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
@@ -80,7 +92,7 @@ def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
     problems = []
     if not group["success"][-1]:
         problems.append("it does not end in success")
-    if np.abs(group["actions"][()]).max() > 1:
+    if "delta" in str(episode.get("control_mode", "delta")) and np.abs(group["actions"][()]).max() > 1:
         problems.append("an action is beyond its limits")
 
     def check(name: str, item: h5py.HLObject) -> None:
@@ -98,7 +110,7 @@ def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
 
 def main(args: Args) -> int:
     """Log the faults, and return 1 if there are any, else 0."""
-    problems = validate(args.folder, args.replay)
+    problems = validate(args.path, args.replay)
     for problem in problems:
         log.error(problem)
     log.info("%d problems", len(problems))

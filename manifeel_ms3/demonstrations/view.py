@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import tyro
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, PandaGelSight
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, PandaGelSight
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import MachineError
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -33,7 +33,12 @@ LOOPBACK = "127.0.0.1"
 """Address that only this machine reaches; Rerun's own default is every address of the machine, without a password."""
 FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
 """Names of the components of the force on a whole pad, in the order of the force field's channels."""
-JOINT_AXES = {"pd_joint_pos": (*(f"{name}, rad" for name in PandaGelSight.arm_joint_names), "gripper")}
+JOINTS = tuple(PandaGelSight.arm_joint_names)
+JOINT_AXES = {
+    f"{mode}{end}": names
+    for mode in ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_target_delta_pos")
+    for end, names in (("", (*JOINTS, "gripper")), (FIXED_GRIPPER, JOINTS))
+}
 """Names of the entries of an action by control mode, for modes that command joints."""
 
 
@@ -195,7 +200,8 @@ def _images(group: Any) -> Iterator[tuple[str, np.ndarray]]:
 
 def _series(group: Any, action_names: list[str]) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
     """Numbers over time of an episode, by place."""
-    yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
+    if "contact_force" in group:  # other programs' files have none
+        yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "force_field" in data:
             yield f"{sensor}_force", (list(FORCE_NAMES), data["force_field"][()].sum((1, 2)))

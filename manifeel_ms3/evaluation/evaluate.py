@@ -36,6 +36,7 @@ from .policy import BATCH_SIZES, PolicySource, checked_device
 from .redaction import redacted
 from .result import as_published, provenance, published_config, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
+from .starts import read_seeds
 
 log = logging.getLogger(__name__)
 SENSING = ("obs_mode", "cameras", "tactile_sensors")
@@ -75,6 +76,9 @@ class Args:
     goes on if nothing has changed, and is refused otherwise. It cannot be known whether the policy of a server has changed."""
     episodes: int = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
+    seeds: Path | None = None
+    """Text file with the seeds of the episodes, one a line, which replaces --episodes: a private list of initial states, to
+    which no policy can have been fitted. The result holds the seeds, too."""
     workers: int = 1
     """Number of processes that simulate episodes side by side; one more process holds the policy of a checkpoint."""
     inference_steps: int | None = None
@@ -104,12 +108,13 @@ def main(args: Args) -> Path:
         PolicyError: The policy cannot be made.
         PolicyUnavailableError: The policy's server cannot be reached.
         InvalidArgumentError: The arguments do not say what to evaluate, or on which task.
+        InvalidFileError: The file of --seeds is no list of seeds for evaluation.
         OtherEvaluationError: Another evaluation of this result was interrupted.
         InUseError: Another process writes this result.
         FileWriteError: The result cannot be written.
     """
     evaluation = evaluation_from_args(args)
-    seeds = evaluation_seeds(args.episodes)
+    seeds = evaluation_seeds(args.episodes) if args.seeds is None else read_seeds(args.seeds)
     out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
     _check_outputs(args, evaluation, seeds, out)
     with owned(out):

@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,6 +138,7 @@ class PolicySource:
             return checkpoint_hash(self.checkpoint)
         if self.is_server:
             return None
+        look_in_working_folder()
         try:
             spec = importlib.util.find_spec(str(self.policy).partition(":")[0])
             return file_hash(Path(spec.origin)) if spec and spec.origin else None
@@ -202,5 +204,15 @@ def import_name(name: str) -> Any:
 
     Only names that the user gives on the command line are imported, never a name that a file holds.
     """
+    look_in_working_folder()
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)
+
+
+def look_in_working_folder() -> None:
+    """Let modules of the working folder be imported, which an installed command, unlike `python -m`, does not find.
+
+    The folder is searched last, so that nothing in it can take the place of an installed module.
+    """
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.append(here)

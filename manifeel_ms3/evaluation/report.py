@@ -21,6 +21,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import make_env
 
+from .floors import Floor, floors_of
 from .gentle import success_under_force
 from .policy import checked_device, load_policy
 from .result import read_result
@@ -120,6 +121,12 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
+def _floors_of(result: dict[str, Any]) -> dict[str, Floor]:
+    """Success of policies that have learnt nothing; {} where it was not measured, or the task has other arguments here."""
+    changed = result["env_kwargs"].keys() & {"fit", "lighting", "occlusion", "randomization"}
+    return {} if changed else floors_of(result["env_id"], result["revision"])
+
+
 def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
     """The device and the batch size of an evaluation, with which an episode goes as it went there."""
     return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
@@ -143,6 +150,7 @@ def main(args: Args) -> Path:
         result=result,
         outcome=outcome,
         rates={label: result[name] for name, label in RATES.items() if name in result},
+        floors=_floors_of(result),
         force_curve=Markup(force_curve(result)),
         randomization=randomization_of(result),
         rows=rows,

@@ -11,10 +11,10 @@ import numpy as np
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
+from manifeel_ms3.provenance import git_commit, machine, package_versions
 from manifeel_ms3.tasks.registry import task_spec
 
 from .gentle import is_gentle
-from .provenance import git_commit, machine, package_versions
 from .redaction import redacted
 from .rollout import ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
 from .statistics import wilson_interval

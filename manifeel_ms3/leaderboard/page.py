@@ -19,6 +19,7 @@ from manifeel_ms3.analysis.presets import setup_of
 from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.evaluation.floors import Floor, highest_floor
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import task_spec
@@ -54,8 +55,15 @@ class Row:
     """Median over episodes of the largest contact force, in N."""
     gentle: float | None
     """Share of the episodes that succeed gently; None for a task without a limit of force."""
+    floor: Floor | None
+    """Highest success of policies that have learnt nothing, where it is known."""
     rerun: tuple[int, int]
     """Numbers of episodes that the leaderboard ran again, and of all episodes."""
+
+    @property
+    def deviation_text(self) -> str:
+        """Standard deviation of the success over training seeds; "" for a single one."""
+        return "" if self.results.seed_deviation is None else f"{self.results.seed_deviation:.0%}"
 
     @property
     def rerun_text(self) -> str:
@@ -85,7 +93,8 @@ def rows_of(submission: Submission) -> list[Row]:
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
         limit, rerun = task_spec(condition.env_id).force_limit, rerun_of(submission, paths)
         gentle = None if limit is None else float(success_under_force(episodes, [limit])[0])
-        rows.append(Row(submission, condition, mean_success(results), results, latency, force, gentle, rerun))
+        floor = highest_floor(condition.env_id, condition.revision, condition.variant)
+        rows.append(Row(submission, condition, mean_success(results), results, latency, force, gentle, floor, rerun))
     return rows
 
 
@@ -117,8 +126,9 @@ def leaderboard_table(rows: list[Row]) -> str:
         f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
         f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
         '95 %; where there are fewer, "of" says how many. A success is gentle where the contact force stayed within the limit '
-        'of the task until then ([limits](../docs/evaluation.md)). "Run again" is the number of episodes that the leaderboard '
-        "ran again with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
+        'of the task until then ([limits](../docs/evaluation.md)). "Std" is the standard deviation over training seeds, '
+        '"floor" the success of policies that have learnt nothing, as far as it was measured. "Run again" is the number of '
+        "episodes that the leaderboard ran again with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
     )
     cells = []
     for row in rows:
@@ -127,10 +137,11 @@ def leaderboard_table(rows: list[Row]) -> str:
         task = f"{condition.task} {condition.variant}".strip()
         gentle = "" if row.gentle is None else f"{row.gentle:.0%}"
         what = (task, condition.sensing, condition.policy, str(setup_of(condition)), condition.encoder)
-        numbers = (condition.num_demos, row.success, gentle, row.results.size, row.rerun_text)
+        success = (row.success, row.deviation_text, row.floor or "", gentle)
+        numbers = (condition.num_demos, *success, row.results.size, row.rerun_text)
         cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
     what = ("task", "sensing", "policy", "settings", "TacRGB encoder", "demonstrations")
-    return head + markdown_table((*what, "success", "gentle success", "of", "run again", "submission"), cells)
+    return head + markdown_table((*what, "success", "std", "floor", "gentle success", "of", "run again", "submission"), cells)
 
 
 def write_page(rows: list[Row], board: Path) -> Path:
@@ -160,6 +171,8 @@ def _for_page(row: Row) -> dict[str, Any]:
     return {name: one_line(text) for name, text in texts.items()} | dict(
         demos=condition.num_demos or "",
         success=row.success,
+        deviation=row.deviation_text,
+        floor=row.floor,
         size=row.results.size,
         full=row.is_full,
         rerun=row.rerun_text,

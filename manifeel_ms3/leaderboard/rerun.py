@@ -24,8 +24,8 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.policy import PolicySource, checked_device
-from manifeel_ms3.evaluation.provenance import package_versions
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome, outcome_as_json
+from manifeel_ms3.provenance import package_versions
 
 from .submission import ABOUT, Rerun, RerunFile, Submission, SubmissionError
 from .untrusted import quoted

@@ -9,6 +9,8 @@ from .config import TactileSensorConfig as TactileSensorConfig
 from .config import TouchRandomization as TouchRandomization
 from .config_fields import with_options as with_options
 from .imperfection_config import ImperfectionConfig as ImperfectionConfig
+from .mounting import grids_for as grids_for
+from .mounting import pad_pose as pad_pose
 from .registry import digit as digit
 from .registry import gelsight_mini as gelsight_mini
 from .registry import gelsight_r15 as gelsight_r15

@@ -1,5 +1,7 @@
 """Gel-based tactile sensor (GelSight and similar ones) for ManiSkill environments."""
 
+import logging
+
 import numpy as np
 import torch
 from mani_skill.envs.scene import ManiSkillScene
@@ -14,6 +16,10 @@ from .depth.raycast import RaycastDepth
 from .mechanics.wrench import WrenchGauge
 from .touch_model import OUTPUTS, TouchModel
 from .visualisation import force_field_images
+
+log = logging.getLogger(__name__)
+LARGEST_PULL = 1.0
+"""Pull on a gel, in N, that is taken for a wrong pose: above the inertia of a pad, below a grip."""
 
 
 class TactileSensor(BaseSensor):
@@ -61,6 +67,7 @@ class TactileSensor(BaseSensor):
         self._gauge = WrenchGauge(articulation, self.pad, config.pad_pose)
         self._depth = self._make_depth()
         self._obs: dict[str, torch.Tensor] = {}
+        self._warned = False
         self.reset(torch.arange(scene.num_envs, device=scene.device))
 
     def _make_depth(self) -> RaycastDepth | CameraDepth:
@@ -104,7 +111,21 @@ class TactileSensor(BaseSensor):
     def capture(self) -> None:
         """Sense the scene in its present state."""
         self._depth.look()
-        self._obs = self.model.observe(self._depth, self.wrench())
+        wrench = self.wrench()
+        self._warn_of_wrong_side(wrench)
+        self._obs = self.model.observe(self._depth, wrench)
+
+    def _warn_of_wrong_side(self, wrench: torch.Tensor) -> None:
+        """Warn once if the gel is pulled, which nothing that it touches can do; on the CPU, where looking costs nothing."""
+        if self._warned or wrench.device.type != "cpu" or (pull := wrench[:, 2].max().item()) < LARGEST_PULL:
+            return
+        self._warned = True
+        log.warning(
+            "the tactile sensor %r is pulled by %.1f N and feels nothing: its pad_pose faces away from what it touches; its "
+            "z axis must point out of the gel (see manifeel_ms3.sensors.pad_pose)",
+            self.config.uid,
+            pull,
+        )
 
     def get_obs(self, **kwargs) -> dict[str, torch.Tensor]:
         """Observation of the last `capture`.

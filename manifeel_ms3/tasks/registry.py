@@ -45,6 +45,8 @@ class TaskSpec:
     the longest."""
     paper_demos: int
     """Number of demonstrations that the paper recorded; what `manifeel dataset` records."""
+    instruction: str = ""
+    """The task as one plain English sentence that tells a robot what to do, for policies that take language; "" if none."""
     paper_tables: tuple[str, ...] = ()
     """Tables of the paper that report the task: "I", "II", "III"."""
     revision: int = 1
@@ -140,6 +142,12 @@ def task_spec(env_id: str) -> TaskSpec:
     """
     _load_plugins()
     return _known(env_id.rpartition(":")[2])
+
+
+def instruction_of(env_class: type) -> str:
+    """The instruction of the task that a class, or the nearest of its base classes, was registered for; "" if none was."""
+    sentences = {spec.env_class: spec.instruction for spec in _SPECS.values()}
+    return next((sentences[one] for one in env_class.__mro__ if one in sentences), "")
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:

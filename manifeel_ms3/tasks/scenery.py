@@ -10,14 +10,17 @@ import torch
 from mani_skill.sensors.camera import CameraConfig
 from sapien.physx import PhysxMaterial
 
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import Box, Part
 from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
 from manifeel_ms3.rendering.looks import CONCRETE
 from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, fine_shadow, presentation_shader
-from manifeel_ms3.rendering.randomization import RandomLooks, VisualRandomization
+from manifeel_ms3.rendering.randomization import LARGEST, RandomLooks, VisualRandomization
 from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
 from manifeel_ms3.rendering.table import table_mesh, wood
 
+from .checks import checked_randomization
 from .sensing import SensingEnv
 from .viewpoints import looking_at, looking_down
 
@@ -40,7 +43,7 @@ FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
 class SceneryEnv(SensingEnv):
     """An environment with the robot at a wooden table in a light room.
 
-    Subclasses set `_camera_names`, `_lighting`, `_quality` and `visual_randomization` before they call the constructor.
+    Subclasses set `_camera_names` and call `_set_looks` before they call the constructor.
     """
 
     front_camera_at = (0.68, 0.0, 0.15)
@@ -48,9 +51,18 @@ class SceneryEnv(SensingEnv):
     side_camera_at = (0.5, -0.17, 0.17)
     """Position of the side camera, in m (public code of the paper)."""
     _camera_names: tuple[str, ...]
-    _lighting: str
-    _quality: str
-    visual_randomization: VisualRandomization
+
+    def _set_looks(self, lighting: str, quality: str, randomization: dict[str, float], num_envs: int) -> None:
+        self._lighting = one_of("lighting", lighting, LIGHTING)
+        self._quality = one_of("quality", quality, QUALITIES)
+        self.visual_randomization = checked_randomization(
+            type(self).__name__, VisualRandomization, randomization, LARGEST, "visual_randomization", "light_level"
+        )
+        if randomization and num_envs != 1:
+            raise InvalidArgumentError(
+                f"visual_randomization={randomization!r} needs num_envs=1, not {num_envs}: the environments of one process "
+                "look alike; use several processes"
+            )
 
     @property
     def _default_sensor_configs(self):

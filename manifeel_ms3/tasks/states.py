@@ -27,6 +27,17 @@ def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
     return _filled(like, iter(state.split(widths, dim=1)))
 
 
+def is_part_of(state: Tree, whole: Tree) -> bool:
+    """Whether all that a tree of tensors or arrays, (N, D) or (D,), holds is the same, bit for bit, in another tree (N, D)."""
+    return all(_is_same(value, whole.get(name)) for name, value in state.items())
+
+
+def _is_same(value: Any, other: Any) -> bool:
+    if isinstance(value, Mapping):
+        return isinstance(other, Mapping) and is_part_of(value, other)
+    return isinstance(other, torch.Tensor) and torch.equal(torch.as_tensor(value).to(other).flatten(), other.flatten())
+
+
 def _leaves(tree: Tree) -> Iterator[torch.Tensor]:
     for value in tree.values():
         yield from _leaves(value) if isinstance(value, Mapping) else [value]

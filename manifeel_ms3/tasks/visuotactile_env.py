@@ -25,14 +25,13 @@ from manifeel_ms3.rendering.backend import (
     use_one_thread_after_fork,
 )
 from manifeel_ms3.rendering.presentation import drawn_sizes
-from manifeel_ms3.rendering.randomization import LARGEST, VisualRandomization
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
-from .registry import gym_id
-from .scenery import LIGHTING, QUALITIES, SceneryEnv
-from .states import unflattened
+from .registry import gym_id, instruction_of
+from .scenery import SceneryEnv
+from .states import is_part_of, unflattened
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
@@ -63,7 +62,8 @@ class VisuotactileEnv(SceneryEnv):
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
     (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
-    the last control step, between the held object and the rest of the world) and the task's own measures.
+    the last control step, between the held object and the rest of the world) and the task's own measures. That of a reset also
+    holds `language_instruction`, the task as a sentence for each environment.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
 
@@ -104,6 +104,8 @@ class VisuotactileEnv(SceneryEnv):
     default_control_mode = "pd_ee_delta_pose_fixed_gripper"
     has_occluder = False
     """Whether the task has a part that hides its interior from the policy's camera."""
+    grips_round_parts = False
+    """Whether the parts that the hand holds are round (`Finger.grips_round_parts`)."""
     physics_rate = 480
     """Physics steps per second, in Hz. At 240 the solver does not converge on a light part that is held and pushed: it turns
     in the hand like on a rubber band, and springs back."""
@@ -147,9 +149,8 @@ class VisuotactileEnv(SceneryEnv):
             for side, name in names.items()
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
-        self._finger = Finger.of(configs["right"])
-        self._lighting = one_of("lighting", lighting, LIGHTING)
-        self._quality = one_of("quality", quality, QUALITIES)
+        self._finger = Finger.of(configs["right"], self.grips_round_parts)
+        self._set_looks(lighting, quality, visual_randomization or {}, kwargs.get("num_envs", 1))
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -157,32 +158,27 @@ class VisuotactileEnv(SceneryEnv):
         self.randomization = checked_randomization(
             type(self).__name__, self.Randomization, randomization or {}, self._largest_ranges()
         )
-        self.visual_randomization = checked_randomization(
-            type(self).__name__, VisualRandomization, visual_randomization or {}, LARGEST, "visual_randomization", "light_level"
-        )
         one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
         check_num_envs(kwargs.get("num_envs", 1))
-        if visual_randomization and (count := kwargs.get("num_envs", 1)) > 1:
-            raise InvalidArgumentError(
-                f"visual_randomization={visual_randomization!r} needs num_envs=1, not {count}: the environments of one process "
-                "look alike; use several processes"
-            )
         use_one_thread_after_fork()
         backend = available_render_backend(render_backend)
-        if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
-            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
-        if self._wanted_images(own_mode, None):
-            announce_first_image(backend)
+        self._require_renderer(backend, own_mode, kwargs.get("render_mode"))
         super().__init__(
             *args,
             obs_mode=own_mode,
             control_mode=control_mode or self.default_control_mode,
             robot_uids=robot_uids,
             render_backend=backend,
-            human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             sensor_configs=camera_configs,
+            human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
+
+    def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
+        if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):
+            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+        if self._wanted_images(own_mode, None):
+            announce_first_image(backend)
 
     @staticmethod
     def _wanted_images(own_mode: str, render_mode: str | None) -> str:
@@ -289,9 +285,13 @@ class VisuotactileEnv(SceneryEnv):
         self._settle(env_idx)
         for sensor in self._tactile_sensors.values():
             sensor.forget_readings(env_idx)  # those before the grip had settled
-        info = self.get_info() | dict(reconfigure=info["reconfigure"])
+        info = self.get_info() | dict(reconfigure=info["reconfigure"], language_instruction=self.get_language_instruction())
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
+
+    def get_language_instruction(self, **_kwargs: Any) -> list[str]:
+        """The task as a sentence, one for each environment; the method's name and form are those of ManiSkill's tasks."""
+        return [instruction_of(type(self))] * self.num_envs
 
     def _settle(self, env_idx: torch.Tensor) -> None:
         """Let the grip take its load before the first observation; the other environments' states are restored afterwards."""
@@ -340,6 +340,12 @@ class VisuotactileEnv(SceneryEnv):
         self._pad_forces.append(self.agent.pad_joint_forces)
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None):
+        """Set the state; one that is the present state already changes nothing, also not what the engine knows of contacts.
+
+        No state holds that knowledge, on which the last bits of an episode depend.
+        """
+        if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
+            return
         super().set_state_dict(state, env_idx)
         if "controller" in state:
             self.agent.set_controller_state(state["controller"])

@@ -19,7 +19,8 @@ BALL_INDENTATION, BATTERY_INDENTATION = 2.5e-3, 6e-4  # m, under that grip
 PUSHER = (0.005, 0.003, 0.001)  # m, half size: it fits between the pads
 PUSHER_SPEED, APPROACH_SPEED, PUSHER_START = 0.012, 0.05, 0.045  # m/s, m/s, m beside the tool
 TURNED, SHIFTED = np.deg2rad(10.0), 2e-3  # rad, m: the push ends where the part has slipped so far
-TORQUE_RATE, SLIPPED, MOST_TORQUE = 0.2, np.deg2rad(1.0), 1.5  # N m/s; rad, after which it slips for good; N m
+FLAT_TORQUE_RATE, ROUND_TORQUE_RATE = 0.2, 0.02  # N m/s: about two seconds to the slip
+SLIPPED, MOST_TORQUE = np.deg2rad(1.0), 1.5  # rad, after which it slips for good; N m
 RAMP, CREEP_TIME, REST = 0.5, 1.0, 0.5  # s
 
 
@@ -36,6 +37,13 @@ class Kind:
     """Half the width that the pads close on, in m, of a part that does not start in the hand, with the gels' indentation."""
     grip: float = GRIP
     """Force of each pad, in N, with which the task holds it."""
+    is_round: bool = False
+    """Whether its surface between the pads is round, so that it slips at a smaller torque than flat parts."""
+
+    @property
+    def torque_rate(self) -> float:
+        """Growth of the torque in the test of slip, in N m/s."""
+        return ROUND_TORQUE_RATE if self.is_round else FLAT_TORQUE_RATE
 
 
 KINDS = {
@@ -45,20 +53,20 @@ KINDS = {
     "gear": Kind("GearAssembly", "plug", 0.040),
     "reorientation peg": Kind("PegReorientation", "plug", 0.039),
     "nut": Kind("NutBoltAssembly", "held", 0.005),
-    "bulb": Kind("BulbInstallation", "held", 0.060, grip=12.0),
+    "bulb": Kind("BulbInstallation", "held", 0.060, grip=14.2, is_round=True),
     "battery": Kind("ObjectSearch", "battery", 0.010, 0.0125 - BATTERY_INDENTATION),
-    "golf ball": Kind("BallSorting", "golf", 0.012, 0.02075 - BALL_INDENTATION),
-    "table-tennis ball": Kind("BallSorting", "tennis", 0.012, 0.02075 - BALL_INDENTATION),
+    "golf ball": Kind("BallSorting", "golf", 0.012, 0.02075 - BALL_INDENTATION, is_round=True),
+    "table-tennis ball": Kind("BallSorting", "tennis", 0.012, 0.02075 - BALL_INDENTATION, is_round=True),
 }
 
 
 class HeldPart:
     """One part between the pads, in its task's own scene."""
 
-    def __init__(self, kind: Kind):
-        self.kind = kind
-        name = f"ManiFeel-{kind.task}-v1"
-        self._wrapped = gym.make(name, obs_mode="none", render_backend="none", sim_backend="physx_cpu")
+    def __init__(self, name: str):
+        self.name, self.kind = name, KINDS[name]
+        kind = self.kind
+        self._wrapped = gym.make(f"ManiFeel-{kind.task}-v1", obs_mode="none", render_backend="none", sim_backend="physx_cpu")
         self.env: Any = self._wrapped.unwrapped
 
     def close(self) -> None:
@@ -99,7 +107,7 @@ class HeldPart:
         """Torque about the closing axis, in N m, at which the part slips, when it grows slowly."""
         torque = 0.0
         while self.turned < SLIPPED and torque < MOST_TORQUE:
-            torque += TORQUE_RATE / self.rate
+            torque += self.kind.torque_rate / self.rate
             self.run(1 / self.rate, torque)
         return torque
 
@@ -171,7 +179,7 @@ def _split(pose: Pose) -> tuple[np.ndarray, Rotation]:
 def main(seeds: range = range(3)) -> None:
     table = Table("part", "mass, g", "grip, N", "slips at, N m", "creeps at 90 %, degrees/s", "springs back, degrees", "mm")
     for name, kind in KINDS.items():
-        part, rows = HeldPart(kind), []
+        part, rows = HeldPart(name), []
         for seed in seeds:
             part.reset(seed)
             torque = part.slip_torque()

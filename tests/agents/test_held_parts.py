@@ -5,14 +5,16 @@ import pytest
 
 from .held_parts import GRIP, KINDS, HeldPart
 
-QUICK = ("peg",)
-ROUND = ("bulb", "golf ball", "table-tennis ball")  # they have one contact point a pad, about which they spin (docs/sensor.md)
-PARTS = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in KINDS if name not in ROUND]
+QUICK = ("peg", "golf ball")
+LEAST_FLAT, LEAST_ROUND = 0.15, 0.04
+"""Least slip torques at 20 N, in N m. The formula of flat parts gives 0.09 for a golf ball, whose contact is small."""
+LIGHT = ("table-tennis ball",)  # 2.7 g under 20 N: the solver does not converge on it, and it springs back by degrees
+PARTS = [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in KINDS if name not in LIGHT]
 
 
 @pytest.fixture(scope="module", params=PARTS)
 def part(request):
-    held = HeldPart(KINDS[request.param])
+    held = HeldPart(request.param)
     yield held
     held.close()
 
@@ -23,7 +25,7 @@ def test_slips_at_the_torque_of_a_gel_and_not_below(part, figure):
     torque = part.slip_torque()
     at_20_newtons = torque * GRIP / part.kind.grip
     figure("slip torque at 20 N, N m", at_20_newtons, at_most=0.55)
-    figure("least slip torque at 20 N, N m", at_20_newtons, at_least=0.15)
+    figure("least slip torque at 20 N, N m", at_20_newtons, at_least=LEAST_ROUND if part.kind.is_round else LEAST_FLAT)
     part.reset(0)
     figure("creep at 90 % of the slip torque, degrees/s", np.rad2deg(part.creep(0.9 * torque)), at_most=0.05)
 

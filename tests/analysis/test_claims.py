@@ -54,7 +54,7 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     assert beside.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 50 | 14 ± 1% | 20% [")
     assert beside.endswith("| 10% | 3 x 10 x 50 | paper |")  # the deviation of 10, 20 and 30 %
     assert "| I | USBInsertion | rgb | diffusion_policy |  | 50 | 49 ± 3% | not run |" in page
-    assert "learnt nothing" not in page
+    assert "What learning gained" not in page
 
 
 # ------------------------------------------------------------------ what once misled the page

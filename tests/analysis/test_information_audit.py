@@ -80,7 +80,10 @@ def recorded(tmp_path):
             sensors["tactile_right/rgb"] = RNG.integers(0, 255, (steps + 1, 24, 32, 3), dtype=np.uint8)
             sensors["tactile_right/force_field"] = np.full((steps + 1, 10, 14, 3), place, np.float32)
     episodes = [dict(episode_id=i, episode_seed=i, elapsed_steps=1, success=True) for i in range(EPISODES)]
-    header = dict(env_info=dict(env_id="manifeel_ms3:ManiFeel-ObjectSearch-v1", env_kwargs={}), episodes=episodes)
+    header = dict(
+        env_info=dict(env_id="manifeel_ms3:ManiFeel-ObjectSearch-v1", env_kwargs=dict(obs_mode="tacrgb+tacff")),
+        episodes=episodes,
+    )
     (task / "trajectory.json").write_text(json.dumps(header))
     return tmp_path
 

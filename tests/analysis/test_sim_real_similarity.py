@@ -12,7 +12,7 @@ from transformers import ConvNextImageProcessor, ResNetConfig, ResNetModel
 from manifeel_ms3.analysis import sim_real_similarity
 from manifeel_ms3.analysis.sim_real_similarity import Args, SimilarityError, fid, kid
 from manifeel_ms3.errors import MissingExtraError
-from manifeel_ms3.paths import data_dir
+from tests.sample import observed_sample
 
 RNG = np.random.default_rng(0)
 OWN = "tests.analysis.test_sim_real_similarity:brightness"
@@ -84,7 +84,7 @@ def test_force_fields_and_recordings_are_compared(folders):
         Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", resamples=5, out=folders / "out")
     )
     assert fields.fid.value > 0
-    recording = data_dir() / "sample/ManiFeel-PegInsertion-v1/trajectory.h5"
+    recording = observed_sample("ManiFeel-PegInsertion-v1")
     same = sim_real_similarity.main(Args(recording, recording, OWN, "tacff", resamples=5, out=folders / "out"))
     assert same.fid.value == pytest.approx(0, abs=1e-6)
     with pytest.raises(SimilarityError, match="lacks tacrgb of tactile_left"):

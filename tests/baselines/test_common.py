@@ -16,11 +16,11 @@ from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
 SPEC = observation_spec("tacff", (), ("right",), 64)
 FIELD = SPEC.force_fields[0]
 HORIZONS = dict(obs_horizon=2, pred_horizon=16, action_horizon=8)
-SAMPLE = Path(__file__).parents[2] / "data/sample"
 CPU = torch.device("cpu")
 
 
@@ -71,7 +71,7 @@ def test_the_arguments_of_the_recorded_task_are_known(demos):
     assert set(recorded_env_kwargs([demos, demos])) == {"fit"}
     assert recorded_env_kwargs([Path(__file__).parents[1] / "demonstrations/lerobot/images"]) == {}
     with pytest.raises(DemonstrationError, match=r"was recorded with fit='\w+', .* with fit=None"):
-        recorded_env_kwargs([demos, SAMPLE / PEG / "trajectory.h5"])
+        recorded_env_kwargs([demos, observed_sample(PEG)])
 
 
 def test_number_of_demonstrations(demos):
@@ -107,7 +107,7 @@ def test_quaternions_do_not_jump_where_the_wrist_can_turn():
 
 @pytest.mark.parametrize("task", ["ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"])
 def test_quaternions_do_not_jump_in_demonstrations_that_screw(task):
-    for episode in read_demonstrations(SAMPLE / task / "trajectory.h5", [POSE]):
+    for episode in read_demonstrations(observed_sample(task), [POSE]):
         assert np.abs(np.diff(quaternion_pose(episode[POSE]), axis=0)).max() < 0.2
         assert np.abs(np.diff(episode[POSE], axis=0)).max() > 1  # as the simulator gives them they do
 

@@ -1,7 +1,6 @@
 """The presets `paper` as they are: their networks, a step of training, and an action."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,10 @@ from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from manifeel_ms3.demonstrations import read_demonstrations
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
 SPECS = pytest.mark.parametrize("spec", [diffusion.SPEC, equivariant.SPEC, flow.SPEC], ids=lambda spec: spec.name)
-SAMPLE = Path(__file__).parents[2] / f"data/sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 CAMERA, FIELD = "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field"
 
 

@@ -9,10 +9,15 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 import tyro
 
 from baselines.common.checkpoint import as_json
+from baselines.common.dataset import SequenceDataset
+from baselines.common.observation import observation_spec
+from baselines.common.train_args import default_steps
 from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
@@ -63,7 +68,7 @@ grids:
     assert len({job.key for job in jobs}) == len(jobs)
 
 
-def test_perturbations_are_further_evaluations_of_the_same_policies():
+def test_other_looks_are_further_evaluations_of_the_same_policies():
     jobs = jobs_of(read_study(REPOSITORY / "configs/perturbation.yaml"))
     evaluated = {}
     for job in jobs:
@@ -246,6 +251,17 @@ def test_what_is_wrong_with_a_study_is_said(study, content, word):
         assert len(str(error.value).splitlines()) == 1
 
 
+def test_training_is_as_long_as_the_samples_of_its_demonstrations_make_it():
+    (train, *_) = (job for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml")) if job.kind == "train")
+    args, record = training_args(train), train.needs[0].settings
+    steps = task_spec(record["env_id"]).demo_steps
+    spec = observation_spec("rgb", (), (), 32)
+    episodes = [{"actions": np.zeros((steps, 6))} | {key: np.zeros((steps + 1, 7)) for key in spec.keys}] * record["num"]
+    horizons = args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon
+    data = SequenceDataset(episodes, spec, *horizons, torch.device("cpu"))
+    assert cost._units(train) == default_steps(record["num"], len(data), args.batch_size)
+
+
 def test_a_plan_tells_the_hours_from_a_trial(study, tmp_path):
     jobs = jobs_of(read_study(study))
     table = study_command.plan(read_study(study), jobs, tmp_path)
@@ -325,3 +341,12 @@ def test_what_fails_is_told_and_tried_again(study, tmp_path):
     with pytest.raises(ValueError, match="nonsense"):
         perform(train, root)
     assert json.loads((train.folder(root) / "started.json").read_text())["attempts"] == 2
+
+
+def test_a_policy_is_trained_once_and_evaluated_with_each_set_of_arguments():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/robustness.yaml"))
+    counts = {kind: [job.kind for job in jobs].count(kind) for kind in ("record", "train", "evaluate")}
+    assert counts == dict(record=2, train=12, evaluate=108)  # 2 tasks, 2 observation modes, 3 seeds, 9 sensors
+    given = {job.settings["env_kwargs"] for job in jobs if job.kind == "evaluate"}
+    assert {"{}", '{"imperfections": {"delay": 2}}'} < given
+    assert all(job.settings["env_kwargs"] == "{}" for job in jobs if job.kind == "record")

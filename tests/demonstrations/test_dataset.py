@@ -17,6 +17,7 @@ from manifeel_ms3.tasks.registry import all_tasks
 from tests.conftest import PEG, needs_renderer
 
 SEARCH = "ManiFeel-ObjectSearch-v1"
+STATES, OBSERVED = "trajectory.h5", "trajectory.tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
 
 
 def contents(path: Path) -> dict[str, np.ndarray]:
@@ -34,7 +35,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_states_are_small_and_observations_are_beside_them(folder):
-    states, trajectory = folder / PEG / "states.h5", folder / PEG / "trajectory.h5"
+    states, trajectory = folder / PEG / STATES, folder / PEG / OBSERVED
     assert states.stat().st_size / 2 < 0.5e6
     bare, full = contents(states), contents(trajectory)
     assert not any("/obs/" in name for name in bare)
@@ -45,7 +46,7 @@ def test_states_are_small_and_observations_are_beside_them(folder):
 
 def test_manifest_says_what_is_there(folder):
     files = json.loads((folder / "manifest.json").read_text())["files"]
-    assert set(files) == {f"{PEG}/states.h5", f"{PEG}/trajectory.h5"}
+    assert set(files) == {f"{PEG}/{STATES}", f"{PEG}/{OBSERVED}"}
     for entry in files.values():
         assert entry["seeds"] == [0, 1]
         assert entry["success"] == 2
@@ -55,9 +56,9 @@ def test_manifest_says_what_is_there(folder):
 
 
 def test_same_command_again_does_nothing(folder):
-    before = (folder / PEG / "trajectory.h5").stat().st_mtime_ns
+    before = (folder / PEG / OBSERVED).stat().st_mtime_ns
     dataset.main(dataset.Args(folder, (PEG,), num=2, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
-    assert (folder / PEG / "trajectory.h5").stat().st_mtime_ns == before
+    assert (folder / PEG / OBSERVED).stat().st_mtime_ns == before
     assert not list(folder.rglob("*.episodes"))
 
 
@@ -67,25 +68,25 @@ def damaged(folder: Path, tmp_path: Path) -> Path:
 
 def test_a_changed_action_is_found(folder, tmp_path):
     copy = damaged(folder, tmp_path)
-    with h5py.File(copy / PEG / "states.h5", "r+") as file:
+    with h5py.File(copy / PEG / STATES, "r+") as file:
         file["traj_1/actions"][3, 0] = 0.123
     problems = validate(copy, num_replays=2)
     assert any("sha256" in problem for problem in problems)
     assert any("seed 1 does not come out as recorded" in problem for problem in problems)
     with pytest.raises(DemonstrationError, match=r"seed 1 .* does not come out as it was recorded"):
-        render_observations.main(render_observations.Args(copy / PEG / "states.h5", copy / "again.h5", "tacff", ()))
+        render_observations.main(render_observations.Args(copy / PEG / STATES, copy / "again.h5", "tacff", ()))
     with h5py.File(copy / "again.h5") as file:  # what was finished before is kept
         assert len(file) == 1
 
 
 def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
     copy = damaged(folder, tmp_path)
-    whole = (copy / PEG / "states.h5").read_bytes()
-    (copy / PEG / "states.h5").write_bytes(whole[: len(whole) // 2])
-    (copy / PEG / "trajectory.h5").unlink()
+    whole = (copy / PEG / STATES).read_bytes()
+    (copy / PEG / STATES).write_bytes(whole[: len(whole) // 2])
+    (copy / PEG / OBSERVED).unlink()
     problems = validate(copy)
-    assert any("states.h5" in problem and "truncated" in problem for problem in problems)
-    assert any("trajectory.h5" in problem and "does not exist" in problem for problem in problems)
+    assert any(STATES in problem and "truncated" in problem for problem in problems)
+    assert any(OBSERVED in problem and "does not exist" in problem for problem in problems)
 
 
 def test_set_without_manifest_says_what_writes_one(tmp_path):
@@ -99,7 +100,7 @@ def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
     monkeypatch.setattr(dataset.shutil, "disk_usage", lambda path: type("Usage", (), dict(free=1e6)))
     with pytest.raises(MachineError, match=r"0\.0 GB free"):
         dataset.main(dataset.Args(tmp_path, (PEG,)))
-    states = folder / PEG / "states.h5"
+    states = folder / PEG / STATES
     with pytest.raises(ValueError, match="is the file that is read"):
         render_observations.main(render_observations.Args(states, states))
 

@@ -6,16 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from baselines.common.dataset import read_episodes
 from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys
-from manifeel_ms3.paths import data_dir
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
+from tests.sample import observed_sample, states_sample
 
-SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 
 
@@ -41,7 +44,7 @@ def require_same(read: list[dict[str, np.ndarray]], last_is_repeated: bool) -> N
 def test_what_can_be_exported_is_found():
     assert sorted(observation_keys(SAMPLE)) == sorted(KEYS)
     with pytest.raises(DemonstrationError, match="states and actions alone"):
-        observation_keys(SAMPLE.with_name("states.h5"))
+        observation_keys(states_sample(PEG))
 
 
 def test_lerobot(tmp_path):
@@ -55,6 +58,48 @@ def test_lerobot(tmp_path):
     assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
 
 
+def test_a_lerobot_dataset_says_what_it_is(tmp_path):
+    folder = exported("lerobot", tmp_path)
+    import pyarrow.parquet as pq
+
+    sentence = task_spec(PEG).instruction
+    assert pq.read_table(folder / "meta/tasks.parquet").to_pylist() == [{"task_index": 0, "__index_level_0__": sentence}]
+    assert pq.read_table(folder / "meta/episodes").column("tasks").to_pylist() == [[sentence]] * 2
+    features = json.loads((folder / "meta/info.json").read_text())["features"]
+    assert features["action"]["names"] == ["x", "y", "z", "roll", "pitch", "yaw"]
+    assert features["observation.state"]["names"] == ["x", "y", "z", "qw", "qx", "qy", "qz"]
+    assert features["observation.tactile.right.force_field"]["names"] == ["rows", "columns", "force"]
+    card = (folder / "README.md").read_text()
+    assert card.startswith("---\nlicense: apache-2.0\n")
+    assert all(f"| `{name}` |" in card for name in features)
+    assert sentence in card
+
+
+def test_a_lerobot_dataset_holds_the_outcome_of_each_action(tmp_path):
+    folder = exported("lerobot", tmp_path)
+    import pyarrow.parquet as pq
+
+    with open_trajectories(SAMPLE) as file:
+        for e in range(2):
+            table = pq.read_table(folder / f"data/chunk-000/file-{e:03d}.parquet")
+            assert table["next.success"].to_pylist() == file[f"traj_{e}/success"][()].tolist()
+            assert table["next.done"].to_pylist() == [False] * (table.num_rows - 1) + [True]
+            if "rewards" in file[f"traj_{e}"]:
+                assert np.allclose(table["next.reward"].to_pylist(), file[f"traj_{e}/rewards"][()])
+
+
+def test_the_cameras_of_a_lerobot_dataset_can_be_videos(tmp_path):
+    pytest.importorskip("pyarrow")
+    folder = export.main(export.Args(SAMPLE, "lerobot", tmp_path / "videos", videos=True))
+    camera, *rest = KEYS
+    recorded, read = read_demonstrations(SAMPLE, KEYS), lerobot.read_lerobot(folder, KEYS)
+    for episode, original in zip(read, recorded, strict=True):
+        assert np.abs(episode[camera][:-1].astype(float) - original[camera][:-1]).mean() < 6  # H.264 halves colours
+        assert all(np.array_equal(episode[key][:-1], original[key][:-1]) for key in rest)
+    with pytest.raises(InvalidArgumentError, match="--videos is for --to lerobot"):
+        export.main(export.Args(SAMPLE, "npz", tmp_path / "npz", videos=True))
+
+
 @pytest.mark.skipif(importlib.util.find_spec("lerobot") is None, reason="lerobot is not installed")
 def test_lerobots_own_reader_takes_it(tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -66,7 +111,9 @@ def test_lerobots_own_reader_takes_it(tmp_path):
     frame = dataset[7]
     assert np.allclose(frame["action"], recorded[0]["actions"][7])
     assert np.allclose(frame["observation.images.wrist"].permute(1, 2, 0) * 255, recorded[0][KEYS[0]][7], atol=1e-3)
-    assert np.allclose(frame["observation.force_field.tactile_right"], recorded[0][KEYS[1]][7])
+    assert np.allclose(frame["observation.tactile.right.force_field"], recorded[0][KEYS[1]][7])
+    assert frame["task"] == task_spec(PEG).instruction
+    assert frame["next.success"].dtype == torch.bool
 
 
 def test_zarr_of_the_papers_layout(tmp_path):

@@ -20,13 +20,13 @@ LENGTHS = (4, 3)
 def test_features_have_their_names():
     assert [feature_name(key) for key in (*KEYS, "sensor_data/tactile_left/rgb")] == [
         "observation.images.wrist",
-        "observation.force_field.tactile_right",
+        "observation.tactile.right.force_field",
         "observation.state",
         "observation.images.tactile_left",
     ]
 
 
-@pytest.mark.parametrize("kind", ["images", "videos"])
+@pytest.mark.parametrize("kind", ["images", "videos"])  # of version 0.1.0: force fields have another name there
 def test_numbers_are_those_that_were_written(kind):
     folder = DATASETS / kind
     assert is_lerobot(folder)

@@ -19,6 +19,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import episode_folder
 from manifeel_ms3.demonstrations.recording import make_header
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
+from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
 from tests.conftest import PEG
@@ -49,10 +50,23 @@ def test_file_holds_what_maniskill_expects(recorded):
             assert group["actions"].shape == (steps, 6)
             assert group["success"].shape == (steps,)
             assert group["success"][-1]
+            assert group["rewards"].shape == (steps,)
+            assert group["rewards"].dtype == np.float32
+            assert 0.5 < group["rewards"][-1] <= 1.0
             assert group["obs/sensor_data/tactile_right/force_field"].shape == (steps + 1, 10, 14, 3)
             assert group["env_states/actors/peg"].shape[0] == steps + 1
             assert episode["peak_contact_force"] < 60
     assert not episode_folder(recorded).exists()
+    assert header["commit_info"] == (git_commit() and dict(commit_id=git_commit()))
+
+
+def test_names_of_files_say_what_is_in_them():
+    def name(obs_mode: str, **kwargs) -> str:
+        return record.Args(PEG, obs_mode=obs_mode, env_kwargs=json.dumps(kwargs)).path.relative_to("data/demos").as_posix()
+
+    assert name("none") == f"{PEG}/trajectory.h5"
+    assert name("rgb+tacff") == f"{PEG}/trajectory.rgb+tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
+    assert name("state", control_mode="pd_ee_delta_pose") == f"{PEG}/trajectory.state.pd_ee_delta_pose.physx_cpu.h5"
 
 
 def contents(path: Path) -> dict[str, bytes]:

@@ -4,15 +4,17 @@ import io
 
 import numpy as np
 import pytest
+from mani_skill.utils.wrappers import RecordEpisode
 from rich.console import Console
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.summary import sparkline, summary
-from manifeel_ms3.paths import data_dir
+from manifeel_ms3.demonstrations.validate import validate
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
-SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 
 
 def test_it_counts_what_is_there():
@@ -41,3 +43,23 @@ def test_a_sparkline_shows_where_it_is_high():
 def test_a_file_that_is_not_there_is_said(tmp_path):
     with pytest.raises(DemonstrationError, match="does not exist"):
         summary(tmp_path / "none.h5")
+
+
+@pytest.mark.parametrize("obs_mode", ["state", "state+tacff"])
+def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
+    """It has no contact forces, and its observations may be vectors."""
+    env = make_env(PEG, obs_mode=obs_mode, render_backend="none")
+    recorder = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)
+    recorder.reset(seed=3)
+    for _ in range(2):
+        recorder.step(recorder.action_space.sample())
+    recorder.flush_trajectory()
+    recorder._h5_file.close()
+    page = io.StringIO()
+    Console(width=160, file=page).print(summary(tmp_path / "theirs.h5"))
+    assert "2 on average" in page.getvalue()
+    assert validate(tmp_path / "theirs.h5") == ["seed 3: it does not end in success"]
+
+
+def test_one_file_is_validated_by_itself():
+    assert validate(SAMPLE) == []

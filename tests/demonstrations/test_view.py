@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, view
-from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
-FILE = data_dir() / f"sample/{PEG}/trajectory.h5"
+FILE = observed_sample(PEG)
 
 
 def test_everything_is_there(tmp_path):

@@ -1,5 +1,6 @@
 """Evaluation: fixed seeds, honest intervals, identical outcomes, a page that opens."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,15 +11,15 @@ from manifeel_ms3.evaluation import evaluate_episode
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
-from manifeel_ms3.evaluation.policy import load_policy
+from manifeel_ms3.evaluation.policy import PolicySource, load_policy
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
 from tests.conftest import PEG
 from tests.outcomes import made_up
+from tests.sample import states_sample
 
 
 class ExpertPolicy:
@@ -131,7 +132,7 @@ TIGHT_LIMIT = 250
 
 @pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
 def test_limits_follow_from_demonstrations(spec):
-    sample = limits_of_file(data_dir() / "sample" / spec.env_id / "states.h5")
+    sample = limits_of_file(states_sample(spec.env_id))
     assert spec.max_episode_steps >= LONGEST_FACTOR * sample.longest
     assert spec.max_episode_steps >= MEAN_FACTOR * spec.demo_steps - STEPS
     tight = TIGHT_LIMIT if spec.category == "insertion" else 0
@@ -178,3 +179,14 @@ def test_broken_checkpoints_say_what_is_wrong(tmp_path, config, word):
     with pytest.raises(CheckpointError, match=word) as error:
         load_policy(tmp_path)
     assert "\n" not in str(error.value)
+
+
+def test_a_policy_is_found_in_the_working_folder(tmp_path, monkeypatch):
+    """An installed command, unlike `python -m`, does not look there by itself."""
+    (tmp_path / "a_policy_of_mine.py").write_text("class Mine:\n    def __init__(self, gain): self.gain = gain\n")
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    monkeypatch.chdir(tmp_path)
+    source = PolicySource(policy="a_policy_of_mine:Mine", kwargs='{"gain": 2}')
+    assert source.fingerprint() is not None
+    assert source.make().gain == 2
+    assert sys.path[-1] == str(tmp_path)  # last, so that nothing here takes the place of an installed module

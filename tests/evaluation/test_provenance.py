@@ -4,8 +4,8 @@ from importlib.metadata import version
 
 import pytest
 
-from manifeel_ms3.evaluation.provenance import git_commit, machine, package_versions
 from manifeel_ms3.evaluation.result import ResultError, read_result, result_of, write_result
+from manifeel_ms3.provenance import git_commit, machine, package_versions
 from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
 from tests.outcomes import made_up

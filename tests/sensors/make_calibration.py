@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.sensors.optics.taxim_table import TABLE_CHANNELS, read_table
+from manifeel_ms3.verification.published_colours import CALIBRATION, published_table
 
-CALIBRATION = data_dir() / "gelsight_r15_polycalib_subset.npz"
 MAX_SLOPE = 1.2  # rad, above all slopes that the tests press or fit
 
 
@@ -26,11 +25,7 @@ def subset(table: np.ndarray) -> dict[str, np.ndarray]:
 
 def write_table(path: Path) -> Path:
     """Write the compact copy as a table in Taxim's format."""
-    with np.load(CALIBRATION) as stored:
-        kept = stored["coefficients"] * stored["scale"]
-        table = np.zeros((3, int(stored["bins"]), *kept.shape[2:]))
-    table[:, : kept.shape[1]] = kept
-    np.savez(path, **dict(zip(TABLE_CHANNELS, table, strict=True)))
+    np.savez(path, **dict(zip(TABLE_CHANNELS, published_table(), strict=True)))
     return path
 
 

@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import torch
 
-from manifeel_ms3.sensors import gelsight_r15, with_options
+from manifeel_ms3.sensors import Light, LightsConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
-from manifeel_ms3.sensors.optics.fit_shader import Presses, main
+from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
+from manifeel_ms3.sensors.optics.lights import lamp_shader
 from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
-from manifeel_ms3.sensors.optics.tacrgb import Optics
+from manifeel_ms3.sensors.optics.tacrgb import Optics, shader_of
 from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
+from manifeel_ms3.verification.published_colours import change_images, published_table, ssim
 from tests.sensors.make_calibration import write_table
-from tests.sensors.readers import photometric_stereo, ssim, table_change
+from tests.sensors.readers import photometric_stereo
 from tests.sensors.shapes import dimples
 
 CONFIG = gelsight_r15("touch", "gel_right")
@@ -180,12 +182,8 @@ def pressed(optics: Optics, name: str) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("press", PRESSES)
-def test_change_images_are_those_of_the_published_calibration(optics, press, table_file, figure):
-    surface = pressed(optics, press)
-    background = optics._background.numpy()
-    change = optics.shade(surface)[0].numpy() - background
-    published = table_change(read_table(table_file), surface[0].double().numpy(), CONFIG.pixel_size)
-    published = (background + published).clip(0, 255) - background
+def test_change_images_are_those_of_the_published_calibration(optics, press, figure):
+    change, published = change_images(optics, PRESSES[press], published_table())
     figure("change images against the R1.5 table, SSIM", ssim(change, published), at_least=0.90)
     rmse = np.sqrt(((change - published) ** 2).mean())
     figure("change images against the R1.5 table, grey levels RMSE", rmse, at_most=6)
@@ -232,13 +230,77 @@ def test_shader_is_fitted_from_ball_presses(optics, tmp_path):
         presses.append(f"{k}.png,{row},{col},{contact - 1.5}")
     cv2.imwrite(str(tmp_path / "background.png"), shader.background.numpy()[..., ::-1])
     (tmp_path / "presses.csv").write_text("\n".join(["file,row,col,radius", *presses]))
-    main(Presses(tmp_path, radius, CONFIG.pixel_size, tmp_path / "out" / "shader.npz"))
+    known = dict(folder=tmp_path, ball_radius=radius, pixel_size=CONFIG.pixel_size)
+    main(Presses(**known, out=tmp_path / "out" / "shader.npz"))
     fitted = make_optics(**{"optics.calibration": tmp_path / "out" / "shader.npz"})
     surface = optics.surface(ball(0.005, 5e-4, 2e-3, -3e-3))
     difference = (fitted.shade(surface).int() - optics.shade(surface).int()).abs().float()
     assert difference.mean() < 1.0
     assert difference.max() < 12
     with pytest.raises(ValueError, match="larger than the ball"):
-        main(Presses(tmp_path, 5e-4, CONFIG.pixel_size, tmp_path / "x.npz"))
+        main(Presses(**known | dict(ball_radius=5e-4), out=tmp_path / "x.npz"))
     with pytest.raises(ValueError, match=r"presses\.csv"):
-        main(Presses(tmp_path / "out", radius, CONFIG.pixel_size, tmp_path / "x.npz"))
+        main(Presses(**known | dict(folder=tmp_path / "out"), out=tmp_path / "x.npz"))
+
+
+def test_circles_that_were_drawn_by_hand_are_shifted_to_where_the_ball_was(tmp_path):
+    radius, rng, shader = 0.003, np.random.default_rng(0), make_optics(**{"optics.smoothing": 0.0})
+    rows, cols = slice(80, 160), slice(110, 210)
+    images, true, radii = [], [], []
+    for _ in range(6):
+        x, y = rng.uniform(-1, 1, 2) * 0.001
+        depth = rng.uniform(6e-4, 1.2e-3)
+        images.append(shader.shade(ball(radius, depth, x, y))[0].numpy()[rows, cols, ::-1])
+        true.append((x / CONFIG.pixel_size + 39.5, y / CONFIG.pixel_size + 49.5))
+        radii.append(np.sqrt(radius**2 - (radius - depth) ** 2) / CONFIG.pixel_size - 3)
+    drawn = np.array(true) + rng.integers(-6, 7, (6, 2))
+    pack = dict(f0=shader.background.numpy()[rows, cols, ::-1], imgs=np.stack(images), touch_center=drawn[:, ::-1])
+    np.savez(tmp_path / "dataPack.npz", **pack, touch_radius=radii)
+    background, read, circles = read_pack(tmp_path / "dataPack.npz")
+    assert circles[:, :2] == pytest.approx(drawn)
+    refined = refined_circles(background, read, circles, radius, CONFIG.pixel_size, uniform=True)
+    error = [np.linalg.norm(found[:, :2] - true, axis=1).mean() for found in (circles, refined)]
+    assert error[1] < 0.65 * error[0]
+    known = dict(ball_radius=radius, pixel_size=CONFIG.pixel_size, uniform=True, out=tmp_path / "shader.npz")
+    main(Pack(pack=tmp_path / "dataPack.npz", **known))
+    fitted = Shader.load(tmp_path / "shader.npz").weights
+    assert (fitted[..., 1:] == 0).all()  # the same all over the image
+    assert (fitted[:, 0] == 0).all()  # and nothing that is the same in all directions
+    np.savez(tmp_path / "other.npz", f0=pack["f0"])
+    with pytest.raises(ValueError, match=r"no dataPack\.npz in Taxim's format.*imgs"):
+        main(Pack(pack=tmp_path / "other.npz", **known))
+
+
+LAMP = Light((0.0, 0.03, -0.01), (1.0, 1.0, 0.0))  # towards the fingertip
+
+
+def test_a_slope_towards_a_lamp_is_lit_by_lamberts_law():
+    lights = LightsConfig((LAMP,), level=60.0)
+    shader = lamp_shader(lights, (0.0, 0.0), (240, 320), CONFIG.pixel_size)
+    place = np.array([1.0, 0, 0, 0, 0, 0])  # of the middle
+    for slope in (0.0, 0.3, 0.6):
+        for phi, faces in ((-np.pi / 2, 1.0), (np.pi / 2, -1.0)):  # the gel rises away from the lamp: its slope faces the lamp
+            terms = fourier_terms(np.array(phi)), slope_terms(np.array(slope))
+            level = np.einsum("cfkq,f,k,q->c", shader.weights, *terms, place) + shader.background @ place
+            elevation = np.arctan2(0.01, 0.03)
+            expected = np.sin(elevation + faces * np.arctan(slope)).clip(min=0) / np.sin(elevation)
+            flat = shader.background[0] @ place
+            assert max(level[0] / flat, 0.0) == pytest.approx(expected, abs=0.12)
+            assert level[2] == 0  # no lamp is blue
+    mean = (place_terms(*np.meshgrid(*[np.linspace(-1, 1, 9)] * 2)) @ shader.background.T).mean((0, 1))
+    assert mean == pytest.approx([60, 60, 0], abs=0.1)
+    near, far = (np.array([1, 0, c, 0, 0, c * c]) @ shader.background[0] for c in (1, -1))
+    assert near > 1.5 * far
+
+
+@pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
+def test_height_comes_back_from_the_picture_of_other_sensors(sensor, figure):
+    config = sensor_config(sensor, "touch", "gel_right")
+    optics = Optics(config, ContactGrid.covering(config.gel.size, 3.5e-4, CPU), 1, CPU)
+    x, y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * config.pixel_size for n in config.image_shape), indexing="ij")
+    height = (np.sqrt(np.maximum(0.004**2 - x**2 - y**2, 0)) - 0.004 + 6e-4).clip(min=0)
+    surface = optics.surface(torch.as_tensor(height, dtype=torch.float32)[None])
+    found = photometric_stereo(optics.shade(surface)[0].numpy(), shader_of(config), config.pixel_size, step=4)
+    off = np.abs(found - surface[0, ::4, ::4].numpy()).max()
+    figure(f"height from the {sensor}'s picture by photometric stereo, mm off", 1e3 * off, at_most=0.1)
+    assert (optics.shade(torch.zeros(1, 240, 320)) == optics.background).all()

@@ -1,9 +1,12 @@
 """What holds for every task."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from mani_skill.utils.wrappers import CPUGymWrapper
 
 import manifeel_ms3.experts  # noqa: F401
 from manifeel_ms3.errors import InvalidArgumentError
@@ -22,6 +25,21 @@ def test_evaluation_seeds_are_the_papers_and_disjoint_from_those_of_demonstratio
     assert min(evaluation_seeds(3)) >= FIRST_EVALUATION_SEED
     with pytest.raises(InvalidArgumentError, match="at least 1"):
         evaluation_seeds(0)
+
+
+def test_every_task_has_one_sentence_that_says_what_to_do():
+    for spec in all_tasks().values():
+        assert re.fullmatch(r"[A-Z][^.]+\.", spec.instruction), spec.env_id
+        assert "ManiFeel" not in spec.instruction
+
+
+def test_the_sentence_comes_with_the_environment_and_with_its_resets(make_env):
+    env = make_env("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none")
+    sentence = all_tasks()["ManiFeel-PegInsertion-v1"].instruction
+    assert env.unwrapped.get_language_instruction() == [sentence]
+    assert env.reset(seed=0)[1]["language_instruction"] == [sentence]
+    _, info = CPUGymWrapper(env).reset(seed=0)
+    assert info["language_instruction"] == sentence
 
 
 @pytest.mark.parametrize("task", TASKS)

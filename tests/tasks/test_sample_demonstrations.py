@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
-from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
+from tests.sample import states_sample
 
 TASKS = sorted(name for name in all_tasks() if name.startswith("ManiFeel-"))
-SAMPLE_REVISIONS = dict.fromkeys(TASKS, 2)
+SAMPLE_REVISIONS = dict.fromkeys(TASKS, 3)
 """Revision of each task with which its sample was recorded."""
 FREE_STEPS = 20
 """Steps before the first contact of any sample; until then a replay repeats the recording on every processor."""
@@ -44,7 +44,7 @@ class Replay:
 
 @cache
 def replayed(task: str) -> Replay:
-    path = data_dir() / "sample" / task / "states.h5"
+    path = states_sample(task)
     episode = read_header(path)["episodes"][0]
     with h5py.File(path) as file:
         trajectory = file[f"traj_{episode['episode_id']}"]

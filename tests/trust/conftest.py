@@ -18,8 +18,8 @@ def folder(tmp_path) -> Path:
 @pytest.fixture
 def demo(tmp_path) -> Path:
     """A copy of the sample's trajectory file, to be spoiled."""
-    for name in ("trajectory.h5", "trajectory.json"):
-        shutil.copy(SAMPLE / name, tmp_path)
+    for suffix in (".h5", ".json"):
+        shutil.copy(SAMPLE.with_suffix(suffix), tmp_path / f"trajectory{suffix}")
     return tmp_path / "trajectory.h5"
 
 

@@ -5,9 +5,10 @@ import os
 from pathlib import Path
 
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
 REPOSITORY = Path(__file__).parents[2]
-SAMPLE = REPOSITORY / "data/sample" / PEG
+SAMPLE = observed_sample(PEG)
 LEROBOT = REPOSITORY / "tests/demonstrations/lerobot"
 KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 SECRET = b"TOP SECRET TEXT OF ANOTHER FILE."

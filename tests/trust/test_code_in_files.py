@@ -18,6 +18,8 @@ from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.policy import PolicySource, load_policy
+from tests.conftest import PEG
+from tests.sample import states_sample
 
 from .files_of_strangers import EXECUTED, REPOSITORY, SAMPLE, rewrite_json
 
@@ -69,8 +71,9 @@ def gadget(tmp_path, monkeypatch) -> Path:
 
 def naming(env_id: str, name: str, folder: Path) -> Path:
     """A trajectory file of a set whose json has this id."""
+    source = SAMPLE if name == "observed" else states_sample(PEG)
     for suffix in (".h5", ".json"):
-        shutil.copy(SAMPLE / f"{name}{suffix}", folder)
+        shutil.copy(source.with_suffix(suffix), folder / f"{name}{suffix}")
     rewrite_json(folder / f"{name}.json", lambda header: header["env_info"].update(env_id=env_id))
     about = {"schema": "manifeel-demonstrations-1", "files": {f"{name}.h5": {"success": 2}}}
     (folder / "manifest.json").write_text(json.dumps(about))
@@ -104,7 +107,7 @@ READ_ENV_ID = {
 def test_a12_no_module_that_a_file_names_is_imported(command, env_id, gadget):
     if command == "render_observations" and "Peg" in env_id:
         pytest.skip("it renders in worker processes, which the test of the command line stands for")
-    path = naming(env_id, "trajectory" if command in ("view", "export") else "states", gadget)
+    path = naming(env_id, "observed" if command in ("view", "export") else "states", gadget)
     with suppress(ManifeelError):
         READ_ENV_ID[command](path)
     assert not (gadget / "executed").exists()

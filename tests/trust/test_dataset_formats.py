@@ -96,7 +96,7 @@ def test_b7_a_pipe_in_a_dataset_is_refused_and_not_waited_for(images):
 def test_b7_a_manifest_names_files_in_its_folder_alone(name, tmp_path):
     folder, elsewhere = tmp_path / "set", tmp_path / "elsewhere"
     folder.mkdir()
-    shutil.copytree(SAMPLE, elsewhere)
+    shutil.copytree(SAMPLE.parent, elsewhere)
     (folder / "link").symlink_to(elsewhere)
     (folder / "manifest.json").write_text(json.dumps({"schema": "manifeel-demonstrations-1", "files": {name: {}}}))
     (problem,) = validate(folder)
@@ -109,7 +109,7 @@ def test_b7_a_manifest_names_files_in_its_folder_alone(name, tmp_path):
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory) -> Path:
     pytest.importorskip("zarr")
-    return export(Args(SAMPLE / "trajectory.h5", "zarr", tmp_path_factory.mktemp("zarr") / "store"))
+    return export(Args(SAMPLE, "zarr", tmp_path_factory.mktemp("zarr") / "store"))
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+from manifeel_ms3 import provenance
 from manifeel_ms3.errors import InUseError, InvalidFileError, ManifeelError
-from manifeel_ms3.evaluation import provenance
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_hash
 from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.journal import Journal, OtherEvaluationError
@@ -340,7 +340,7 @@ def git(folder: Path, *arguments: str) -> str:
 
 def commit_seen_from(package: Path) -> str | None:
     """The commit that a copy of the package gives."""
-    file = package / "evaluation/provenance.py"
+    file = package / "provenance.py"
     file.parent.mkdir(parents=True)
     file.write_text(Path(provenance.__file__).read_text())
     spec = importlib.util.spec_from_file_location("copied_provenance", file)

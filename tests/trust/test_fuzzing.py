@@ -35,11 +35,12 @@ from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.policy import load_policy
 from manifeel_ms3.evaluation.result import read_result
 from tests.conftest import PEG
+from tests.sample import observed_sample
 
 from .tiny_checkpoint import save_tiny_checkpoint
 
 REPOSITORY = Path(__file__).parents[2]
-SAMPLE = REPOSITORY / "data/sample" / PEG
+SAMPLE = observed_sample(PEG)
 LEROBOT = REPOSITORY / "tests/demonstrations/lerobot"
 RESULT = Path(__file__).with_name("result.json")
 KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
@@ -147,7 +148,7 @@ def copied(file: Path) -> Callable[[Path], Path]:
 
 def made_trajectory(folder: Path) -> Path:
     """The first steps of one episode of the sample, with all of its parts."""
-    with h5py.File(SAMPLE / "trajectory.h5") as sample, h5py.File(folder / "trajectory.h5", "w") as file:
+    with h5py.File(SAMPLE) as sample, h5py.File(folder / "trajectory.h5", "w") as file:
 
         def shorten(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset):
@@ -156,7 +157,7 @@ def made_trajectory(folder: Path) -> Path:
                 file.create_dataset(f"traj_0/{name}", data=values, chunks=chunks, compression="gzip" if chunks else None)
 
         sample["traj_0"].visititems(shorten)
-    header = json.loads((SAMPLE / "trajectory.json").read_text())
+    header = json.loads(SAMPLE.with_suffix(".json").read_text())
     header["episodes"] = [header["episodes"][0] | dict(elapsed_steps=STEPS)]
     (folder / "trajectory.json").write_text(json.dumps(header))
     return folder / "trajectory.h5"

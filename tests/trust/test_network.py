@@ -9,7 +9,6 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import closing
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
@@ -17,8 +16,9 @@ import pytest
 
 from tests.browser import wait_until
 from tests.conftest import PEG
+from tests.sample import states_sample
 
-SAMPLE = Path(f"data/sample/{PEG}/states.h5").resolve()
+SAMPLE = states_sample(PEG)
 LOOPBACK = {"127.0.0.1", "::1"}
 
 

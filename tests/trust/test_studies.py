@@ -174,7 +174,7 @@ import json, sys
 from pathlib import Path
 from baselines.studies import cost
 from baselines.studies.study import jobs_of, read_study
-from manifeel_ms3.evaluation.provenance import machine
+from manifeel_ms3.provenance import machine
 
 study = read_study(Path("study.yaml"))
 jobs = jobs_of(study)

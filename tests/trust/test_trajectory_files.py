@@ -80,11 +80,11 @@ def test_a25_a_trajectory_file_is_refused(kind, demo, secret):
     ],
 )
 def test_a25_an_index_links_to_its_own_episodes_alone(file, place, tmp_path, secret):
-    shutil.copy(SAMPLE / "trajectory.json", tmp_path)
+    shutil.copy(SAMPLE.with_suffix(".json"), tmp_path / "trajectory.json")
     episodes, other = tmp_path / "trajectory.episodes", secret.with_name("other.h5")
     episodes.mkdir()
     for target in (other, episodes / "seed_00000000.h5"):
-        shutil.copy(SAMPLE / "trajectory.h5", target)
+        shutil.copy(SAMPLE, target)
     (episodes / "link.h5").symlink_to(other)
     with h5py.File(tmp_path / "trajectory.h5", "w") as index:
         index["traj_0"] = h5py.ExternalLink(file, place)
@@ -96,10 +96,10 @@ def test_a25_an_index_links_to_its_own_episodes_alone(file, place, tmp_path, sec
 
 
 def test_a25_an_episode_of_an_index_is_checked_too(tmp_path, secret):
-    shutil.copy(SAMPLE / "trajectory.json", tmp_path)
+    shutil.copy(SAMPLE.with_suffix(".json"), tmp_path / "trajectory.json")
     episodes = tmp_path / "trajectory.episodes"
     episodes.mkdir()
-    shutil.copy(SAMPLE / "trajectory.h5", episodes / "seed_00000000.h5")
+    shutil.copy(SAMPLE, episodes / "seed_00000000.h5")
     with_dataset(episodes / "seed_00000000.h5", lambda group: HARM["external storage"](group, secret))
     with h5py.File(tmp_path / "trajectory.h5", "w") as index:
         index["traj_0"] = h5py.ExternalLink("trajectory.episodes/seed_00000000.h5", "traj_0")

@@ -16,8 +16,9 @@ from baselines.common.encoders import EncoderConfig
 from baselines.common.train_args import TrainArgs
 from baselines.diffusion_policy import train as diffusion
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from tests.sample import observed_sample
 
-DEMOS = Path(__file__).parents[2] / "data/sample/ManiFeel-PegInsertion-v1/trajectory.h5"
+DEMOS = observed_sample("ManiFeel-PegInsertion-v1")
 STEPS = 40
 FORKING = multiprocessing.get_context("forkserver")
 FORKING.set_forkserver_preload([__name__, "tensorboard.summary.writer.event_file_writer"])

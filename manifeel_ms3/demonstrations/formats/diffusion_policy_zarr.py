@@ -3,6 +3,9 @@
 `data/` holds the steps of all episodes one after the other, and `meta/episode_ends` the step at which each one ends. The arrays
 are the cameras under their names (uint8), `right_tactile_camera_taxim` (float in [0, 1], 320 x 240: TacRGB turned by 90
 degrees), `tactile_force_field_right` (10 x 14 x 3), `state` (pose of the tool, m and xyzw) and `action`.
+
+The paper's stores say nothing of their task. Their force fields hold penetration and sliding speed (units="tacsl"). The stores
+that are written here name the task and its arguments, the units among them, in the attributes of the root group.
 """
 
 from itertools import pairwise
@@ -12,14 +15,28 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import read_json
+from manifeel_ms3.sensors.config import TactileSensorConfig
 
 from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
-from .maniskill_h5 import each_demonstration, observation_keys
+from .maniskill_h5 import each_demonstration, observation_keys, read_header
 from .own_files import broken_if_fails
 from .zarr_arrays import open_arrays
 
 ENDS, ACTION = "meta/episode_ends", "data/action"
 """Arrays that every store has."""
+ATTRIBUTES = ".zattrs"
+"""File of the attributes of a store of zarr format 2."""
+ABOUT = {
+    "type": "object",
+    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}, "force_field_units": {"type": "string"}},
+}
+"""Json schema of the attributes that are read."""
+PAPERS_ARGUMENTS: dict[str, Any] = {"tactile": {"units": "tacsl"}}
+"""Arguments of the environment with which the sensor gives the quantities of the paper's stores."""
+MOST_PENETRATION = 0.02
+"""Penetration, in m, above which a force field cannot be in the paper's units: five times the thickness of the gel."""
 STEPS_PER_CHUNK = 64
 """Number of steps in a chunk of an array."""
 XYZW = [0, 1, 2, 4, 5, 6, 3]
@@ -42,6 +59,33 @@ def array_name(key: str) -> str:
         return sensor
     side = sensor.removeprefix("tactile_")
     return f"{side}_tactile_camera_taxim" if kind == "rgb" else f"tactile_force_field_{side}"
+
+
+def recorded_arguments(folder: Path) -> dict[str, Any]:
+    """Arguments of the environment that a store names; those that stand for the paper's data where it names none.
+
+    Raises:
+        DemonstrationError: The attributes of the store are broken.
+    """
+    return _attributes(folder).get("env_kwargs", PAPERS_ARGUMENTS)
+
+
+def _attributes(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / ATTRIBUTES
+    try:
+        return read_json(path, ABOUT, "the attributes of a zarr store") if path.is_file() else {}
+    except InvalidFileError as error:
+        raise DemonstrationError(f"{error}; export the data set again") from error
+
+
+def _require_units(folder: Path, field: np.ndarray, episode: int) -> None:
+    """Check that a force field of a store that says nothing of its units can be one of the paper's."""
+    most = float(field[..., 0].max(initial=0.0))
+    if "env_kwargs" not in _attributes(folder) and most > MOST_PENETRATION:
+        raise DemonstrationError(
+            f"{folder} does not say in which units its force fields are, and episode {episode} holds {most:.3g}, too much for "
+            "the penetration in m of the paper's data; export the data set again, so that it names its units"
+        )
 
 
 def count_episodes(folder: Path) -> int:
@@ -67,11 +111,11 @@ def read_zarr(
         keys: Observations to read.
         num: Number of episodes; all of them if not given.
         progress: Wraps the iteration over episodes, to show a progress bar.
-        env_id: Ignored: a store does not name its task.
+        env_id: Id of the task that the episodes must be of, if the store names its task.
 
     Raises:
-        DemonstrationError: The store is broken, lacks an array, has fewer episodes, asks for decoders that could run code, or
-            declares more than it holds.
+        DemonstrationError: The store is broken or of another task, lacks an array, has fewer episodes, asks for decoders that
+            could run code, or declares more than it holds; or it holds force fields whose units cannot be known.
         MissingExtraError: zarr is not installed.
     """
     folder = Path(folder)
@@ -79,6 +123,8 @@ def read_zarr(
     held = sorted(path.name for path in (folder / "data").glob("*") if path.is_dir())
     if missing := [name for name in (*names.values(), ACTION) if Path(name).name not in held]:
         raise DemonstrationError(f"{folder} lacks {[Path(name).name for name in missing]}; it holds {held}")
+    if env_id not in (None, found := _attributes(folder).get("env_id", env_id)):
+        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
     arrays = open_arrays(folder, [ENDS, ACTION, *names.values()])
     ends = _ends(folder, arrays)
     for key, name in names.items():
@@ -91,6 +137,8 @@ def read_zarr(
         part = slice(ends[i - 1] if i else 0, ends[i])
         with broken_if_fails(folder, f"episode {i}"):
             episode = {key: _from_paper(key, np.asarray(arrays[name][part])) for key, name in names.items()}
+            for key in (key for key in keys if key.endswith("/force_field")):
+                _require_units(folder, episode[key], i)
             episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
             episodes.append(episode | dict(actions=np.asarray(arrays[ACTION][part], np.float32)))
     return episodes
@@ -134,6 +182,7 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
         import zarr
     keys, arrays, ends = observation_keys(path), {}, []
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
+    store.attrs.update(_about(path))
     for episode in each_demonstration(path, keys, progress):
         length = len(episode["actions"])
         parts = {array_name(key): _to_paper(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
@@ -144,6 +193,13 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
             arrays[name].append(values)
         ends.append(length + (ends[-1] if ends else 0))
     store.create_array(ENDS, data=np.array(ends, np.int64))
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """The attributes of a store that is written from a trajectory file."""
+    recorded = read_header(path)["env_info"]
+    units = recorded["env_kwargs"].get("tactile", {}).get("units", TactileSensorConfig.units)
+    return dict(env_id=recorded["env_id"].rpartition(":")[2], env_kwargs=recorded["env_kwargs"], force_field_units=units)
 
 
 def _from_paper(key: str, values: np.ndarray) -> np.ndarray:
@@ -166,4 +222,4 @@ def _to_paper(key: str, values: np.ndarray) -> np.ndarray:
     return values
 
 
-DIFFUSION_POLICY_ZARR = DemonstrationFormat("zarr", is_zarr, count_episodes, read_zarr, write_zarr)
+DIFFUSION_POLICY_ZARR = DemonstrationFormat("zarr", is_zarr, count_episodes, read_zarr, write_zarr, recorded_arguments)

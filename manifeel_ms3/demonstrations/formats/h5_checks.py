@@ -22,7 +22,7 @@ NUMBER_KINDS = "biuf"
 """numpy's kinds of numbers: Boolean, integers with and without a sign, and floating point."""
 GROUPS = ("obs", "obs/sensor_data", "obs/extra", "env_states", "env_states/actors")
 """Parts of an episode that hold other parts; each one stands after its parent."""
-PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force")
+PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force", "rewards")
 """Parts of an episode with one number for each step."""
 POSE_SIZE = 7
 """Numbers of a pose: position and quaternion."""
@@ -106,8 +106,9 @@ def _check_episode(episode: Any, path: Path) -> None:
     """Check that the parts of an episode that are read are what they must be: groups, or arrays with so many axes."""
     if not isinstance(episode, h5py.Group):
         raise _refused(path, f"{episode.name} is not an episode")
+    flat = isinstance(episode.get("obs"), h5py.Dataset) and episode["obs"].ndim == 2  # ManiSkill's vectors of states
     for name in GROUPS:
-        if name in episode:
+        if name in episode and not (flat and name == "obs"):
             _require(isinstance(episode[name], h5py.Group), path, episode, name)
     arrays = dict(actions=2) | dict.fromkeys(PER_STEP, 1)
     sensors: Any = episode.get("obs/sensor_data", {})

@@ -130,12 +130,23 @@ def read_demonstrations(
         return [_read_episode(file, i, keys, path, header) for i in progress(range(count))]
 
 
-def each_demonstration(path: Path, keys: list[str], progress: Progress = iter) -> Iterator[dict[str, np.ndarray]]:
-    """All episodes that `read_demonstrations` reads, one at a time, so that one of them is in memory."""
+def each_demonstration(
+    path: Path, keys: list[str], progress: Progress = iter, outcomes: tuple[str, ...] = ()
+) -> Iterator[dict[str, np.ndarray]]:
+    """All episodes that `read_demonstrations` reads, one at a time, so that one of them is in memory.
+
+    Args:
+        path: Trajectory file.
+        keys: Observations to read.
+        progress: Wraps the iteration over episodes, to show a progress bar.
+        outcomes: Arrays (T,) of what followed the actions, such as "success", that are read where the file has them.
+    """
     header = read_header(path)
     with open_trajectories(path) as file:
         for i in progress(range(len(header["episodes"]))):
-            yield _read_episode(file, i, keys, path, header)
+            episode = _read_episode(file, i, keys, path, header)
+            found = {name: file[f"traj_{i}/{name}"][()] for name in outcomes if name in file[f"traj_{i}"]}
+            yield episode | {name: values for name, values in found.items() if values.shape == episode["actions"].shape[:1]}
 
 
 def observation_keys(path: Path) -> list[str]:
@@ -176,5 +187,9 @@ def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) 
 
 
 MANISKILL_H5 = DemonstrationFormat(
-    "maniskill", matches=lambda path: not Path(path).is_dir(), count=count_episodes, read=read_demonstrations
+    "maniskill",
+    matches=lambda path: not Path(path).is_dir(),
+    count=count_episodes,
+    read=read_demonstrations,
+    env_kwargs=lambda path: read_header(path)["env_info"]["env_kwargs"],
 )

@@ -189,6 +189,8 @@ class Optics:
         self._to_light = wp.array(to_light, dtype=wp.vec2f, device=warp_device(device))
         self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=warp_device(device))
         self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
+        self.levels = wp.to_torch(self._background)
+        """Levels (H, W, 3) of the untouched gel's image before they are rounded, grey levels."""
         self._wide = [GaussianBlur(coarse, sigma / cell, device) for sigma in WIDE_SIGMAS]
         self._narrow = GaussianBlur(shape, NARROW_SIGMA / config.pixel_size, device)
         self._coat = GaussianBlur(shape, optics.smoothing, device) if optics.smoothing > 0 else None

@@ -58,12 +58,13 @@ class BallSortingRewardConfig:
 
 @register_task(
     "ManiFeel-BallSorting-v1",
+    instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,
     paper_tables=("II", "III"),
     demo_steps=83,
-    revision=2,
+    revision=3,
     force_limit=12.0,
 )
 class BallSortingEnv(VisuotactileEnv):
@@ -89,6 +90,7 @@ class BallSortingEnv(VisuotactileEnv):
     Randomization = BallSortingRandomization
     reward_config = BallSortingRewardConfig()
     policy_cameras = ("front",)
+    grips_round_parts = True
     default_control_mode = "pd_ee_delta_pose"
     front_camera_at = (0.80, 0.0, 0.15)
     side_camera_at = (0.5, -0.4, 0.17)
@@ -174,12 +176,13 @@ class BallSortingEnv(VisuotactileEnv):
 
 @register_task(
     "ManiFeel-BallSortingDim-v1",
+    instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,
     paper_tables=("I", "II", "III"),
     demo_steps=83,
-    revision=2,
+    revision=3,
     force_limit=12.0,
 )
 class BallSortingDimEnv(BallSortingEnv):

@@ -54,12 +54,13 @@ class ObjectSearchRewardConfig:
 
 @register_task(
     "ManiFeel-ObjectSearch-v1",
+    instruction="Find the battery in the container, and lift it.",
     max_episode_steps=160,
     category="exploration",
     paper_demos=50,
     paper_tables=("I", "II", "III"),
     demo_steps=77,
-    revision=2,
+    revision=3,
     force_limit=8.0,
 )
 class ObjectSearchEnv(VisuotactileEnv):

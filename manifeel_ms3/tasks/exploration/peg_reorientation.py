@@ -35,11 +35,12 @@ class PegReorientationRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-PegReorientation-v1",
+    instruction="Turn the peg in the hand until it is upright, and insert it into the hole in the box.",
     max_episode_steps=360,
     category="exploration",
     paper_demos=50,
     paper_tables=("I",),
-    revision=2,
+    revision=3,
     demo_steps=135,
     force_limit=38.0,
 )

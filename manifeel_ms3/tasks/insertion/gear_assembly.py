@@ -30,12 +30,13 @@ class GearRandomization(InsertionRandomization):
 
 @register_task(
     "ManiFeel-GearAssembly-v1",
+    instruction="Put the gear onto its shaft between the two other gears.",
     max_episode_steps=390,
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
     demo_steps=131,
-    revision=2,
+    revision=3,
     force_limit=27.0,
 )
 class GearAssemblyEnv(InsertionEnv):

@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PegInsertion-v1",
+    instruction="Insert the peg into the hole.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=57,
-    revision=2,
+    revision=3,
     force_limit=36.0,
 )
 class PegInsertionEnv(InsertionEnv):

@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-PowerPlugInsertion-v1",
+    instruction="Insert the power plug into the socket.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=57,
-    revision=2,
+    revision=3,
     force_limit=32.0,
 )
 class PowerPlugInsertionEnv(InsertionEnv):

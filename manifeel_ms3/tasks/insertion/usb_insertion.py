@@ -8,12 +8,13 @@ from .base import InsertionEnv
 
 @register_task(
     "ManiFeel-USBInsertion-v1",
+    instruction="Insert the USB plug into the port.",
     max_episode_steps=240,
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=60,
-    revision=2,
+    revision=3,
     force_limit=31.0,
 )
 class USBInsertionEnv(InsertionEnv):

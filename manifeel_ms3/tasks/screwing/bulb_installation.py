@@ -41,13 +41,14 @@ class BulbRandomization(ScrewingRandomization):
 
 @register_task(
     "ManiFeel-BulbInstallation-v1",
+    instruction="Screw the light bulb into its holder.",
     max_episode_steps=890,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
     demo_steps=444,
-    revision=2,
+    revision=3,
     force_limit=29.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
@@ -74,7 +75,8 @@ class BulbInstallationEnv(ScrewingEnv):
 
     Randomization = BulbRandomization
     screw = bulb_and_holder()
-    grip_indentation = 1.5e-3  # m: one contact point of 8 kN/m
+    grips_round_parts = True
+    grip_indentation = 1.27e-3  # m: where the five contact points of each pad carry the grip force
     contacts = CONTACTS | dict(
         enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
         contact_offset=4e-5,  # m; without them, what moves further than twice that in a physics step slips through a thread

@@ -15,13 +15,14 @@ MAX_TILT = np.deg2rad(2.0)
 
 @register_task(
     "ManiFeel-NutBoltAssembly-v1",
+    instruction="Screw the nut onto the bolt.",
     max_episode_steps=810,
     category="screwing",
     paper_demos=30,
     paper_tables=("I",),
     demo_megabytes=70.0,
     demo_steps=406,
-    revision=2,
+    revision=3,
     force_limit=24.0,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):

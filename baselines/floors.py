@@ -1,0 +1,132 @@
+"""Measure the failure floors of tasks: `python -m baselines.floors ManiFeel-PegInsertion-v1 --episodes 20`.
+
+Three policies that have learnt nothing are evaluated on the first evaluation seeds: random actions, the mean action of
+demonstrations, and the network of Diffusion Policy's preset `cpu` before training. An episode ends at success, and where it
+can no longer be won, which takes less time and leaves its success as it is. Tables of results show the floors
+(`manifeel_ms3.evaluation.floors`).
+"""
+
+import json
+import logging
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from baselines.registry import policy_spec, preset_cli
+from manifeel_ms3.command_line import run
+from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations.recording import observed_file
+from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.floors import POLICIES, SCHEMA, floors_file
+from manifeel_ms3.evaluation.result import read_result
+from manifeel_ms3.files import write_json
+from manifeel_ms3.paths import data_dir
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
+
+log = logging.getLogger(__name__)
+OBS_MODE = "rgb+tacff"
+"""Observation mode of the untrained network."""
+BLIND: dict[str, Any] = dict(obs_mode="none", env_kwargs='{"render_backend": "none"}')
+"""Arguments of the evaluation of policies that observe nothing."""
+
+
+@dataclass
+class Args:
+    """Arguments of the command."""
+
+    tasks: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Ids of the tasks; all tasks if none is given."""
+    policies: tuple[str, ...] = tuple(POLICIES)
+    """Names of the policies: "random", "mean action", "untrained"."""
+    episodes: int = 50
+    """Number of episodes for each policy."""
+    workers: int = 1
+    """Number of processes that simulate."""
+    demos: Path | None = None
+    """Folder with trajectory files in a folder for each task, from which the mean action and the ranges of the network's inputs
+    are taken; the sample of the package if not given."""
+    out: Path | None = None
+    """Folder of the files, one for each task; that of the package if not given. Policies that are not measured keep theirs."""
+
+
+def main(args: Args) -> list[Path]:
+    """Measure the floors, and return the paths of the files.
+
+    Raises:
+        UnknownNameError: A task is not registered.
+        DemonstrationError: The demonstrations of a task are missing or broken.
+    """
+    command = f"python -m baselines.floors --episodes {args.episodes}"
+    return [_measure_task(env_id, args, command) for env_id in args.tasks or all_tasks()]
+
+
+def _measure_task(env_id: str, args: Args, command: str) -> Path:
+    spec = task_spec(env_id)
+    demos = _observed_demonstrations((args.demos or data_dir() / "sample") / spec.env_id)
+    path = floors_file(spec.env_id, args.out)
+    floors = _earlier(path, spec.revision)
+    for name in args.policies:
+        with tempfile.TemporaryDirectory() as folder:
+            result = _evaluate(name, spec.env_id, demos, Path(folder), args)
+        numbers = dict(episodes=len(result["episodes"])) | result["success_once"]
+        floors[name] = numbers
+        log.info("%s, %s: %s", spec.env_id, name, numbers)
+        about = dict(schema=SCHEMA, env_id=spec.env_id, revision=spec.revision, git_commit=result["git_commit"])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(path, about | dict(command=command, floors={known: floors[known] for known in POLICIES if known in floors}))
+    return path
+
+
+def _observed_demonstrations(folder: Path) -> Path:
+    """The file of a task's demonstrations that holds what the untrained network observes.
+
+    Raises:
+        DemonstrationError: There is none.
+    """
+    path = observed_file(folder)
+    modes = read_header(path)["env_info"]["env_kwargs"]["obs_mode"].split("+") if path else ()
+    if path and set(OBS_MODE.split("+")) <= set(modes):
+        return path
+    raise DemonstrationError(f"{folder} has no trajectory file with {OBS_MODE}; record one with --obs-mode {OBS_MODE}")
+
+
+def _earlier(path: Path, revision: int) -> dict[str, Any]:
+    """The floors that a file holds of this revision of the task."""
+    if not path.is_file():
+        return {}
+    content = json.loads(path.read_text(encoding="utf-8"))
+    return content["floors"] if content["revision"] == revision else {}
+
+
+def _evaluate(name: str, env_id: str, demos: Path, folder: Path, args: Args) -> dict[str, Any]:
+    """The result of one policy."""
+    if name == "untrained":
+        arguments = _untrained(env_id, demos, folder)
+    else:
+        known = {"random": ("RandomActions", dict(env_id=env_id)), "mean action": ("MeanAction", dict(demos=str(demos)))}
+        policy, kwargs = known[name]
+        arguments = dict(policy=f"baselines.references:{policy}", policy_kwargs=json.dumps(kwargs)) | BLIND
+    out = folder / "evaluation.json"
+    amount: dict[str, Any] = dict(episodes=args.episodes, workers=args.workers, stop_at_success=True, out=out)
+    evaluate.main(evaluate.Args(env_id=env_id, **arguments, **amount))
+    return read_result(out)
+
+
+def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
+    """The evaluation of a network that one gradient step has made a checkpoint of; its first weights are drawn again."""
+    cameras = read_header(demos)["env_info"]["env_kwargs"]["cameras"]
+    policy = policy_spec("diffusion_policy")
+    sensing = ["--env-id", env_id, "--obs-mode", OBS_MODE, "--cameras", *cameras]
+    train = preset_cli(policy, ["cpu", "--demos", str(demos), *sensing, "--steps", "1", "--run-dir", str(folder / "run")])
+    kwargs = json.dumps(dict(checkpoint=str(policy.train(train))))
+    observed = dict(obs_mode=OBS_MODE, cameras=tuple(cameras))
+    return dict(policy="baselines.references:Untrained", policy_kwargs=kwargs, **observed)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, tyro.cli(Args)))

@@ -1,0 +1,245 @@
+"""PPO on joint states and touch, with the arguments of ManiSkill's `ppo.py`: `python examples/ppo.py --total-timesteps 60000`.
+
+The observation is a vector of the state and of the right pad's force field; `FlattenVisuotactileObservationWrapper` makes it.
+Each environment simulates on the CPU in a process of its own. ManiSkill's own `ppo.py` needs the two wrappers of `WRAPPERS` and
+nothing else to do the same on a GPU.
+"""
+
+import json
+import logging
+import random
+import time
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import torch
+import tyro
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+from mani_skill.utils.wrappers import CPUGymWrapper
+from mani_skill.utils.wrappers.flatten import FlattenObservationWrapper
+from torch import nn
+from torch.distributions import Normal
+from torch.utils.tensorboard import SummaryWriter
+
+import manifeel_ms3  # noqa: F401  (registers the tasks)
+from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper
+
+WRAPPERS = (partial(FlattenVisuotactileObservationWrapper, flat_tacff=True), FlattenObservationWrapper)
+FIXED = dict.fromkeys(("socket_xy", "start_xy", "start_z", "start_rotation", "in_hand_pitch"), 0.0)
+
+
+@dataclass
+class Args:
+    env_id: str = "ManiFeel-PegInsertion-v1"
+    """Id of the task."""
+    env_kwargs: str = json.dumps(dict(randomization=FIXED, max_episode_steps=100))
+    """Arguments of the task as json. The default is the easiest PegInsertion: the socket and the start do not vary."""
+    obs_mode: str = "state+tacff"
+    """Observation mode."""
+    exp_name: str = "ppo"
+    """Name of the run, whose log and weights are in runs/<exp_name>."""
+    seed: int = 1
+    """Seed of the networks, the environments and the actions."""
+    total_timesteps: int = 60_000
+    """Number of environment steps."""
+    learning_rate: float = 3e-4
+    """Learning rate of Adam."""
+    num_envs: int = 4
+    """Number of environments, each in a process."""
+    num_eval_envs: int = 2
+    """Number of environments of an evaluation."""
+    num_steps: int = 256
+    """Number of steps of each environment between two updates."""
+    eval_freq: int = 10
+    """Number of updates between two evaluations."""
+    gamma: float = 0.8
+    """Discount factor."""
+    gae_lambda: float = 0.9
+    """Lambda of the generalized advantage estimation."""
+    num_minibatches: int = 8
+    """Number of minibatches of an epoch."""
+    update_epochs: int = 8
+    """Number of epochs of an update."""
+    clip_coef: float = 0.2
+    """Clipping of the ratio of probabilities."""
+    vf_coef: float = 0.5
+    """Weight of the value's loss."""
+    max_grad_norm: float = 0.5
+    """Largest norm of a gradient."""
+    target_kl: float = 0.1
+    """Divergence of the policy from the one that collected the data at which an update ends."""
+
+
+class Agent(nn.Module):
+    """Actor and critic, as in ManiSkill's ppo.py, behind a running normalisation of the observation."""
+
+    def __init__(self, num_obs: int, num_actions: int):
+        super().__init__()
+        self.critic, actor = (self.mlp(num_obs, out, std) for out, std in ((1, 1.0), (num_actions, 0.01)))
+        self.actor_mean = actor
+        self.actor_logstd = nn.Parameter(torch.full((1, num_actions), -0.5))
+        self.register_buffer("mean", torch.zeros(num_obs))
+        self.register_buffer("var", torch.ones(num_obs))
+        self.register_buffer("count", torch.tensor(1e-4))
+
+    @staticmethod
+    def mlp(num_in: int, num_out: int, last_std: float) -> nn.Sequential:
+        layers = [nn.Linear(a, b) for a, b in ((num_in, 256), (256, 256), (256, num_out))]
+        for layer, std in zip(layers, (2**0.5, 2**0.5, last_std), strict=True):
+            nn.init.orthogonal_(layer.weight, std)
+            nn.init.zeros_(layer.bias)
+        return nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
+
+    def watch(self, obs: torch.Tensor) -> None:
+        """Update the mean and variance of observations (N, D)."""
+        delta, total = obs.mean(0) - self.mean, self.count + len(obs)
+        between = delta**2 * self.count * len(obs) / total
+        self.var = (self.var * self.count + obs.var(0, correction=0) * len(obs) + between) / total
+        self.mean = self.mean + delta * len(obs) / total
+        self.count = total
+
+    def normalized(self, obs: torch.Tensor) -> torch.Tensor:
+        return ((obs - self.mean) / (self.var + 1e-4).sqrt()).clamp(-5, 5)
+
+    def value(self, obs: torch.Tensor) -> torch.Tensor:
+        return self.critic(self.normalized(obs))[:, 0]
+
+    def distribution(self, obs: torch.Tensor) -> Normal:
+        return Normal(self.actor_mean(self.normalized(obs)), self.actor_logstd.exp())
+
+
+def make_env(args: Args, ignore_terminations: bool = False) -> gym.Env:
+    env = gym.make(args.env_id, obs_mode=args.obs_mode, render_backend="none", **json.loads(args.env_kwargs))
+    for wrapper in WRAPPERS:
+        env = wrapper(env)
+    return CPUGymWrapper(env, ignore_terminations=ignore_terminations, record_metrics=True)
+
+
+def make_envs(args: Args, num: int, **kwargs) -> AsyncVectorEnv:
+    made = [partial(make_env, args, **kwargs)] * num
+    return AsyncVectorEnv(made, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
+
+
+def tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(array, dtype=torch.float32)
+
+
+@torch.no_grad()
+def evaluate(agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
+    """Metrics of one episode of the mean action in each environment, to the time limit."""
+    obs, _ = envs.reset(seed=100_000)
+    while True:
+        obs, _, _, truncated, infos = envs.step(agent.distribution(tensor(obs)).mean.clamp(-1, 1).numpy())
+        if truncated.all():
+            metrics = infos["final_info"]["episode"]
+            return {f"eval/{name}": float(values.mean()) for name, values in metrics.items() if not name.startswith("_")}
+
+
+class Rollout:
+    """What the environments did between two updates; every array is (T, N, ...)."""
+
+    def __init__(self, args: Args, envs: AsyncVectorEnv):
+        shape = (args.num_steps, args.num_envs)
+        self.obs = torch.zeros(*shape, *envs.single_observation_space.shape)
+        self.actions = torch.zeros(*shape, *envs.single_action_space.shape)
+        self.logprobs, self.rewards, self.values, self.dones, self.final_values = (torch.zeros(shape) for _ in range(5))
+
+    @torch.no_grad()
+    def collect(self, agent: Agent, envs: AsyncVectorEnv, obs: np.ndarray) -> tuple[np.ndarray, list[float]]:
+        """Fill the arrays, and return the next observation and the success of each episode that ended."""
+        successes = []
+        self.final_values.zero_()
+        for t in range(len(self.obs)):
+            self.obs[t] = tensor(obs)
+            distribution = agent.distribution(self.obs[t])
+            self.actions[t] = distribution.sample()
+            self.logprobs[t], self.values[t] = distribution.log_prob(self.actions[t]).sum(1), agent.value(self.obs[t])
+            obs, reward, terminated, truncated, infos = envs.step(self.actions[t].clamp(-1, 1).numpy())
+            done = terminated | truncated
+            self.rewards[t], self.dones[t] = tensor(reward), tensor(done)
+            if done.any():
+                final = tensor(np.stack(list(infos["final_obs"][done])))
+                self.final_values[t, torch.as_tensor(done)] = agent.value(final)
+                successes += infos["final_info"]["episode"]["success_once"][done].astype(float).tolist()
+        return obs, successes
+
+    def advantages(self, args: Args, next_value: torch.Tensor) -> torch.Tensor:
+        """Generalized advantage estimation; an episode that ended is continued by the value of its last observation."""
+        advantages, last = torch.zeros_like(self.rewards), torch.zeros(args.num_envs)
+        for t in reversed(range(args.num_steps)):
+            following = next_value if t == args.num_steps - 1 else self.values[t + 1]
+            alive = 1 - self.dones[t]
+            delta = self.rewards[t] + args.gamma * (alive * following + self.final_values[t]) - self.values[t]
+            advantages[t] = last = delta + args.gamma * args.gae_lambda * alive * last
+        return advantages
+
+
+def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, advantages: torch.Tensor) -> dict:
+    """Improve actor and critic on a rollout, and return what is logged."""
+    returns = (advantages + rollout.values).flatten()
+    obs, actions = rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1)
+    old_logprobs, advantages = rollout.logprobs.flatten(), advantages.flatten()
+    losses = {}
+    for _ in range(args.update_epochs):
+        for batch in torch.randperm(len(obs)).chunk(args.num_minibatches):
+            distribution = agent.distribution(obs[batch])
+            logratio = distribution.log_prob(actions[batch]).sum(1) - old_logprobs[batch]
+            ratio = logratio.exp()
+            divergence = ((ratio - 1) - logratio).mean().item()
+            if divergence > args.target_kl:
+                return losses
+            advantage = (advantages[batch] - advantages[batch].mean()) / (advantages[batch].std() + 1e-8)
+            clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
+            policy_loss = -torch.min(advantage * ratio, advantage * clipped).mean()
+            value_loss = 0.5 * (agent.value(obs[batch]) - returns[batch]).square().mean()
+            loss = policy_loss + args.vf_coef * value_loss
+            optimizer.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)
+            optimizer.step()
+            losses = {"losses/policy_loss": policy_loss.item(), "losses/value_loss": value_loss.item()}
+            losses |= {"losses/approx_kl": divergence}
+    return losses
+
+
+def main(args: Args) -> Path:
+    """Train, and return the folder of the run."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    torch.manual_seed(args.seed)
+    random.seed(args.seed)
+    folder = Path("runs") / args.exp_name
+    writer, log = SummaryWriter(str(folder)), (folder / "log.jsonl").open("w")
+    envs, eval_envs = make_envs(args, args.num_envs), make_envs(args, args.num_eval_envs, ignore_terminations=True)
+    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0])
+    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
+    rollout, (obs, _), begin = Rollout(args, envs), envs.reset(seed=args.seed), time.time()
+    agent.watch(tensor(obs))
+    num_updates = args.total_timesteps // (args.num_envs * args.num_steps)
+    for iteration in range(num_updates + 1):
+        step = iteration * args.num_envs * args.num_steps
+        scalars = {}
+        if iteration % args.eval_freq == 0 or iteration == num_updates:
+            scalars |= evaluate(agent, eval_envs)
+        if iteration < num_updates:
+            obs, successes = rollout.collect(agent, envs, obs)
+            advantages = rollout.advantages(args, agent.value(tensor(obs)).detach())
+            scalars |= update(args, agent, optimizer, rollout, advantages)
+            agent.watch(rollout.obs.flatten(0, 1))
+            scalars |= {"train/reward": rollout.rewards.mean().item(), "charts/SPS": step / (time.time() - begin)}
+            scalars |= {"train/success_once": float(np.mean(successes))} if successes else {}
+        for name, value in scalars.items():
+            writer.add_scalar(name, value, step)
+        log.write(json.dumps(dict(step=step) | scalars) + "\n")
+        log.flush()
+        logging.info("%d: %s", step, {name: round(value, 3) for name, value in scalars.items()})
+    torch.save(agent.state_dict(), folder / "agent.pt")
+    for made in (envs, eval_envs):
+        made.close()
+    return folder
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))

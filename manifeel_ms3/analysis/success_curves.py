@@ -1,0 +1,127 @@
+"""Success over the course of training, from the evaluations of a run's checkpoints: a figure, and a table as csv.
+
+The figure's axis is the number of environment steps that training has seen: each sample of a batch begins at one recorded step
+of a demonstration, so this number is gradient steps times batch size, and runs with different batch sizes can be compared.
+"""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.files import write_text
+
+from .condition import Condition, condition_of
+from .estimates import Estimate, mean_success
+from .presets import setup_of
+from .protocol import collect
+
+PANEL, DPI = (5.0, 3.4), 130
+"""Width and height of a panel in inches, and resolution in pixels per inch."""
+COLUMNS = ("task", "variant", "sensing", "policy", "settings", "id", "gradient_steps", "environment_steps")
+MEASURES = ("success", "low", "high", "training_seeds", "episodes")
+"""Columns of the table: those that say what was trained, and those that say how it succeeds."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Success of a condition after some training."""
+
+    gradient_steps: int
+    environment_steps: int | None
+    """Gradient steps times batch size; None if the configuration does not name the batch size."""
+    success: Estimate
+    training_seeds: int
+    """Number of training seeds that were evaluated after so many steps."""
+    episodes: int
+    """Number of evaluation episodes of each."""
+
+
+def success_curves(results: Sequence[dict[str, Any]]) -> dict[Condition, list[Point]]:
+    """The success of each condition after each number of gradient steps that has results; two such numbers make a curve.
+
+    Args:
+        results: Contents of result files.
+
+    Raises:
+        ResultError: Two results are of the same checkpoint, or of different initial states.
+    """
+    by_step: dict[Condition, dict[int, list[dict[str, Any]]]] = {}
+    for result in results:
+        if isinstance(step := result["config"].get("step"), int):
+            by_step.setdefault(condition_of(result), {}).setdefault(step, []).append(result)
+    return {
+        condition: [_point(step, here) for step, here in sorted(steps.items())]
+        for condition, steps in by_step.items()
+        if len(steps) > 1
+    }
+
+
+def _point(step: int, results: list[dict[str, Any]]) -> Point:
+    (evaluated,) = collect(results).values()
+    batch_size = results[0]["config"].get("batch_size")
+    seeds, _, episodes = evaluated.success.shape
+    return Point(step, step * batch_size if isinstance(batch_size, int) else None, mean_success(evaluated), seeds, episodes)
+
+
+def curve_table(curves: dict[Condition, list[Point]]) -> str:
+    """The table of all curves as csv."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow((*COLUMNS, *MEASURES))
+    for condition, points in curves.items():
+        what = (condition.task, condition.variant, condition.sensing, condition.policy, str(setup_of(condition)), condition.key)
+        for point in points:
+            success = [round(number, 4) for number in (point.success.value, point.success.low, point.success.high)]
+            amount = (point.gradient_steps, point.environment_steps)
+            writer.writerow((*what, *amount, *success, point.training_seeds, point.episodes))
+    return out.getvalue()
+
+
+def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -> bool:
+    """Draw the curves, with one panel for each task, and write their table.
+
+    Args:
+        results: Contents of result files.
+        figure: Path of the figure.
+        table: Path of the csv file.
+
+    Returns:
+        Whether there is a curve; nothing is written without one.
+
+    Raises:
+        ResultError: Two results are of the same checkpoint, or of different initial states.
+        MissingExtraError: The extra `report`, which draws, is not installed.
+    """
+    with missing_extras_named():
+        from matplotlib.figure import Figure
+        from matplotlib.ticker import EngFormatter
+
+    curves = success_curves(results)
+    if not curves:
+        return False
+    tasks: dict[str, list[Condition]] = {}
+    for condition in sorted(curves, key=str):
+        tasks.setdefault(condition.task, []).append(condition)
+    fig = Figure(figsize=(PANEL[0] * len(tasks), PANEL[1]), layout="constrained")
+    for ax, (task, conditions) in zip(fig.subplots(1, len(tasks), squeeze=False)[0], tasks.items(), strict=True):
+        for condition in conditions:
+            _draw(ax, condition, [point for point in curves[condition] if point.environment_steps is not None])
+        ax.set(title=task, xlabel="environment steps trained on", ylabel="success", ylim=(-0.02, 1.02))
+        ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 400k
+        ax.legend(fontsize=6)
+    figure.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(figure, dpi=DPI)
+    write_text(table, curve_table({condition: curves[condition] for here in tasks.values() for condition in here}))
+    return True
+
+
+def _draw(ax: Any, condition: Condition, points: list[Point]) -> None:
+    seen = [point.environment_steps for point in points]
+    label = ", ".join(filter(None, (condition.variant, condition.sensing, condition.policy, str(setup_of(condition)))))
+    (line,) = ax.plot(seen, [point.success.value for point in points], label=label, lw=1.5, marker=".")
+    lows, highs = zip(*((point.success.low, point.success.high) for point in points), strict=True) if points else ((), ())
+    ax.fill_between(seen, lows, highs, color=line.get_color(), alpha=0.15, lw=0)

@@ -1,0 +1,68 @@
+"""The card of an exported LeRobot dataset: the README.md that the Hub shows."""
+
+import json
+from typing import Any
+
+FRONT = """---
+license: apache-2.0
+task_categories:
+- robotics
+tags:
+- LeRobot
+- tactile
+- simulation
+configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
+
+# {env_id}
+
+**Task:** {task}
+
+{episodes} demonstrations with {frames} frames at {fps} Hz, made in simulation with
+manifeel_ms3 {version} (revision {revision} of the task), by: {source}.
+The dataset has LeRobot's format {form}.
+
+| Feature | Type | Shape | Components |
+|---|---|---|---|
+"""
+BACK = """
+`observation.state` is the pose of the tool in the robot's base frame (m, quaternion wxyz). `observation.images.tactile_*` are
+what a GelSight pad's camera sees. `observation.tactile.<side>.force_field` are the forces on the taxels, in newtons, in the
+pad's frame: normal, and shear along rows and columns. Actions are in [-1, 1]. `next.reward`, `next.success` and `next.done`
+are those after the frame's action.
+
+The task was made with these arguments:
+
+```json
+{env_kwargs}
+```
+"""
+
+
+def card(header: dict[str, Any], task: str, info: dict[str, Any]) -> str:
+    """The text of the card.
+
+    Args:
+        header: The json beside the trajectory file.
+        task: Sentence of the task.
+        info: The content of meta/info.json.
+    """
+    about = dict(
+        env_id=header["env_info"]["env_id"].rpartition(":")[2],
+        task=task,
+        episodes=info["total_episodes"],
+        frames=info["total_frames"],
+        fps=info["fps"],
+        version=header.get("versions", {}).get("manifeel-ms3", "of unknown version"),
+        revision=header.get("revision", "not known"),
+        source=header.get("source_desc", "a source that is not named"),
+        form=info["codebase_version"],
+    )
+    rows = [
+        f"| `{name}` | {feature['dtype']} | {' x '.join(map(str, feature['shape']))} | {', '.join(feature['names'] or ())} |\n"
+        for name, feature in info["features"].items()
+    ]
+    kwargs = json.dumps(header["env_info"]["env_kwargs"], indent=2)
+    return FRONT.format(**about) + "".join(rows) + BACK.format(env_kwargs=kwargs)

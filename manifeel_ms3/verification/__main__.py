@@ -1,0 +1,172 @@
+"""Verify a tactile sensor: `manifeel verify-sensor gelsight_r15 --report sensor.html`.
+
+Known loads are pressed on the simulated pad, and one page says what the sensor reports of them: applied against reported force,
+centre of pressure, shear, hysteresis, depth, and the worst case of each beside its bound. The exit code is not 0 if a bound is
+broken.
+"""
+
+import base64
+import io
+import json
+import logging
+import sys
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+import tyro
+
+from manifeel_ms3.command_line import json_object, missing_extras_named, run
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.provenance import git_commit, machine, package_versions
+from manifeel_ms3.files import write_text
+from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
+from manifeel_ms3.sensors.visualisation import force_field_images
+
+from .checks import Check, checks_of
+from .loads import SHAPES, Measurements, measure
+
+with missing_extras_named():
+    import jinja2
+    from markupsafe import Markup
+
+log = logging.getLogger(__name__)
+TEMPLATE = Path(__file__).with_name("page.html.j2")
+COLOURS = ("#3a74c7", "#c7793a", "#4a9a5b", "#9a4a8f", "#8a8f98")
+"""Colours of the shapes in the figure."""
+FIGURE_SIZE = (12.0, 7.5)
+"""Width and height of the figure, in inches."""
+
+
+@dataclass
+class Args:
+    """Arguments of the command."""
+
+    sensor: tyro.conf.Positional[str] = DEFAULT_SENSOR
+    """Name of the sensor: gelsight_r15, gelsight_mini, digit, or one that another package registers."""
+    report: Path = Path("sensor.html")
+    """Path of the page that is written."""
+    tactile: str = "{}"
+    """Fields of the sensor's configuration to change, as json by dotted name, such as '{"gel.thickness": 0.003}'."""
+    imperfections: str = "{}"
+    """Amounts of the sensor's imperfections, as json by name."""
+    loads: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+    """Normal loads in N. A ball, which has one contact point, gets those that the gel carries alone."""
+
+
+def main(args: Args) -> int:
+    """Verify a sensor, write the page, and return the number of bounds that are broken.
+
+    Raises:
+        UnknownNameError: The sensor, a field or an imperfection is unknown.
+        InvalidArgumentError: A value is not allowed.
+        MissingExtraError: The extra `report` is not installed.
+        FileWriteError: The page cannot be written.
+    """
+    with missing_extras_named():
+        import matplotlib as _  # noqa: F401  (asked for before the first load)
+    tactile, imperfections = json_object("--tactile", args.tactile), json_object("--imperfections", args.imperfections)
+    if not args.loads or min(args.loads) <= 0:
+        raise InvalidArgumentError(f"--loads {args.loads} must be positive forces in N, such as 1 10")
+    config = task_sensor(args.sensor, "tactile_right", "gel_right", tactile, imperfections)
+    with progress_bar() as bar:
+        task = bar.add_task("pressing", total=len(SHAPES))
+
+        def on_shape(name: str) -> None:
+            bar.update(task, advance=1, description=f"pressing the {name}")
+
+        found = measure(args.sensor, args.loads, tactile, imperfections, on_shape)
+    checks = checks_of(found, config)
+    write_text(args.report, page(args.sensor, tactile | imperfections, found, checks))
+    for check in checks:
+        sign = "at least" if check.at_least else "at most"
+        state = "ok    " if check.holds else "BROKEN"
+        log.info("%s %s: %.3g %s (%s %g)", state, check.claim, check.worst, check.unit, sign, check.bound)
+    log.info("%s", args.report)
+    return sum(not check.holds for check in checks)
+
+
+def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list[Check]) -> str:
+    """The page as HTML that needs no other file."""
+    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
+        TEMPLATE.read_text(encoding="utf-8")
+    )
+    return template.render(
+        sensor=sensor,
+        changes=json.dumps(changes) if changes else "",
+        date=datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
+        versions=package_versions(),
+        commit=git_commit(),
+        machine=machine(),
+        checks=checks,
+        figure=Markup(figure(found)),
+        strip=_strip(found),
+        names=[picture.shape for picture in found.pictures],
+        readings=found.readings,
+    )
+
+
+def _strip(found: Measurements) -> str:
+    """TacRGB over force field of every shape, as a PNG in base64."""
+    columns = []
+    for picture in found.pictures:
+        height, width = picture.rgb.shape[:2]
+        field = force_field_images(torch.as_tensor(picture.force_field)[None], (height, width))[0].numpy()
+        columns.append(np.vstack([picture.rgb, field]))
+    return base64.b64encode(cv2.imencode(".png", np.hstack(columns)[..., ::-1])[1].tobytes()).decode()
+
+
+def figure(found: Measurements) -> str:
+    """The measurements as an SVG."""
+    from matplotlib.figure import Figure
+
+    drawn = Figure(figsize=FIGURE_SIZE, layout="constrained")
+    axes = drawn.subplots(2, 3)
+    _draw_forces(axes[0, 0], found)
+    for name, colour in zip(SHAPES, COLOURS, strict=True):
+        rows = [reading for reading in found.readings if reading.shape == name]
+        load = [reading.applied[0] for reading in rows]
+        axes[0, 1].loglog(load, [1e3 * max(reading.centre_error, 1e-8) for reading in rows], "o-", color=colour, label=name)
+        for k, mark in ((1, "o"), (2, "s")):
+            axes[0, 2].plot([r.applied[k] for r in rows], [r.reported[k] for r in rows], mark, color=colour, ms=4)
+        axes[1, 0].plot([1e3 * r.on_pad[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=4)
+    axes[0, 1].set(title="centre of pressure", xlabel="normal load, N", ylabel="distance from the load's, mm")
+    axes[0, 2].set(title="shear: rows (dots), columns (squares)", xlabel="applied, N", ylabel="reported, N")
+    axes[1, 0].set(title="moment about the normal", xlabel="on the pad, N mm", ylabel="reported, N mm")
+    for axis in (axes[0, 2], axes[1, 0]):
+        axis.axline((0, 0), slope=1, color="black", lw=0.6)
+    top = int(found.loop[:, 0].argmax())
+    axes[1, 1].plot(*found.loop[: top + 1].T, "o-", color=COLOURS[0], label="loading")
+    axes[1, 1].plot(*found.loop[top:].T, "s--", color=COLOURS[1], label="unloading")
+    axes[1, 1].set(title="loading and unloading", xlabel="applied, N", ylabel="reported, N")
+    axes[1, 2].plot(found.depths[:, 0], 1e3 * found.depths[:, 1], "o", color=COLOURS[0], label="sensor")
+    axes[1, 2].plot(found.depths[:, 0], 1e3 * found.depths[:, 2], "-", color="black", lw=0.8, label="law of the layer")
+    axes[1, 2].set(title="depth of the ball", xlabel="normal load, N", ylabel="depth, mm")
+    for axis in (axes[1, 1], axes[1, 2]):
+        axis.legend(fontsize=8)
+    text = io.StringIO()
+    drawn.savefig(text, format="svg")
+    return text.getvalue()[text.getvalue().index("<svg") :]
+
+
+def _draw_forces(axis: Any, found: Measurements) -> None:
+    """Reported against applied normal force, and what the penalty field says, scaled to newtons by one factor for all."""
+    pairs = [(r.penalty_sum, r.applied[0]) for r in found.readings if r.penalty_sum > 0]
+    scale = float(np.exp(np.mean([np.log(load / indented) for indented, load in pairs]))) if pairs else 1.0
+    for name, colour in zip(SHAPES, COLOURS, strict=True):
+        rows = [reading for reading in found.readings if reading.shape == name]
+        load = [reading.applied[0] for reading in rows]
+        axis.loglog(load, [max(reading.reported[0], 1e-6) for reading in rows], "o", color=colour, label=name)
+        axis.loglog(load, [max(scale * reading.penalty_sum, 1e-6) for reading in rows], ":", color=colour, lw=1)
+    axis.axline((1, 1), (10, 10), color="black", lw=0.6)
+    axis.set(title='normal force; dotted: units="tacsl", scaled', xlabel="applied, N", ylabel="sum of the field, N")
+    axis.legend(fontsize=7)
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, tyro.cli(Args)))

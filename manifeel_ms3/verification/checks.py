@@ -1,0 +1,82 @@
+"""What a sensor must hold, and the worst of what was measured beside it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from manifeel_ms3.sensors.config import OpticsConfig, TactileSensorConfig
+
+from .loads import Measurements
+from .published_colours import worst_similarity
+
+FORCE_BOUND = 0.01
+"""Largest relative error of the force field's sums."""
+CENTRE_BOUND = 0.5e-3
+"""Largest distance of the centre of pressure from the load's, in m."""
+LOOP_BOUND = 0.01
+"""Largest area between loading and unloading, as a share of the area under the loading curve."""
+DEPTH_BOUND = 2e-5
+"""Largest error of the depth of a ball, in m."""
+SIMILARITY_BOUND = 0.90
+"""Smallest structural similarity of the change images with those of a published calibration."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One claim."""
+
+    claim: str
+    worst: float
+    """Worst value that was measured."""
+    bound: float
+    unit: str
+    at_least: bool = False
+    """Whether the value must be at least the bound; otherwise at most."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether the bound is kept; a value that is no number breaks it."""
+        return bool(self.worst >= self.bound if self.at_least else self.worst <= self.bound)
+
+
+def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
+    """The checks of a sensor."""
+    normal = [abs(r.reported[0] / r.applied[0] - 1) for r in found.readings]
+    shear = [np.abs(r.reported[1:3] - r.applied[1:3]).max() / r.applied[0] for r in found.readings]
+    pad = [np.abs(r.reported[:3] - r.on_pad[:3]).max() / r.applied[0] for r in found.readings]
+    twist = [abs(r.reported[3] - r.on_pad[3]) / r.applied[0] for r in found.readings]
+    centre = [r.centre_error for r in found.readings]
+    depth = np.abs(found.depths[:, 1] - found.depths[:, 2])
+    checks = [
+        Check("normal force: sum of the field against the load applied", 100 * max(normal), 100 * FORCE_BOUND, "%"),
+        Check(
+            "shear: sums of the field against the load applied, of the normal load", 100 * max(shear), 100 * FORCE_BOUND, "%"
+        ),
+        Check(
+            "force: sums of the field against the force on the pad, of the normal load", 100 * max(pad), 100 * FORCE_BOUND, "%"
+        ),
+        Check("moment about the normal: error over the normal load", 1e3 * max(twist), 1e3 * CENTRE_BOUND, "mm"),
+        Check("centre of pressure", 1e3 * max(centre), 1e3 * CENTRE_BOUND, "mm"),
+        Check("loading and unloading: area of the loop", 100 * loop_area(found.loop), 100 * LOOP_BOUND, "%"),
+        Check("depth of a ball against the law of the gel layer", 1e3 * float(depth.max()), 1e3 * DEPTH_BOUND, "mm"),
+    ]
+    if has_published_colours(config):
+        similarity = Check(
+            "colours against the published calibration, SSIM", worst_similarity(config), SIMILARITY_BOUND, "", True
+        )
+        checks.append(similarity)
+    return checks
+
+
+def loop_area(loop: np.ndarray) -> float:
+    """Area between loading and unloading (n, 2) as a share of the area under loading."""
+    top = int(loop[:, 0].argmax())
+    up, down = loop[: top + 1], loop[top:]
+    areas = [abs(float(np.sum(np.diff(part[:, 0]) * (part[1:, 1] + part[:-1, 1]) / 2))) for part in (up, down)]
+    return abs(areas[1] - areas[0]) / areas[0]
+
+
+def has_published_colours(config: TactileSensorConfig) -> bool:
+    """Whether a published table of the sensor's colours is at hand: that of the GelSight R1.5."""
+    default = OpticsConfig()
+    return config.optics.lights is None and config.optics.calibration == default.calibration

@@ -1,0 +1,181 @@
+"""Known loads on a sensor: what was applied, what the sensor reports, and what a penalty field would say."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import brentq
+
+from manifeel_ms3.agents.panda_gelsight import GEL_STIFFNESS
+from manifeel_ms3.sensors import TactileSensor, with_options
+from manifeel_ms3.sensors.config import GelConfig
+
+from .press import Press, indenter
+
+BALL_RADIUS = 0.010
+"""Radius of the ball, in m."""
+PLACE = (1e-3, -2e-3)
+"""Point of the pad over which objects are pressed, in m, so that nothing is symmetric."""
+SHEAR_SHARES = (0.25, -0.15)
+"""Shear along rows and columns as shares of the normal load; the gel's contact holds 0.65 of it."""
+TWIST_ARM = 4e-4
+"""Moment about the normal over the normal load, in m."""
+PICTURED_LOAD = 10.0
+"""Load under which pictures are taken, in N."""
+LOOP_LOADS = (2.0, 4.0, 6.0, 8.0, 10.0)
+"""Loads, in N, of the loop of loading and unloading, which begins and ends at 0."""
+DEPTH_LOADS = (1.0, 3.0, 10.0)
+"""Loads, in N, of a ball whose depth is compared with the law of the gel layer."""
+CLEARANCE = 2e-4
+"""Height over the pad at which an object begins, in m."""
+SHAPES: dict[str, tuple[dict[str, Any], float]] = {
+    "ball, 10 mm": (dict(radius=BALL_RADIUS), BALL_RADIUS),
+    "ball, 6 mm": (dict(radius=0.006), 0.006),
+    "rod, 6 mm": (dict(radius=0.006, half_length=0.006), 0.006),
+    "box, 8 x 10 mm": (dict(half_size=[0.004, 0.005, 0.004]), 0.004),
+    "plate, 12 x 16 mm": (dict(half_size=[0.006, 0.008, 0.004]), 0.004),
+}
+"""Indenters: arguments of `indenter`, and the height of the body's origin over the face when it touches, in m."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One load and what the sensor says of it. Loads are normal, shear along rows and columns (N), moment (N m)."""
+
+    shape: str
+    applied: np.ndarray
+    """The load that pushes the object, (4,)."""
+    on_pad: np.ndarray
+    """The load that the engine carries through the pad's joint, (4,)."""
+    reported: np.ndarray
+    """The sums over the force field, (4,)."""
+    centre_error: float
+    """Distance of the field's centre of pressure from the load's, m."""
+    penalty_sum: float
+    """Sum of the normal components of the field with units="tacsl", m."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """TacRGB and force field under one load."""
+
+    shape: str
+    rgb: np.ndarray
+    """(H, W, 3) uint8."""
+    force_field: np.ndarray
+    """(rows, cols, 3), N."""
+
+
+@dataclass
+class Measurements:
+    """Everything that was measured on one sensor."""
+
+    readings: list[Reading]
+    pictures: list[Picture]
+    loop: np.ndarray
+    """Loading and unloading (n, 2): applied and reported normal force, N."""
+    depths: np.ndarray
+    """A ball in the middle of the pad (n, 3): load in N, depth, and depth by the law of the layer, m."""
+
+
+def measure(
+    sensor: str,
+    loads: tuple[float, ...],
+    tactile: Mapping[str, Any] | None = None,
+    imperfections: Mapping[str, Any] | None = None,
+    on_shape: Callable[[str], None] = lambda _name: None,
+) -> Measurements:
+    """Press the shapes on a sensor's simulated pad.
+
+    Args:
+        sensor: Name of the sensor.
+        loads: Normal loads, N.
+        tactile: Fields of the sensor's configuration to change, by dotted name.
+        imperfections: Amounts of its imperfections, by name.
+        on_shape: Called with the name of each shape before it is pressed.
+
+    Raises:
+        UnknownNameError: The sensor, a field or an imperfection is unknown.
+        InvalidArgumentError: A value is not allowed.
+    """
+    arguments: dict[str, Any] = dict(sensor=sensor, tactile=tactile, imperfections=imperfections)
+    found = Measurements([], [], np.zeros((0, 2)), np.zeros((0, 3)))
+    for name, (shape, touching) in SHAPES.items():
+        on_shape(name)
+        press = Press(indenter(name, **shape), **arguments)
+        found.readings += _readings(press, name, touching, loads)
+        found.pictures.append(_picture(press, name, touching))
+        if name.startswith("box"):
+            found.loop = _loop(press, touching)
+        if name == "ball, 10 mm":
+            found.depths = _depths(press, touching)
+        press.close()
+    return found
+
+
+def largest_load(press: Press, name: str) -> float:
+    """Largest load, N, that the engine's gel carries: a ball has one contact point, and would reach the housing."""
+    stiffness = GEL_STIFFNESS / 2 * (1 if name.startswith("ball") else 4)  # PhysX averages it with the other body's 0
+    return 0.9 * stiffness * press.sensor.config.housing.protrusion
+
+
+def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]) -> Iterator[Reading]:
+    config = with_options(press.sensor.config, {"units": "tacsl"})
+    penalty = TactileSensor(config, press.env.scene, press.env.agent.robot, ("force_field",))
+    for load in loads:
+        if load > largest_load(press, name):
+            continue
+        twist = 0.0 if name.startswith("ball") else TWIST_ARM * load  # a ball on a point contact would spin
+        applied = np.array([load, *(share * load for share in SHEAR_SHARES), twist])
+        press.place(touching + CLEARANCE, *PLACE)
+        press.push(*applied)
+        penalty.reset(torch.arange(1))
+        penalty.capture()
+        indented = penalty.get_obs()["force_field"][..., 0].sum().item()
+        yield Reading(name, applied, press.wrench, press.sums, press.centre_error, indented)
+
+
+def _picture(press: Press, name: str, touching: float) -> Picture:
+    sensor = TactileSensor(press.sensor.config, press.env.scene, press.env.agent.robot)
+    load = min(PICTURED_LOAD, largest_load(press, name))
+    press.place(touching + CLEARANCE, *PLACE)
+    press.push(load, *(share * load for share in SHEAR_SHARES))
+    sensor.capture()
+    return Picture(name, sensor.get_obs()["rgb"][0].cpu().numpy(), press.field)
+
+
+def _loop(press: Press, touching: float) -> np.ndarray:
+    press.place(touching + CLEARANCE, *PLACE)
+    points = [(0.0, 0.0)]
+    for load in (*LOOP_LOADS, *LOOP_LOADS[-2::-1], 0.0):
+        press.push(load, seconds=0.05)
+        points.append((load, press.sums[0]))
+    return np.array(points)
+
+
+def _depths(press: Press, touching: float) -> np.ndarray:
+    rows, gel = [], press.sensor.config.gel
+    for load in DEPTH_LOADS:
+        press.place(touching + CLEARANCE)
+        press.push(load)
+        rows.append((load, press.depth.max(), ball_depth(gel, BALL_RADIUS, press.wrench[0])))
+    return np.array(rows)
+
+
+def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
+    """Depth, m, to which a load, N, presses a ball of a radius, m, into the middle of the gel, by the law of the layer.
+
+    The pressure is `gel.normal_stiffness` times the penetration, summed over a finer grid than the sensor's.
+    """
+    sides = [np.linspace(-extent / 2, extent / 2, 401) for extent in gel.size]
+    x, y = np.meshgrid(*sides, indexing="ij")
+    area = np.prod([side[1] - side[0] for side in sides])
+    r2 = x**2 + y**2
+    gap = np.where(r2 < radius**2, radius - np.sqrt(np.maximum(radius**2 - r2, 0.0)) + gel.sag(x, y), np.inf)
+
+    def excess(depth: float) -> float:
+        return gel.normal_stiffness * area * np.maximum(depth - gap, 0.0).sum() - load
+
+    return float(brentq(excess, 0.0, radius / 2))

@@ -1,0 +1,99 @@
+"""The published calibration of the GelSight R1.5, read with interpolation, and how similar the sensor's images are to it."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from manifeel_ms3.paths import data_dir
+from manifeel_ms3.sensors.config import TactileSensorConfig
+from manifeel_ms3.sensors.mechanics.contact import ContactGrid
+from manifeel_ms3.sensors.optics.tacrgb import Optics
+from manifeel_ms3.sensors.optics.taxim_table import portrait_place
+from manifeel_ms3.sensors.touch_model import CONTACT_CELL
+
+CALIBRATION = data_dir() / "gelsight_r15_polycalib_subset.npz"
+"""The slope bins up to 1.2 rad of Taxim's table of a GelSight R1.5 (NOTICE), in int16."""
+SSIM_WINDOW = 1.5
+"""Standard deviation of the windows of the structural similarity, in pixels (Wang et al. 2004)."""
+
+
+def published_table(path: Path = CALIBRATION) -> np.ndarray:
+    """The table (3, bins, bins, 6) in Taxim's format; bins beyond 1.2 rad are zero."""
+    with np.load(path) as stored:
+        kept, bins = stored["coefficients"] * stored["scale"], int(stored["bins"])
+    table = np.zeros((3, bins, *kept.shape[2:]))
+    table[:, : kept.shape[1]] = kept
+    return table
+
+
+def gradients(surface: np.ndarray, pixel_size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Central differences (H, W) along rows and columns of a surface (H, W), m/m."""
+    padded = np.pad(surface, 1, mode="edge")
+    return (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * pixel_size), (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * pixel_size)
+
+
+def places(shape: tuple[int, int]) -> list[np.ndarray]:
+    """Normalised rows and columns (H, W) of an image, in [-1, 1]."""
+    return list(np.meshgrid(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), indexing="ij"))
+
+
+def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> np.ndarray:
+    """Colour change (H, W, 3) of a surface (H, W), m, by a table in Taxim's format, interpolated between its bins' middles."""
+    along_rows, along_cols = gradients(surface, pixel_size)
+    slope, phi = np.arctan(np.hypot(along_rows, along_cols)), np.arctan2(-along_cols, along_rows)
+    last = table.shape[1] - 1
+    change = table - table[:, :1, last // 2 + 1 : last // 2 + 2]
+    change[:, 0] = 0.0
+    u = np.clip(slope / (np.pi / 2 / last) - 0.5, 0, last - 1e-3)
+    v = ((phi + np.pi) / (2 * np.pi / last) - 0.5) % last
+    i, j = u.astype(int), v.astype(int)
+    shape = (surface.shape[0], surface.shape[1])
+    terms = portrait_place(*places(shape), shape)
+    total = np.zeros((*shape, 3))
+    for rows, row_share in ((i, 1 - (u - i)), (i + 1, u - i)):
+        for cols, col_share in ((j, 1 - (v - j)), ((j + 1) % last, v - j)):
+            total += (row_share * col_share)[..., None] * np.einsum("khwq,hwq->hwk", change[:, rows, cols], terms)
+    return total
+
+
+def ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Structural similarity (Wang et al. 2004) of two pictures (H, W, 3), with the range of the second."""
+    span = b.max() - b.min()
+    c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+
+    def mean(picture: np.ndarray) -> np.ndarray:
+        return gaussian_filter(picture, SSIM_WINDOW, axes=(0, 1))
+
+    ma, mb = mean(a), mean(b)
+    va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb
+    return float((((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean())
+
+
+def pressed_shapes(config: TactileSensorConfig) -> dict[str, np.ndarray]:
+    """Heights (H, W), m, of shapes over the untouched face, into it."""
+    x, y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * config.pixel_size for n in config.image_shape), indexing="ij")
+    return {
+        "ball": np.sqrt(np.maximum(0.004**2 - x**2 - y**2, 0)) - 0.004 + 6e-4,
+        "rod": np.where(np.abs(y) < 0.008, np.sqrt(np.maximum(0.004**2 - x**2, 0)) - 0.004 + 5e-4, -1),
+        "tilted plate": np.where((np.abs(x) < 0.004) & (np.abs(y) < 0.005), 4e-4 + 0.02 * x, -1),
+        "wedge": np.where(np.abs(y) < 0.007, 5e-4 - 0.5 * np.abs(x), -1),
+    }
+
+
+def change_images(optics: Optics, height: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Changes (H, W, 3) from the untouched gel's image under a shape: the sensor's, and that of a published table."""
+    surface = optics.surface(torch.as_tensor(height.clip(min=0), dtype=torch.float32)[None])
+    background = optics.levels.cpu().numpy()
+    change = optics.shade(surface)[0].cpu().numpy() - background
+    published = table_change(table, surface[0].double().cpu().numpy(), optics.config.pixel_size)
+    return change, (background + published).clip(0, 255) - background
+
+
+def worst_similarity(config: TactileSensorConfig) -> float:
+    """Smallest structural similarity, over the shapes, of the sensor's change images with the published table's."""
+    cpu = torch.device("cpu")
+    optics = Optics(config, ContactGrid.covering(config.gel.size, CONTACT_CELL, cpu), 1, cpu)
+    table = published_table()
+    return min(ssim(*change_images(optics, height, table)) for height in pressed_shapes(config).values())

@@ -1,0 +1,68 @@
+"""Ranks are compared as scipy and SimplerEnv do, and appear on the page of results once there is something to rank."""
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.analysis import results_page
+from manifeel_ms3.analysis.paper import MODES, paper_condition
+from manifeel_ms3.analysis.protocol import ConditionResults
+from manifeel_ms3.analysis.rank_agreement import Ranked, agreement_of, mean_tau, rank_violation
+
+from .made_up import write_run
+
+ALL = [[0, 1, 2, 3]]
+PAPER = np.array([0.1, 0.2, 0.4, 0.8])
+
+
+def ranked(rates: list[float], task: str = "PegInsertion") -> list[Ranked]:
+    rng = np.random.default_rng(0)
+    found = []
+    for mode, paper, rate in zip((*MODES, "rgb"), PAPER, rates, strict=True):
+        success = (rng.random((3, 10, 50)) < rate).astype(float)
+        found.append(Ranked(paper_condition(task, mode), paper, ConditionResults(success, list(range(50)))))
+    return found
+
+
+def test_the_same_order_agrees_and_the_reverse_does_not():
+    ours = np.array([0.0, 0.3, 0.5, 0.6])
+    assert (mean_tau(PAPER, ours, ALL), rank_violation(PAPER, ours, ALL)) == (1.0, 0.0)
+    assert mean_tau(PAPER, -ours, ALL) == -1.0
+    assert rank_violation(PAPER, -ours, ALL) == pytest.approx((0.7 + 0.6 + 0.4 + 0.7) / 4)  # the widest gap of each
+
+
+def test_one_wrong_pair_costs_its_gap_in_the_paper():
+    ours = np.array([0.3, 0.2, 0.5, 0.6])  # the first two, 0.1 apart in the paper, have changed places
+    assert mean_tau(PAPER, ours, ALL) == pytest.approx(4 / 6)  # five pairs of six agree, one does not
+    assert rank_violation(PAPER, ours, ALL) == pytest.approx((0.1 + 0.1) / 4)
+
+
+def test_groups_are_compared_within_themselves():
+    ours = np.array([0.7, 0.8, 0.1, 0.2])  # wrong between the groups, right within each
+    assert mean_tau(PAPER, ours, [[0, 1], [2, 3]]) == 1.0
+    assert rank_violation(PAPER, ours, [[0, 1], [2, 3]]) == 0.0
+    assert mean_tau(PAPER, np.full(4, 0.5), ALL) == 0.0  # nothing is ranked
+
+
+def test_intervals_hold_the_value_and_shrink_with_what_is_certain():
+    tau, violation = agreement_of(ranked([0.1, 0.4, 0.7, 0.95]), ALL)
+    assert (tau.value, tau.low, tau.high) == (1.0, 1.0, 1.0)
+    assert violation.high == 0.0
+    tau, violation = agreement_of(ranked([0.5, 0.5, 0.5, 0.5]), ALL)
+    assert tau.low < 0 < tau.high
+    assert violation.low <= violation.value <= violation.high
+    assert violation.high > 0.3
+
+
+def test_the_page_ranks_three_conditions_or_more(tmp_path):
+    for mode, rate in zip(MODES, (0.2, 0.3, 0.6), strict=True):
+        page = (
+            results_page.main(results_page.Args((tmp_path / "runs",), tmp_path / "results.md")).read_text()
+            if rate > 0.2
+            else ""
+        )
+        assert "## Ranks" not in page
+        for seed in range(3):
+            write_run(tmp_path / "runs", mode, rate, seed, checkpoints=3)
+    page = results_page.main(results_page.Args((tmp_path / "runs",), tmp_path / "results.md")).read_text()
+    assert "| I | paper | within tasks | 3 | 1.00 [" in page
+    assert "| 0.00 [0.00, " in page

@@ -1,0 +1,54 @@
+"""The command that measures failure floors, on the real simulator."""
+
+import json
+
+import numpy as np
+import pytest
+
+from baselines import floors
+from baselines.references import RandomActions
+from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.evaluation.floors import POLICIES, SCHEMA, floors_file, floors_of, highest_floor
+from manifeel_ms3.tasks.registry import task_spec
+from tests.conftest import PEG, needs_renderer
+
+NUT, SEARCH = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-ObjectSearch-v1"
+
+
+def test_random_actions_are_drawn_by_the_seed_of_the_episode():
+    policy = RandomActions(PEG)
+    policy.begin_episode(3)
+    first = [policy.act({}) for _ in range(4)]
+    policy.begin_episode(3)
+    assert np.array_equal(first, [policy.act({}) for _ in range(4)])
+    policy.begin_episode(4)
+    assert not np.array_equal(first[0], policy.act({}))
+    assert np.abs(first).max() <= 1
+    assert len(first[0]) == 6
+    assert len(RandomActions(PEG, "pd_ee_delta_yaw").act({})) == 5
+
+
+def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
+    """Random fingers let go of the nut in the first steps."""
+    spec, mean = task_spec(NUT), dict(episodes=7, rate=0.5, low=0.25, high=0.75)
+    about = dict(schema=SCHEMA, env_id=NUT, revision=spec.revision, git_commit=None, command="made up")
+    floors_file(NUT, tmp_path).write_text(json.dumps(about | dict(floors={"mean action": mean})))
+    (path,) = floors.main(floors.Args((NUT,), ("random",), episodes=1, out=tmp_path))
+    found = floors_of(NUT, spec.revision, tmp_path)
+    assert {name: (one.episodes, one.rate) for name, one in found.items()} == {"random": (1, 0.0), "mean action": (7, 0.5)}
+    assert highest_floor(NUT, spec.revision, folder=tmp_path).policy == "mean action"
+    assert floors._earlier(path, spec.revision + 1) == {}  # floors of another revision are not kept
+
+
+@pytest.mark.slow
+@needs_renderer
+def test_all_policies_are_measured(tmp_path):
+    floors.main(floors.Args((SEARCH,), episodes=2, out=tmp_path))
+    found = floors_of(SEARCH, task_spec(SEARCH).revision, tmp_path)
+    assert list(found) == list(POLICIES)
+    assert all(floor.episodes == 2 for floor in found.values())
+
+
+def test_missing_demonstrations_are_named(tmp_path):
+    with pytest.raises(DemonstrationError, match=r"has no trajectory file with rgb\+tacff; record one"):
+        floors.main(floors.Args((NUT,), episodes=1, demos=tmp_path, out=tmp_path))

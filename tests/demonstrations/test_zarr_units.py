@@ -1,0 +1,89 @@
+"""A zarr store says in which units its touch is, and touch in different units is never mixed or evaluated unawares."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from baselines.common.dataset import recorded_env_kwargs
+from manifeel_ms3.demonstrations import DemonstrationError, export
+from manifeel_ms3.demonstrations.formats.diffusion_policy_zarr import recorded_arguments
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.paths import data_dir
+from tests.conftest import PEG
+from tests.trust.tiny_checkpoint import save_tiny_checkpoint
+
+zarr = pytest.importorskip("zarr")
+SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+FIELD = "sensor_data/tactile_right/force_field"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return export.main(export.Args(SAMPLE, "zarr", tmp_path_factory.mktemp("export") / "store"))
+
+
+@pytest.fixture
+def papers_store(store, tmp_path) -> Path:
+    """The same arrays without a word on their units, as in the paper's data."""
+    folder = shutil.copytree(store, tmp_path / "papers")
+    (folder / ".zattrs").unlink()
+    return folder
+
+
+def read(folder: Path, env_id: str | None = None) -> np.ndarray:
+    from manifeel_ms3.demonstrations.formats import format_of
+
+    return format_of(folder).read(folder, [FIELD], num=1, env_id=env_id)[0][FIELD]
+
+
+def test_the_store_names_its_task_its_arguments_and_its_units(store):
+    about = json.loads((store / ".zattrs").read_text())
+    assert (about["env_id"], about["force_field_units"]) == (PEG, "newton")
+    assert recorded_arguments(store) == json.loads(SAMPLE.with_suffix(".json").read_text())["env_info"]["env_kwargs"]
+    assert recorded_env_kwargs([store, SAMPLE]) == recorded_env_kwargs([SAMPLE])
+    assert read(store, PEG)[..., 0].max() > 0.02  # N
+    with pytest.raises(DemonstrationError, match="not of ManiFeel-USBInsertion-v1"):
+        read(store, "ManiFeel-USBInsertion-v1")
+
+
+def test_newtons_without_a_word_are_not_taken_for_the_papers_penetration(papers_store):
+    with pytest.raises(DemonstrationError, match="does not say in which units"):
+        read(papers_store)
+
+
+def test_the_papers_data_are_in_the_papers_units_and_not_mixed_with_newtons(papers_store):
+    fields = zarr.open_array(str(papers_store / "data/tactile_force_field_right"), mode="r+")
+    fields[:] = 1e-3 * fields[:]
+    assert read(papers_store)[..., 0].max() < 0.02
+    assert recorded_env_kwargs([papers_store]) == {"tactile": {"units": "tacsl"}}
+    with pytest.raises(DemonstrationError, match="train on files that were recorded with the same"):
+        recorded_env_kwargs([papers_store, SAMPLE])
+
+
+def test_broken_attributes_are_named(store, tmp_path):
+    folder = shutil.copytree(store, tmp_path / "broken")
+    (folder / ".zattrs").write_text('{"env_kwargs": 3}')
+    with pytest.raises(DemonstrationError, match=r"\.zattrs.*export the data set again"):
+        recorded_arguments(folder)
+
+
+def test_a_checkpoint_is_evaluated_with_the_sensor_and_units_of_its_demonstrations(tmp_path, caplog):
+    checkpoint = save_tiny_checkpoint(tmp_path / "checkpoint")
+    config = json.loads((checkpoint / "config.json").read_text())
+    learnt = dict(sensor="digit", tactile={"units": "tacsl"}, lighting="dim")
+    (checkpoint / "config.json").write_text(json.dumps(config | dict(env_id=PEG, env_kwargs=learnt)))
+
+    def kwargs(**given) -> dict:
+        return evaluate.evaluation_from_args(evaluate.Args(checkpoint, **given)).env_kwargs
+
+    assert kwargs().items() >= learnt.items()
+    assert kwargs(sensor="digit") == kwargs()
+    with pytest.raises(InvalidArgumentError, match=r"--sensor gelsight_mini.*recorded with digit.*--env-kwargs"):
+        kwargs(sensor="gelsight_mini")
+    other = kwargs(env_kwargs='{"sensor": "gelsight_mini"}')
+    assert (other["sensor"], other["tactile"]) == ("gelsight_mini", {"units": "tacsl"})
+    assert "sensor is 'gelsight_mini' here, but 'digit'" in caplog.text

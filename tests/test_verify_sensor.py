@@ -1,0 +1,77 @@
+"""`manifeel verify-sensor`: the page, the bounds and the exit code."""
+
+import re
+
+import numpy as np
+import pytest
+
+from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
+from manifeel_ms3.sensors import GelConfig
+from manifeel_ms3.verification.__main__ import Args, main
+from manifeel_ms3.verification.checks import Check, loop_area
+from manifeel_ms3.verification.loads import SHAPES, ball_depth
+
+pytest.importorskip("jinja2")
+
+
+@pytest.fixture
+def two_shapes(monkeypatch):
+    """A box and a ball, so that it takes seconds."""
+    for name in [name for name in SHAPES if name not in ("ball, 10 mm", "box, 8 x 10 mm")]:
+        monkeypatch.delitem(SHAPES, name)
+    monkeypatch.setattr("manifeel_ms3.verification.loads.LOOP_LOADS", (5.0, 10.0))
+    monkeypatch.setattr("manifeel_ms3.verification.loads.DEPTH_LOADS", (3.0,))
+    monkeypatch.setattr("manifeel_ms3.verification.__main__.COLOURS", ("red", "blue"))
+
+
+def test_a_sound_sensor_has_a_page_and_exit_code_0(two_shapes, tmp_path):
+    page = tmp_path / "sensor.html"
+    assert run(main, Args("digit", report=page, loads=(0.1, 10.0))) == 0
+    text = page.read_text()
+    for wanted in ("digit", "manifeel-ms3", "commit", "centre of pressure", "<svg", "ball, 10 mm", "data:image/png;base64,"):
+        assert wanted in text
+    assert text.count(">holds<") == 7  # no published colours of a DIGIT
+    assert ">broken<" not in text
+    assert not re.search(r'(src|href)="http', text)  # needs nothing else
+
+
+def test_a_broken_bound_is_shown_and_the_exit_code_is_not_0(two_shapes, tmp_path):
+    page = tmp_path / "sensor.html"
+    arguments = dict(tactile='{"gel.friction": 0.1}', imperfections='{"gain": 0.5, "hysteresis": 0.2}', loads=(3.0,))
+    assert run(main, Args("gelsight_r15", report=page, **arguments)) == 1
+    text = page.read_text()
+    for broken in ("normal force", "shear", "loading and unloading"):
+        row = text[text.index(f"<td>{broken}") :]
+        assert row[: row.index("</tr>")].count("broken") == 2, broken  # the class and the word
+    assert "gel.friction" in text
+
+
+def test_what_cannot_be_verified_is_named(tmp_path):
+    with pytest.raises(UnknownNameError, match="choose from"):
+        main(Args("biotac"))
+    with pytest.raises(UnknownNameError, match="wobble"):
+        main(Args(imperfections='{"wobble": 1}'))
+    with pytest.raises(InvalidArgumentError, match="positive forces"):
+        main(Args(loads=(1.0, -3.0)))
+    with pytest.raises(InvalidArgumentError, match="folds"):
+        main(Args("digit", tactile='{"gel.curvature": [80.0, 80.0]}'))
+
+
+def test_value_that_is_no_number_breaks_a_bound():
+    assert not Check("", float("nan"), 1.0, "").holds
+    assert not Check("", float("nan"), 1.0, "", at_least=True).holds
+    assert Check("", 0.95, 0.9, "", at_least=True).holds
+
+
+def test_area_of_a_loop():
+    loop = np.array([(0, 0), (5, 5), (10, 10), (5, 7), (0, 0)], float)
+    assert loop_area(loop) == pytest.approx((0.5 * 10 * 2) / 50)
+
+
+@pytest.mark.parametrize(("curvature", "radius"), [(0.0, 0.01), (20.0, 0.01)])
+def test_depth_of_a_ball_by_the_law_of_the_layer(curvature, radius):
+    gel = GelConfig(curvature=(curvature, curvature))
+    both = 1 / (1 / radius + curvature)  # m, of a ball that leaves the same gap over a flat face
+    load = np.pi * gel.normal_stiffness * both * 5e-4**2
+    assert ball_depth(gel, radius, load) == pytest.approx(5e-4, rel=0.02)
