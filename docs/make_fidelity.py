@@ -250,7 +250,7 @@ def read_from_the_code() -> dict[str, Any]:
         image_size=env.IMAGE_SIZE,
         field_of_view=np.rad2deg(env.FIELD_OF_VIEW),
         dim=env.LIGHTING["dim"],
-        save_every=TrainArgs(demos=()).save_every,
+        save_freq=TrainArgs(demos=()).save_freq,
     )
 
 

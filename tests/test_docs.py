@@ -110,7 +110,7 @@ def shelf(tmp_path_factory) -> Path:
     module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
     (shelf / "my_module.py").write_text(module[1])
     flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
-    evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
+    evaluated = ["--num-eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(
         tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
     )
