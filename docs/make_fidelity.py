@@ -251,7 +251,7 @@ def read_from_the_code() -> dict[str, Any]:
         image_size=scenery.IMAGE_SIZE,
         field_of_view=np.rad2deg(scenery.FIELD_OF_VIEW),
         dim=scenery.LIGHTING["dim"],
-        save_every=TrainArgs(demos=()).save_every,
+        save_freq=TrainArgs(demos=()).save_freq,
     )
 
 

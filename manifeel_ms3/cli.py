@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
+from importlib.metadata import version
 from operator import or_
 from typing import Annotated, Any
 
@@ -84,6 +85,9 @@ def all_commands() -> dict[str, Command]:
 
 def _run(arguments: list[str]) -> Any:
     commands = all_commands()
+    if arguments == ["--version"]:
+        sys.stdout.write(f"manifeel-ms3 {version('manifeel-ms3')}\n")
+        return None
     if arguments and arguments[0] in commands:
         name = arguments[0]
         module = command_module(name)

@@ -246,5 +246,5 @@ def test_the_papers_own_numbers_agree_with_its_claims_but_where_it_contradicts_i
 
 
 def test_folders_without_results_are_named(tmp_path):
-    with pytest.raises(ResultError, match="--eval-episodes 50"):
+    with pytest.raises(ResultError, match="--num-eval-episodes 50"):
         claims.main(claims.Args((tmp_path,)))
