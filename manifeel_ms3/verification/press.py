@@ -1,6 +1,6 @@
 """Objects pressed on the right pad by known forces, through the engine's own contacts."""
 
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # (ManiSkill and SAPIEN annotate poses and bodies by their base classes)
 from collections.abc import Callable
 from dataclasses import dataclass

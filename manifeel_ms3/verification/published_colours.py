@@ -36,7 +36,7 @@ def gradients(surface: np.ndarray, pixel_size: float) -> tuple[np.ndarray, np.nd
 
 def places(shape: tuple[int, int]) -> list[np.ndarray]:
     """Normalised rows and columns (H, W) of an image, in [-1, 1]."""
-    return list(np.meshgrid(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), indexing="ij"))
+    return list(np.meshgrid(*(np.linspace(-1, 1, count) for count in shape), indexing="ij"))
 
 
 def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> np.ndarray:
