@@ -24,7 +24,7 @@ TRACEBACK = "MANIFEEL_TRACEBACK"
 INTERRUPTED = 130
 """Exit code of a command that was interrupted with Ctrl-C: 128 + SIGINT, the convention of shells."""
 PACKAGE = "manifeel-ms3"
-DISTRIBUTIONS = {"sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
+DISTRIBUTIONS = {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
 """Names of distributions by the names of their modules, where the two differ."""
 
 

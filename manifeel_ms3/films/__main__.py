@@ -1,0 +1,224 @@
+"""Make a film of recorded or evaluated episodes: `manifeel film trajectory.h5 --out peg.mp4`.
+
+A film shows the scene, the image of a camera, TacRGB (the image of the camera in the finger pad), TacFF (the forces on the
+pad; arrows are shear) and the contact force over time, under the names of task, episode and seed:
+
+    manifeel film trajectory.h5 --episode 3 --out peg.mp4
+    manifeel film runs/peg/evaluation.json --out evaluated.mp4
+    manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
+
+The episode of a trajectory file is replayed from its actions, and every picture is rendered anew, so that the file needs no
+observations. A result holds no actions: its episode is run again with the policy, from `checkpoints/last` beside the result if
+no other is given.
+"""
+
+import logging
+import sys
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.demonstrations.episode import run_episode
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.policy import Policy, PolicySource, checked_device
+from manifeel_ms3.evaluation.result import read_result
+from manifeel_ms3.evaluation.rollout import evaluate_episode
+from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
+
+from .shots import FilmingWrapper, Take, View, filming_env, shown_steps
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Args:
+    """Arguments of the command."""
+
+    files: tyro.conf.Positional[tuple[Path, ...]]
+    """Paths of trajectory files (.h5), or of results of evaluations (.json); the film shows one episode of each."""
+    out: Path = Path("film.mp4")
+    """Path of the film, which ends in .mp4, .webp or .gif."""
+    episode: int = 0
+    """Number of the episode in each file, from 0."""
+    camera: str | None = None
+    """Camera to show: front, side or wrist; the task's policy camera if not given."""
+    pad: str = "right"
+    """Finger pad to show: left or right."""
+    max_frames: int | None = None
+    """Largest number of frames of each episode; every control step is a frame if not given."""
+    fps: int = CONTROL_FREQ
+    """Frames per second. A film of every control step at 10 runs as fast as the episode did."""
+    width: int | None = None
+    """Width of the film, in pixels; 1048 if not given."""
+    checkpoint: Path | None = None
+    """Checkpoint folder of the policy of a result; checkpoints/last beside the result if not given."""
+    policy: str | None = None
+    """Policy of a result that is no checkpoint: a class ("module:Class"), or the address of a server."""
+    policy_kwargs: str = "{}"
+    """Keyword arguments of the --policy, as json."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """An episode that is to be filmed."""
+
+    path: Path
+    """Path of the trajectory file or of the result."""
+    env_id: str
+    """Id of the task, without a module."""
+    env_kwargs: dict[str, Any]
+    """Arguments of `gym.make`."""
+    entry: dict[str, Any]
+    """The episode's entry in the header of the trajectory file, or in the result."""
+    is_result: bool
+    inference: dict[str, Any]
+    """Device and batch size of the policy of a result."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of the episode."""
+        return self.entry["seed" if self.is_result else "episode_seed"]
+
+    @property
+    def length(self) -> int:
+        """Number of control steps of the episode."""
+        return self.entry["episode_len" if self.is_result else "elapsed_steps"]
+
+    @property
+    def success(self) -> bool:
+        """Whether the episode succeeded when it was recorded or evaluated."""
+        return bool(self.entry["success_once" if self.is_result else "success"])
+
+
+def main(args: Args) -> Path:
+    """Make a film, and return its path.
+
+    Raises:
+        InvalidArgumentError: An argument is not allowed, or a file has no such episode.
+        DemonstrationError: A trajectory file cannot be used, or its actions no longer have the same outcome.
+        ResultError: A result cannot be used.
+        CheckpointError: The checkpoint of a result is missing or broken.
+        MachineError: This machine has no renderer.
+        MissingExtraError: The extra `report`, which encodes films, is not installed.
+        FileWriteError: The film cannot be written.
+    """
+    with missing_extras_named():
+        import imageio_ffmpeg  # noqa: F401  (only to see whether mp4 can be written)
+
+        from .film_file import check_film_path, write_film
+        from .layout import film_frames
+    check_film_path(args.out)
+    _check(args)
+    sources = [read_source(path, args.episode) for path in args.files]
+    takes = [_film(source, args) for source in sources]
+    write_film([list(film_frames(take)) for take in takes], args.out, args.fps, args.width)
+    log.info("%s (%.1f MB)", args.out, args.out.stat().st_size / 1e6)
+    return args.out
+
+
+def _check(args: Args) -> None:
+    """Check the arguments before anything is rendered.
+
+    Raises:
+        InvalidArgumentError: One is not allowed.
+    """
+    if not args.files:
+        raise InvalidArgumentError("no file is given; give a trajectory file (.h5) or a result of `manifeel eval` (.json)")
+    one_of("--camera", args.camera, (None, *CAMERAS))
+    one_of("--pad", args.pad, SIDES)
+    for name, least in (("max_frames", 2), ("fps", 1), ("width", 64)):
+        value = getattr(args, name)
+        if value is not None and value < least:
+            raise InvalidArgumentError(f"--{name.replace('_', '-')} {value} is too small; give {least} or more")
+
+
+def read_source(path: Path, episode: int) -> Source:
+    """Find an episode in a trajectory file, or in a result of an evaluation.
+
+    Raises:
+        DemonstrationError: The trajectory file, or its json, is missing or broken.
+        ResultError: The result is missing or broken.
+        InvalidArgumentError: There is no such episode.
+    """
+    is_result = path.suffix == ".json" and not path.with_suffix(".h5").is_file()
+    content: dict[str, Any] = read_result(path) if is_result else read_header(path.with_suffix(".h5"))
+    about = content if is_result else content["env_info"]
+    count = len(content["episodes"])
+    if not 0 <= episode < count:
+        raise InvalidArgumentError(f"--episode {episode}: {path} has the episodes 0 to {count - 1}")
+    env_id = task_spec(about["env_id"]).env_id
+    kwargs, inference = dict(about["env_kwargs"]), content.get("inference", {})
+    return Source(path, env_id, kwargs, content["episodes"][episode], is_result, inference)
+
+
+def _film(source: Source, args: Args) -> Take:
+    """Run an episode again and film it.
+
+    Raises:
+        DemonstrationError: The recorded actions succeed no longer, or do so only now.
+    """
+    spec = task_spec(source.env_id)
+    view = View(args.camera or spec.policy_camera, args.pad)
+    kind = "policy" if source.is_result else "demonstration"
+    take = Take(f"{spec.name}, {kind}, seed {source.seed}", spec.force_limit)
+    steps = shown_steps(source.length, args.max_frames)
+    with progress_bar() as bar:
+        counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
+        with closing(filming_env(source.env_id, source.env_kwargs, view)) as env:
+            filmed = FilmingWrapper(env, take, view, steps, lambda: bar.advance(counter))
+            if source.is_result:
+                evaluate_episode(filmed, _policy(source, args), source.seed, on_step=lambda _obs: None)
+            else:
+                _replay(filmed, source)
+    if any(take.successes) != source.success:
+        _name_difference(source, any(take.successes))
+    return take
+
+
+def _replay(env: FilmingWrapper, source: Source) -> None:
+    path = source.path.with_suffix(".h5")
+    with open_trajectories(path) as file:
+        actions = file[f"traj_{source.entry['episode_id']}/actions"][()]
+    run_episode(env, source.seed, lambda: actions)
+
+
+def _policy(source: Source, args: Args) -> Policy:
+    """The policy of a result."""
+    if args.policy is not None:
+        return PolicySource(policy=args.policy, kwargs=args.policy_kwargs).make()
+    checkpoint = args.checkpoint or source.path.parent / "checkpoints/last"
+    if not checkpoint.is_dir():
+        raise InvalidArgumentError(
+            f"{source.path} holds no actions, and the policy that would act again is not in {checkpoint}; give its --checkpoint "
+            "or --policy"
+        )
+    device = checked_device(source.inference.get("device"))
+    return PolicySource(checkpoint, None, args.policy_kwargs, device, source.inference.get("batch_size")).make()
+
+
+def _name_difference(source: Source, success: bool) -> None:
+    """Say that an episode has come out otherwise than before.
+
+    Raises:
+        DemonstrationError: It is of a trajectory file, whose actions alone decide the outcome.
+    """
+    outcome = "succeeds" if success else "does not succeed"
+    if source.is_result:
+        log.warning("the episode of seed %d %s now, other than in %s", source.seed, outcome, source.path)
+        return
+    raise DemonstrationError(
+        f"the episode of seed {source.seed} in {source.path} {outcome} now, other than when it was recorded; the json beside the "
+        "file names the versions that it was recorded with: use those, or record it again here"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(run(main, tyro.cli(Args)))

@@ -1,0 +1,75 @@
+"""Writing of films: H.264 in mp4, animated WebP, and GIF."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.files import atomic_write
+
+SUFFIXES = (".mp4", ".webp", ".gif")
+BLOCK = 2
+"""Widths and heights are cut to multiples of this number of pixels, which H.264 needs."""
+MP4_QUALITY = 7
+"""Quality of the mp4 encoding from 0 to 10, as imageio has it (chosen; captions stay sharp)."""
+WEBP_QUALITY = 70
+"""Quality of the WebP encoding from 0 to 100 (chosen; captions stay sharp)."""
+WEBP_EFFORT = 6
+"""Effort of the WebP encoding from 0 to 6; the largest takes longer, and yields the smallest file."""
+END_SECONDS = 1.5
+"""Time for which the last frame of each episode is shown, in s (chosen)."""
+
+
+def check_film_path(path: Path) -> None:
+    """Check that the path ends in a known suffix and is no folder.
+
+    Raises:
+        InvalidArgumentError: It does not, or is one.
+    """
+    if path.suffix.lower() not in SUFFIXES or path.is_dir():
+        raise InvalidArgumentError(f"--out {path} is no path of a film; give a file that ends in {', '.join(SUFFIXES)}")
+
+
+def write_film(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:
+    """Write the frames of some episodes, one after the other, as one film that stops for a moment after each episode.
+
+    Args:
+        episodes: Frames of each episode.
+        path: Path of the film; its suffix decides the format.
+        fps: Frames per second.
+        width: Width of the film in pixels; that of the frames if not given.
+
+    Raises:
+        FileWriteError: The film cannot be written.
+    """
+    frames = [_resized(frame, width) for episode in episodes for frame in episode + episode[-1:] * round(END_SECONDS * fps)]
+    with atomic_write(path) as partial:
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(frames, partial, fps)
+        else:
+            _write_animation(frames, partial, path.suffix.lower()[1:].upper(), fps)
+
+
+def _resized(frame: Image.Image, width: int | None) -> Image.Image:
+    width = width or frame.width
+    height = round(frame.height * width / frame.width)
+    return frame.resize((width // BLOCK * BLOCK, height // BLOCK * BLOCK), Image.Resampling.LANCZOS)
+
+
+def _write_mp4(frames: list[Image.Image], path: Path, fps: int) -> None:
+    import imageio.v2 as imageio
+
+    options: Any = dict(format="FFMPEG", fps=fps, macro_block_size=BLOCK, quality=MP4_QUALITY)
+    writer: Any  # the stubs of imageio do not know `append_data`
+    with imageio.get_writer(path, **options, output_params=["-f", "mp4", "-movflags", "+faststart"]) as writer:
+        for frame in frames:
+            writer.append_data(np.asarray(frame))
+
+
+def _write_animation(frames: list[Image.Image], path: Path, kind: str, fps: int) -> None:
+    options: dict[str, Any] = dict(quality=WEBP_QUALITY, method=WEBP_EFFORT) if kind == "WEBP" else {}
+    first, *others = frames
+    first.save(path, kind, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, **options)

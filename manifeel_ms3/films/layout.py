@@ -1,0 +1,102 @@
+"""The layout of a film: title above, scene at the left, camera, touch and the curve of the force at the right."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
+
+from .shots import SCENE_SIZE, Shot, Take
+
+BAR = 36
+"""Height of the title, in pixels."""
+TILE = SCENE_SIZE // 2
+"""Height of the images at the right, in pixels."""
+GAP = 4
+"""Width of the lines between the images, in pixels."""
+NARROW, WIDE = TILE, TILE * 4 // 3
+"""Widths of the two columns at the right, in pixels: square for the camera, and 4 : 3 as the tactile images are."""
+SIZE = (SCENE_SIZE + NARROW + WIDE + 2 * GAP, BAR + 2 * TILE + GAP)
+"""Width and height of a film, in pixels."""
+MARGINS = (14, 34, 14, 14)
+"""Left, upper, right and lower margin of the curve in its tile, in pixels."""
+SMALLEST_AXIS = 5.0
+"""Smallest end of the axis of forces, in N: less is noise of the contacts."""
+GROUND, PAPER, INK, FAINT = (18, 20, 24), (30, 33, 39), (236, 238, 242), (128, 134, 146)
+CURVE, SUCCESS, LIMIT = (255, 170, 70), (110, 210, 130), (200, 90, 90)
+
+
+def film_frames(take: Take) -> Iterator[Image.Image]:
+    """The frames of a film, one for each shot."""
+    for shot in take.shots:
+        yield film_frame(take, shot)
+
+
+def film_frame(take: Take, shot: Shot) -> Image.Image:
+    """One frame."""
+    frame = Image.new("RGB", SIZE, GROUND)
+    _draw_title(ImageDraw.Draw(frame), take, shot.step)
+    images = dict(shot.images)
+    frame.paste(_fitted(images.pop("scene"), SCENE_SIZE, SCENE_SIZE), (0, BAR))
+    left, right = SCENE_SIZE + GAP, SCENE_SIZE + NARROW + 2 * GAP
+    upper, lower = BAR, BAR + TILE + GAP
+    places = ((left, upper, NARROW), (right, upper, WIDE), (right, lower, WIDE))
+    for (caption, image), (x, y, width) in zip(images.items(), places, strict=True):
+        tile = _fitted(image, width, TILE)
+        _draw_caption(ImageDraw.Draw(tile), caption)
+        frame.paste(tile, (x, y))
+    frame.paste(_force_curve(take, shot.step), (left, lower))
+    return frame
+
+
+def _draw_title(draw: ImageDraw.ImageDraw, take: Take, step: int) -> None:
+    middle = BAR // 2
+    draw.text((12, middle), take.title, INK, _font(19), anchor="lm")
+    time = f"{step / CONTROL_FREQ:.1f} s"
+    draw.text((SIZE[0] - 12, middle), time, FAINT, _font(17), anchor="rm")
+    if take.successes[step]:
+        draw.text((SIZE[0] - 90, middle), "success", SUCCESS, _font(19), anchor="rm")
+
+
+def _fitted(image: np.ndarray, width: int, height: int) -> Image.Image:
+    """An image as large as fits, in the middle of a tile."""
+    picture = Image.fromarray(image)
+    scale = min(width / picture.width, height / picture.height)
+    size = (round(picture.width * scale), round(picture.height * scale))
+    tile = Image.new("RGB", (width, height), PAPER)
+    tile.paste(picture.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, (height - size[1]) // 2))
+    return tile
+
+
+def _draw_caption(draw: ImageDraw.ImageDraw, caption: str) -> None:
+    font = _font(14)
+    box = draw.textbbox((8, 6), caption, font)
+    draw.rectangle((box[0] - 5, box[1] - 4, box[2] + 5, box[3] + 4), fill=GROUND)
+    draw.text((8, 6), caption, INK, font)
+
+
+def _force_curve(take: Take, step: int) -> Image.Image:
+    """The contact force from the start up to a step, over the whole length of the episode."""
+    tile = Image.new("RGB", (NARROW, TILE), PAPER)
+    draw = ImageDraw.Draw(tile)
+    left, top, right, bottom = MARGINS[0], MARGINS[1], NARROW - MARGINS[2], TILE - MARGINS[3]
+    largest = max(*take.forces, take.force_limit or 0.0, SMALLEST_AXIS) * 1.1
+    across = np.linspace(left, right, max(len(take.forces), 2))
+    down = bottom - (bottom - top) * np.asarray(take.forces) / largest
+    draw.line((left, bottom, right, bottom), FAINT)
+    if take.force_limit:
+        height = bottom - (bottom - top) * take.force_limit / largest
+        draw.line((left, height, right, height), LIMIT)
+        draw.text((right, height - 3), f"gentle: up to {take.force_limit:g} N", LIMIT, _font(12), anchor="rs")
+    points = list(zip(across.tolist(), down.tolist(), strict=False))[: step + 1]
+    if len(points) > 1:
+        draw.line(points, CURVE, width=2, joint="curve")
+    x, y = points[-1]
+    draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=CURVE)
+    draw.text((8, 6), f"contact force: {take.forces[step]:.1f} N", INK, _font(14))
+    return tile
+
+
+def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)

@@ -1,0 +1,124 @@
+"""What a film shows of an episode, taken while the episode runs."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from mani_skill.utils import common
+
+from manifeel_ms3.sensors.visualisation import observation_images
+from manifeel_ms3.tasks.registry import make_env, task_spec
+
+SCENE_SIZE = 480
+"""Width and height of the picture of the scene, in pixels."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What a film shows beside the scene and the force."""
+
+    camera: str
+    """Name of the camera."""
+    pad: str
+    """Side of the finger pad, "left" or "right"."""
+
+
+@dataclass
+class Shot:
+    """One moment of a film."""
+
+    step: int
+    """Number of control steps since the start of the episode."""
+    images: dict[str, np.ndarray]
+    """RGB images (H, W, 3) uint8: "scene", and the others by their captions."""
+
+
+@dataclass
+class Take:
+    """What is filmed of one episode."""
+
+    title: str
+    """Task, origin and seed of the episode."""
+    force_limit: float | None
+    """Largest contact force of a gentle success of the task, in N; None if not known."""
+    shots: list[Shot] = field(default_factory=list)
+    forces: list[float] = field(default_factory=list)
+    """Contact force of every control step, in N; 0 at the start."""
+    successes: list[bool] = field(default_factory=list)
+    """Whether the task has succeeded, for every control step."""
+
+
+class FilmingWrapper(gym.Wrapper):
+    """Wrapper that takes shots of an episode, at chosen steps, while the episode runs.
+
+    Args:
+        env: Environment of `filming_env`.
+        take: What the shots, forces and successes are added to.
+        view: Camera and pad to show.
+        steps: Numbers of the control steps that are shown.
+        on_step: Called after the reset and after every step.
+    """
+
+    def __init__(self, env: gym.Env, take: Take, view: View, steps: set[int], on_step: Callable[[], None]):
+        super().__init__(env)
+        self._take, self._view, self._steps, self._on_step = take, view, steps, on_step
+
+    def reset(self, **kwargs: Any):
+        obs, info = self.env.reset(**kwargs)
+        self._keep(obs, info)
+        return obs, info
+
+    def step(self, action: Any):
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self._keep(obs, info)
+        return obs, reward, terminated, truncated, info
+
+    def _keep(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
+        take, step = self._take, len(self._take.forces)
+        take.forces.append(float(info["contact_force"]))
+        take.successes.append(bool(info["success"]))
+        if step in self._steps:
+            take.shots.append(Shot(step, self._images(obs)))
+        self._on_step()
+
+    def _images(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
+        scene: Any = self.env.render()
+        shown = (self._view.camera, f"tactile_{self._view.pad}")
+        sensors = {name: data for name, data in obs["sensor_data"].items() if name in shown}
+        return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors))
+
+
+def filming_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env:
+    """The environment of an episode, with the scene, the camera and the pad of a film added to what it renders.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make` with which the episode was recorded or evaluated.
+        view: Camera and pad of the film.
+
+    Raises:
+        MachineError: This machine has no renderer.
+    """
+    added: dict[str, Any] = dict(
+        obs_mode="rgb+tacrgb+tacff",
+        cameras=tuple(dict.fromkeys([*(env_kwargs.get("cameras") or [task_spec(env_id).policy_camera]), view.camera])),
+        tactile_sensors=tuple(dict.fromkeys([*env_kwargs.get("tactile_sensors", ()), view.pad])),
+        render_backend="auto",
+        render_mode="rgb_array",
+        human_render_camera_configs=dict(width=SCENE_SIZE, height=SCENE_SIZE),
+    )
+    return make_env(env_id, **dict(env_kwargs) | added)
+
+
+def shown_steps(length: int, most: int | None) -> set[int]:
+    """Numbers of the control steps that are shown of an episode, evenly spread, with the first and the last one.
+
+    Args:
+        length: Number of control steps of the episode.
+        most: Largest number of shots; every step is shown if not given.
+    """
+    if most is None or most > length:
+        return set(range(length + 1))
+    return set(np.linspace(0, length, most).round().astype(int).tolist())
