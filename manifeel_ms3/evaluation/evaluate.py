@@ -77,8 +77,8 @@ class Args:
     episodes: Annotated[int, tyro.conf.arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     seeds: Path | None = None
-    """Text file with the seeds of the episodes, one a line, which replaces --num-eval-episodes: a private list of initial states, to
-    which no policy can have been fitted. The result holds the seeds, too."""
+    """Text file with the seeds of the episodes, one a line, which replaces --num-eval-episodes: a private list of initial
+    states, to which no policy can have been fitted. The result holds the seeds, too."""
     workers: Annotated[int, tyro.conf.arg(name="num-eval-envs", aliases=["--workers"])] = 1
     """Number of processes that simulate episodes side by side; one more process holds the policy of a checkpoint."""
     inference_steps: int | None = None
