@@ -231,7 +231,7 @@ class Trainer:
             for name in (CHECKPOINTS, EVALUATIONS):
                 if (self.run_dir / name).is_dir():
                     remove_folder(self.run_dir / name)
-        opened = RunLog(self.run_dir, self.config, self.step, wandb_run_of(self.args, self.config["policy_name"]))
+        opened = RunLog(self.run_dir, self.config, self.step, wandb_run_of(self.args, str(self.config["policy_name"])))
         if self.args.resume:
             make_last(newest_checkpoint(self.checkpoints))
             evaluated = {entry["step"] for entry in opened.entries if SUCCESS in entry}
