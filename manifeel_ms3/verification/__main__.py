@@ -108,6 +108,7 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
         strip=_strip(found),
         names=[picture.shape for picture in found.pictures],
         readings=found.readings,
+        left_out=found.left_out,
     )
 
 
