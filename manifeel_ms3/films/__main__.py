@@ -111,8 +111,6 @@ def main(args: Args) -> Path:
         FileWriteError: The film cannot be written.
     """
     with missing_extras_named():
-        import imageio_ffmpeg  # noqa: F401  (only to see whether mp4 can be written)
-
         from .film_file import check_film_path, write_film
         from .layout import film_frames
     check_film_path(args.out)
@@ -197,8 +195,8 @@ def _policy(source: Source, args: Args) -> Policy:
     checkpoint = args.checkpoint or source.path.parent / "checkpoints/last"
     if not checkpoint.is_dir():
         raise InvalidArgumentError(
-            f"{source.path} holds no actions, and the policy that would act again is not in {checkpoint}; give its --checkpoint "
-            "or --policy"
+            f"{source.path} holds no actions, and there is no policy in {checkpoint} that could act again; give its "
+            "--checkpoint or --policy"
         )
     device = checked_device(source.inference.get("device"))
     return PolicySource(checkpoint, None, args.policy_kwargs, device, source.inference.get("batch_size")).make()
@@ -215,8 +213,8 @@ def _name_difference(source: Source, success: bool) -> None:
         log.warning("the episode of seed %d %s now, other than in %s", source.seed, outcome, source.path)
         return
     raise DemonstrationError(
-        f"the episode of seed {source.seed} in {source.path} {outcome} now, other than when it was recorded; the json beside the "
-        "file names the versions that it was recorded with: use those, or record it again here"
+        f"the episode of seed {source.seed} in {source.path} {outcome} now, other than when it was recorded; the json "
+        "beside the file names the versions that it was recorded with: use those, or record it again here"
     )
 
 

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import imageio.v2 as imageio
 import numpy as np
 from PIL import Image
 
@@ -17,7 +19,7 @@ MP4_QUALITY = 7
 """Quality of the mp4 encoding from 0 to 10, as imageio has it (chosen; captions stay sharp)."""
 WEBP_QUALITY = 70
 """Quality of the WebP encoding from 0 to 100 (chosen; captions stay sharp)."""
-WEBP_EFFORT = 6
+WEBP_EFFORT = 4
 """Effort of the WebP encoding from 0 to 6; the largest takes longer, and yields the smallest file."""
 END_SECONDS = 1.5
 """Time for which the last frame of each episode is shown, in s (chosen)."""
@@ -60,13 +62,13 @@ def _resized(frame: Image.Image, width: int | None) -> Image.Image:
 
 
 def _write_mp4(frames: list[Image.Image], path: Path, fps: int) -> None:
-    import imageio.v2 as imageio
-
-    options: Any = dict(format="FFMPEG", fps=fps, macro_block_size=BLOCK, quality=MP4_QUALITY)
-    writer: Any  # the stubs of imageio do not know `append_data`
-    with imageio.get_writer(path, **options, output_params=["-f", "mp4", "-movflags", "+faststart"]) as writer:
-        for frame in frames:
-            writer.append_data(np.asarray(frame))
+    with TemporaryDirectory() as folder:
+        film = Path(folder) / "film.mp4"  # imageio knows the format by the suffix
+        writer: Any  # the stubs of imageio do not know `append_data`
+        with imageio.get_writer(film, fps=fps, macro_block_size=BLOCK, quality=MP4_QUALITY) as writer:
+            for frame in frames:
+                writer.append_data(np.asarray(frame))
+        path.write_bytes(film.read_bytes())
 
 
 def _write_animation(frames: list[Image.Image], path: Path, kind: str, fps: int) -> None:

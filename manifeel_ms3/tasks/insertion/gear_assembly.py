@@ -61,6 +61,7 @@ class GearAssemblyEnv(InsertionEnv):
     **Fail Conditions:** the gear has left the grip (30 mm).
     """
 
+    _sample_video_link = "docs/films/GearAssembly.mp4"
     Randomization = GearRandomization
     contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
     make_fit = staticmethod(gear_fit)

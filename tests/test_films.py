@@ -1,0 +1,119 @@
+"""Films of recorded and evaluated episodes show every moment that they should, or say why there is none."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from manifeel_ms3 import cli
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.films import layout
+from manifeel_ms3.films.__main__ import read_source
+from manifeel_ms3.films.film_file import END_SECONDS, write_film
+from manifeel_ms3.films.shots import Shot, Take, shown_steps
+from tests.conftest import PEG, needs_renderer
+from tests.sample import states_sample
+
+FILE = states_sample(PEG)
+
+
+def a_take() -> Take:
+    rng = np.random.default_rng(0)
+    touch = dict.fromkeys(("tactile right: TacRGB", "tactile right: TacFF"), (240, 320))
+    sizes = {"scene": (480, 480), "wrist": (256, 256)} | touch
+    shots = [Shot(k, {name: rng.integers(0, 255, (*size, 3), np.uint8) for name, size in sizes.items()}) for k in (0, 2, 4)]
+    return Take("PegInsertion, seed 0", 36.0, shots, [0.0, 1.0, 9.0, 2.0, 0.0], [False, False, False, False, True])
+
+
+def test_the_first_and_the_last_step_are_shown():
+    assert shown_steps(64, None) == set(range(65))
+    assert shown_steps(64, 5) == {0, 16, 32, 48, 64}
+    assert shown_steps(3, 40) == {0, 1, 2, 3}
+
+
+def test_a_frame_shows_each_image_at_its_place_and_the_force_so_far():
+    take = a_take()
+    frames = [np.asarray(frame) for frame in layout.film_frames(take)]
+    assert all(frame.shape == (layout.SIZE[1], layout.SIZE[0], 3) for frame in frames)
+    np.testing.assert_array_equal(frames[1][layout.BAR :, :480][:480], take.shots[1].images["scene"])
+    touch = frames[1][layout.BAR + 40 : layout.BAR + 240, -layout.WIDE :]
+    np.testing.assert_array_equal(touch, take.shots[1].images["tactile right: TacRGB"][40:240])
+    drawn = [(frame == layout.CURVE).all(-1).sum() for frame in frames]
+    assert drawn[0] < drawn[1] < drawn[2]  # the curve grows
+    succeeded = [(frame[: layout.BAR] == layout.SUCCESS).all(-1).any() for frame in frames]
+    assert succeeded == [False, False, True]
+
+
+@pytest.mark.parametrize("suffix", ["webp", "gif"])
+def test_an_animation_has_every_frame_and_stops_at_the_end(tmp_path, suffix):
+    frames = list(layout.film_frames(a_take()))
+    write_film([frames], tmp_path / f"film.{suffix}", fps=10, width=400)
+    with Image.open(tmp_path / f"film.{suffix}") as film:
+        assert film.n_frames >= len(frames)
+        assert film.size == (400, 198)
+        lasted = 0
+        for k in range(film.n_frames):
+            film.seek(k)
+            film.load()
+            lasted += film.info["duration"]
+    assert lasted == pytest.approx(1000 * (0.1 * len(frames) + END_SECONDS), abs=100)
+
+
+def test_an_mp4_has_every_frame(tmp_path):
+    imageio = pytest.importorskip("imageio.v2")
+    frames = list(layout.film_frames(a_take()))
+    write_film([frames, frames], tmp_path / "film.mp4", fps=4)
+    with imageio.get_reader(tmp_path / "film.mp4") as film:
+        assert film.count_frames() == 2 * (len(frames) + round(4 * END_SECONDS))
+
+
+@needs_renderer
+def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
+    out = tmp_path / "peg.webp"
+    assert cli.main(["film", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
+    with Image.open(out) as film:
+        assert film.size == (524, 260)
+        film.seek(film.n_frames - 1)
+        last = np.asarray(film.convert("RGB")).astype(int)
+    touch = last[20:130, -150:]
+    assert touch.std() > 10  # TacRGB of a held peg is not one colour
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--out", "peg.avi"], "peg.avi is no path of a film; give a file that ends in .mp4, .webp, .gif"),
+        (["--episode", "7"], "has the episodes 0 to 1"),
+        (["--camera", "top"], "--camera='top' is unknown; choose from"),
+        (["--pad", "both"], "--pad='both' is unknown; choose from"),
+        (["--max-frames", "1"], "--max-frames 1 is too small; give 2 or more"),
+    ],
+)
+def test_what_cannot_be_filmed_is_refused_in_one_line(arguments, said, capsys):
+    assert cli.main(["film", str(FILE), *arguments]) == 1
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.splitlines()) == 2  # the error, and where there is more
+
+
+def test_a_file_that_is_not_there(tmp_path, capsys):
+    assert cli.main(["film", str(tmp_path / "x.h5")]) == 1
+    assert "x.h5 does not exist" in capsys.readouterr().err
+
+
+def test_a_result_without_its_policy_says_what_to_give(tmp_path, capsys):
+    shutil.copy("tests/trust/result.json", tmp_path / "evaluation.json")
+    assert cli.main(["film", str(tmp_path / "evaluation.json")]) == 1
+    assert "give its --checkpoint or --policy" in capsys.readouterr().err
+
+
+def test_a_result_names_the_seed_and_the_length_of_an_episode(tmp_path):
+    path = tmp_path / "evaluation.json"
+    shutil.copy("tests/trust/result.json", path)
+    episodes = json.loads(path.read_text())["episodes"]
+    source = read_source(path, len(episodes) - 1)
+    assert (source.seed, source.length) == (episodes[-1]["seed"], episodes[-1]["episode_len"])
+    with pytest.raises(InvalidArgumentError, match="has the episodes 0 to"):
+        read_source(path, len(episodes))
