@@ -19,6 +19,7 @@ from baselines.registry import all_policies
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import paper_demos
+from manifeel_ms3.tasks import scenery
 from manifeel_ms3.tasks import visuotactile_env as env
 from manifeel_ms3.tasks.insertion import base as insertion
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
@@ -247,10 +248,10 @@ def read_from_the_code() -> dict[str, Any]:
     return dict(
         control_freq=env.CONTROL_FREQ,
         hold=env.HOLD_SECONDS,
-        image_size=env.IMAGE_SIZE,
-        field_of_view=np.rad2deg(env.FIELD_OF_VIEW),
-        dim=env.LIGHTING["dim"],
-        save_every=TrainArgs(demos=()).save_every,
+        image_size=scenery.IMAGE_SIZE,
+        field_of_view=np.rad2deg(scenery.FIELD_OF_VIEW),
+        dim=scenery.LIGHTING["dim"],
+        save_freq=TrainArgs(demos=()).save_freq,
     )
 
 

@@ -51,11 +51,11 @@ class Args:
     """Number of environments, each in a process."""
     num_eval_envs: int = 2
     """Number of environments of an evaluation."""
-    num_steps: int = 256
+    num_steps: int = 128
     """Number of steps of each environment between two updates."""
     eval_freq: int = 10
     """Number of updates between two evaluations."""
-    gamma: float = 0.8
+    gamma: float = 0.9
     """Discount factor."""
     gae_lambda: float = 0.9
     """Lambda of the generalized advantage estimation."""
@@ -80,7 +80,7 @@ class Agent(nn.Module):
         super().__init__()
         self.critic, actor = (self.mlp(num_obs, out, std) for out, std in ((1, 1.0), (num_actions, 0.01)))
         self.actor_mean = actor
-        self.actor_logstd = nn.Parameter(torch.full((1, num_actions), -0.5))
+        self.actor_logstd = nn.Parameter(torch.full((1, num_actions), -1.6))
         self.register_buffer("mean", torch.zeros(num_obs))
         self.register_buffer("var", torch.ones(num_obs))
         self.register_buffer("count", torch.tensor(1e-4))

@@ -11,8 +11,10 @@ except for a shell's completion, which needs the flags of all commands.
 
 import sys
 from dataclasses import dataclass
+from difflib import get_close_matches
 from functools import cache, reduce
 from importlib import import_module
+from importlib.metadata import version
 from operator import or_
 from typing import Annotated, Any
 
@@ -20,7 +22,7 @@ import tyro
 
 from manifeel_ms3 import plugins
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.errors import PluginError
+from manifeel_ms3.errors import PluginError, UnknownNameError
 from manifeel_ms3.plugins import Command
 
 COMMANDS = {
@@ -85,10 +87,17 @@ def all_commands() -> dict[str, Command]:
 
 def _run(arguments: list[str]) -> Any:
     commands = all_commands()
+    if arguments == ["--version"]:
+        sys.stdout.write(f"manifeel-ms3 {version('manifeel-ms3')}\n")
+        return None
     if arguments and arguments[0] in commands:
         name = arguments[0]
         module = command_module(name)
         return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
+    if arguments and not arguments[0].startswith("-"):
+        near = get_close_matches(arguments[0], commands, n=1)
+        meant = f" (did you mean {near[0]!r}?)" if near else ""
+        raise UnknownNameError(f"{arguments[0]!r} is not a command{meant}; choose from {list(commands)}")
     completion = any("-completion" in argument for argument in arguments)
     forms: list[Any] = [
         Annotated[

@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from manifeel_ms3 import cli
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
 from manifeel_ms3.errors import MissingExtraError
+from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
 
 
@@ -120,9 +122,36 @@ def test_answers_that_count_what_is_wrong_are_exit_codes():
     assert run(interrupted, None) == 130
 
 
-def test_a_flag_that_is_not_known_is_refused():
+def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):
     with pytest.raises(SystemExit, match="2"):
-        cli.main(["record", PEG, "--no-such-flag"])
+        cli.main(["record", PEG, "--obs-moed", "tacff"])
+    assert "--obs-mode" in capsys.readouterr().err
+    assert cli.main(["recrod", PEG]) == 1
+    assert "'recrod' is not a command (did you mean 'record'?); choose from ['tasks'" in capsys.readouterr().err
+    assert cli.main(["record", PEG, "-n", "0"]) == 1
+    assert "--num-demos 0: at least 1" in capsys.readouterr().err
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("manifeel-ms3 ")
+
+
+def test_flags_have_maniskills_names_and_their_old_ones():
+    parse = partial(tyro.cli, cli.command_module("train").Args)
+    theirs = "--demo-path a.h5 --total-iters 7 --save-freq 3 --log-freq 2 --num-eval-episodes 4 --num-eval-envs 2 --track"
+    ours = "--demos a.h5 --steps 7 --save-every 3 --log-every 2 --eval-episodes 4 --eval-workers 2 --track"
+    assert parse(args=["flow_matching", "cpu", *theirs.split()]) == parse(args=["flow_matching", "cpu", *ours.split()])
+    evaluate = partial(tyro.cli, cli.command_module("eval").Args)
+    assert evaluate(args=["--num-eval-episodes", "3", "--num-eval-envs", "2"]) == evaluate(
+        args=["--episodes", "3", "--workers", "2"]
+    )
+    for command in ("record", "replay", "render-observations"):
+        module = cli.command_module(command)
+        positional = [PEG] if command == "record" else ["a.h5", *(["--out", "b.h5"] if command != "replay" else [])]
+        counts = [tyro.cli(module.Args, args=[*positional, flag, "3"]).num for flag in ("--num-demos", "--num", "-n")]
+        assert counts == [3, 3, 3]
+
+
+def test_a_task_may_be_named_shortly():
+    assert task_spec("PegInsertion") is task_spec(PEG)
 
 
 def test_training_takes_policy_preset_and_flags():

@@ -118,7 +118,7 @@ def shelf(tmp_path_factory) -> Path:
     (shelf / "my_module.py").write_text(module[1])
     (shelf / "my_seeds.txt").write_text("734501\n220011\n")
     flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
-    evaluated = ["--eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
+    evaluated = ["--num-eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(
         tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
     )

@@ -6,9 +6,12 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from manifeel_ms3.sensors import pad_pose
-from tests.conftest import needs_renderer
+from tests.conftest import PEG, needs_renderer
+from tests.sample import observed_sample
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -99,3 +102,55 @@ def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
     assert asked[0]["task_description"] == "Insert the peg into the hole."
     assert np.shape(asked[0]["touch"]["right"]) == (10, 14, 3)
     assert not np.allclose(asked[0]["state"], asked[3]["state"])  # another initial state
+
+
+def test_our_recordings_feed_the_loader_of_maniskills_diffusion_policy():
+    """Its observations are those that the wrapper makes in evaluation."""
+    example = load("diffusion_policy_loader")
+    batch = example.main(observed_sample(PEG))
+    assert batch["observations"]["rgb"].shape == (8, 2, 128, 128, 3)
+    assert batch["observations"]["state"].shape == (8, 2, 25 + 420)
+    assert batch["actions"].shape == (8, 16, 6)
+    dataset = example.DiffusionPolicyDataset(observed_sample(PEG))
+    first, last = dataset[0], dataset[len(dataset.actions[0]) - 1]
+    assert np.array_equal(first["observations"]["state"][0], first["observations"]["state"][1])  # padded
+    assert np.array_equal(last["actions"][1], dataset.actions[0][-1])
+
+
+def test_ppo_improves_a_policy_on_what_it_observes():
+    """The networks, the rollout's advantages and the update, without a simulator."""
+    ppo = load("ppo")
+    args = ppo.Args(num_steps=64, num_envs=4, num_minibatches=4, update_epochs=4, gamma=0.0)
+    torch.manual_seed(0)
+    agent = ppo.Agent(5, 2)
+    envs = SyncVectorEnv([Aim] * args.num_envs, autoreset_mode=AutoresetMode.SAME_STEP)
+    rollout, (obs, _) = ppo.Rollout(args, envs), envs.reset(seed=0)
+    optimizer = torch.optim.Adam(agent.parameters(), 5e-4)
+    rewards = []
+    for _ in range(30):
+        obs, _ = rollout.collect(agent, envs, obs)
+        ppo.update(args, agent, optimizer, rollout, rollout.advantages(args, agent.value(ppo.tensor(obs)).detach()))
+        agent.watch(rollout.obs.flatten(0, 1))
+        rewards.append(rollout.rewards.mean().item())
+    assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.1
+
+
+class Aim(gym.Env):
+    """Rewards actions near the first two numbers of the observation; episodes have 8 steps."""
+
+    observation_space = gym.spaces.Box(-1, 1, (5,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.left = 8
+        return self._obs(), {}
+
+    def _obs(self):
+        self.seen = self.np_random.uniform(-1, 1, 5).astype(np.float32)
+        return self.seen
+
+    def step(self, action):
+        self.left -= 1
+        reward = -float(np.abs(action - self.seen[:2]).mean())
+        return self._obs(), reward, False, self.left == 0, dict(episode=dict(success_once=False))

@@ -92,9 +92,10 @@ class EndsTheProcess:
 
 
 def test_processes_that_end_as_they_start_are_one_error():
-    with pytest.raises(WorkFailedError, match="end as they start"), WorkerPool(1, EndsTheProcess()) as pool:
+    with WorkerPool(1, EndsTheProcess()) as pool:
         pool.submit(add, 1)
-        for finished in pool.as_finished():
+        (finished,) = pool.as_finished()
+        with pytest.raises(WorkFailedError, match="end as they start"):
             finished.result()
 
 

@@ -8,7 +8,13 @@ import sys
 from collections import deque
 from pathlib import Path
 
+from manifeel_ms3.evaluation.result import MEANS
+
 log = logging.getLogger(__name__)
+RATES = ("success_once", "success_at_end", "fail_once", "fail_at_end", "gentle_success")
+"""Rates of a result that are logged."""
+SUCCESS = "eval/success_once"
+"""Scalar that every evaluation logs."""
 NOT_FROM_HERE = ["-P"] if sys.version_info >= (3, 11) else []
 """Option of Python with which `-m` does not put the current folder, where anybody's torch.py may lie, on the path."""
 
@@ -22,12 +28,16 @@ class BackgroundEvaluation:
         workers: Number of processes of an evaluation.
         env_kwargs: Arguments of the task, as a json object.
         device: Device of the policy; a GPU if there is one and this is not given.
+        video: Whether the first episode is recorded as a video, videos/<step>.mp4 in the folder.
     """
 
-    def __init__(self, folder: Path, episodes: int, workers: int, env_kwargs: str, device: str | None = None):
+    def __init__(
+        self, folder: Path, episodes: int, workers: int, env_kwargs: str, device: str | None = None, video: bool = False
+    ):
         self.folder = folder
-        self._arguments = ["--episodes", str(episodes), "--workers", str(workers), "--env-kwargs", env_kwargs]
+        self._arguments = ["--num-eval-episodes", str(episodes), "--num-eval-envs", str(workers), "--env-kwargs", env_kwargs]
         self._arguments += [] if device is None else ["--device", device]
+        self._arguments += ["--videos", "0"] if video else []
         self._waiting: deque[Path] = deque()
         self._running: tuple[Path, subprocess.Popen] | None = None
 
@@ -47,9 +57,9 @@ class BackgroundEvaluation:
             wait: Whether to wait until all queued checkpoints have been evaluated.
 
         Returns:
-            For each checkpoint its "evaluated_step" and its rate "success_once".
+            For each checkpoint its "step", and its rates and means with ManiSkill's names, such as "eval/success_once".
         """
-        rates = []
+        rates: list[dict[str, float]] = []
         while self._running or self._waiting:
             checkpoint, process = self._running = self._running or self._start(self._waiting.popleft())
             if wait:
@@ -76,7 +86,18 @@ class BackgroundEvaluation:
         if code != 0:
             log.warning("the evaluation of %s failed; %s says why", checkpoint, path.with_suffix(".log"))
             return []
-        return [dict(evaluated_step=int(checkpoint.name), success_once=json.loads(path.read_text())["success_once"]["rate"])]
+        step, result = int(checkpoint.name), json.loads(path.read_text())
+        if (film := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
+            film.replace(film.with_name(f"{step}.mp4"))  # the next evaluation records the same episode
+        scalars: dict[str, float] = {name: result[name]["rate"] for name in RATES if name in result} | {
+            name: result[name] for name in MEANS
+        }
+        return [{"step": step, **{f"eval/{name}": value for name, value in scalars.items()}}]
+
+    def video_of(self, step: int) -> Path | None:
+        """The video of a checkpoint's evaluation; None if there is none."""
+        path = self.folder / "videos" / f"{step}.mp4"
+        return path if path.is_file() else None
 
     def _result(self, checkpoint: Path) -> Path:
         return self.folder / f"{checkpoint.name}.json"

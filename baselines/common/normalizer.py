@@ -7,29 +7,50 @@ MIN_RANGE = 1e-3
 """Smallest half range that is divided by; values that hardly vary are shifted but not magnified."""
 
 
+TAXEL_SHARE = 0.05
+"""Smallest half range of a taxel's component that is divided by, as a share of the largest one of that component: a taxel that
+is hardly touched is not magnified to the size of one that carries the grip."""
+MIN_TOUCH = 1e-6
+"""Smallest half range of a force field that is divided by, in N, or in m with units="tacsl"."""
+
+
 class Normalizer(nn.Module):
-    """Affine map of the data's range to [-1, 1], for each component of the last dimension.
+    """Affine map of the data's range to [-1, 1], for each component.
 
     Args:
-        size: Number of components.
+        shape: Number of components, or shape of the components: the last dimensions of the data.
+        min_range: Smallest half range that is divided by.
+        min_share: The same as a share of the largest half range among the components with the same last index.
     """
 
     low: torch.Tensor
     high: torch.Tensor
 
-    def __init__(self, size: int):
+    def __init__(self, shape: int | tuple[int, ...], min_range: float = MIN_RANGE, min_share: float = 0.0):
         super().__init__()
-        self.register_buffer("low", -torch.ones(size))
-        self.register_buffer("high", torch.ones(size))
+        self.min_range, self.min_share = min_range, min_share
+        self.register_buffer("low", -torch.ones(shape))
+        self.register_buffer("high", torch.ones(shape))
+
+    @classmethod
+    def of_taxels(cls, taxel_shape: tuple[int, int]) -> "Normalizer":
+        """The normaliser of a force field: every component of every taxel has its own range.
+
+        The taxels at the border own the rest of the gel and carry most of a grip. With one range for all taxels they set it,
+        and what changes in the middle of the gel is a small part of it (docs/policies.md).
+        """
+        return cls((*taxel_shape, 3), MIN_TOUCH, TAXEL_SHARE)
 
     def fit(self, data: torch.Tensor) -> None:
-        """Take the range from data (..., size)."""
-        flat = data.reshape(-1, data.shape[-1]).float()
+        """Take the range from data (..., *shape)."""
+        flat = data.reshape(-1, *self.low.shape).float()
         self.low.copy_(flat.amin(0))
         self.high.copy_(flat.amax(0))
 
     def _scale(self) -> tuple[torch.Tensor, torch.Tensor]:
-        return (self.high + self.low) / 2, ((self.high - self.low) / 2).clamp(min=MIN_RANGE)
+        half = (self.high - self.low) / 2
+        least = self.min_share * half.reshape(-1, half.shape[-1]).amax(0)
+        return (self.high + self.low) / 2, torch.maximum(half, least).clamp(min=self.min_range)
 
     def normalize(self, data: torch.Tensor) -> torch.Tensor:
         """Map data (..., size) to [-1, 1]."""

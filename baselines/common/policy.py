@@ -71,8 +71,9 @@ class VisuotactilePolicy(nn.Module):
         super().__init__()
         self.config, self.spec, self.action_dim = config, spec, action_dim
         self.encoder, self.action_network = self.make_networks()
-        sizes = {POSE: spec.pose_features} | dict.fromkeys(spec.force_fields, 3)
-        self.obs_normalizers = nn.ModuleDict({module_name(key): Normalizer(size) for key, size in sizes.items()})
+        normalizers = {POSE: Normalizer(spec.pose_features)}
+        normalizers |= {key: Normalizer.of_taxels(spec.taxel_shape) for key in spec.force_fields}
+        self.obs_normalizers = nn.ModuleDict({module_name(key): one for key, one in normalizers.items()})
         self.action_normalizer = Normalizer(action_dim)
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:

@@ -41,7 +41,7 @@ def for_cpu(args: Args, inference_steps: int, **policy: Any) -> Args:
         steps=2000,
         lr=1e-3,
         warmup_steps=100,
-        save_every=1000,
+        save_freq=1000,
         device="cpu",
         precision="fp32",
         compile=False,

@@ -4,6 +4,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,52 @@ from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPriva
 
 from manifeel_ms3.errors import ServerError
 from manifeel_ms3.files import write_text
+from manifeel_ms3.tasks.registry import short_name
+
+from .train_args import TrainArgs
 
 LOG = "log.jsonl"
 EVENTS = "events.out.tfevents.*"
 """Files of the log in the folder of a run: json lines, and tensorboard's events."""
 WANDB_TIMEOUT = 30
 """Longest wait for Weights & Biases, s."""
+
+
+GLOBAL_STEP = "global_step"
+"""Name of the gradient step in Weights & Biases, over which everything is drawn."""
+
+
+@dataclass(frozen=True)
+class WandbRun:
+    """What a run is called in Weights & Biases."""
+
+    project: str
+    """Name of the project."""
+    entity: str | None
+    """Team or user; the user's default if None."""
+    name: str
+    """Name of the run."""
+    group: str
+    """Group that the run belongs to."""
+    tags: tuple[str, ...]
+    """Tags of the run."""
+    config: dict[str, Any]
+    """Settings beside those of the run, such as `eval_env_cfg`."""
+
+
+def wandb_run_of(args: TrainArgs, policy: str) -> WandbRun | None:
+    """The run in Weights & Biases, described as ManiSkill's baselines describe theirs; None if it is not asked for.
+
+    Args:
+        args: Settings of the run, with its name.
+        policy: Registered name of the policy.
+    """
+    if not args.track:
+        return None
+    evaluated_on = dict(env_id=args.env_id, env_kwargs=json.loads(args.eval_env_kwargs), num_envs=args.num_eval_envs)
+    tags = (policy, short_name(args.env_id), args.obs_mode)
+    about = dict(eval_env_cfg=evaluated_on)
+    return WandbRun(args.wandb_project_name, args.wandb_entity, str(args.exp_name), policy, tags, about)
 
 
 class RunLog:
@@ -30,15 +71,15 @@ class RunLog:
         folder: Folder of the run.
         config: Settings of the run, for Weights & Biases.
         step: Step of the checkpoint from which the run goes on; 0 where it begins, and the log in the folder is replaced.
-        wandb_project: Project of Weights & Biases; not used if None.
+        wandb_run: The run in Weights & Biases; it is not used if None.
 
     Raises:
         ServerError: Weights & Biases cannot be reached.
         FileWriteError: The log cannot be written.
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_project: str | None):
-        self._wandb = _start_wandb(wandb_project, config, folder) if wandb_project else None
+    def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_run: WandbRun | None):
+        self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
         """The entries of the log that are kept from before."""
         write_text(folder / LOG, "".join(map(_line, self.entries)))
@@ -49,13 +90,18 @@ class RunLog:
             self._show(entry)
         self._lines = (folder / LOG).open("a", encoding="utf-8")
 
-    def write(self, entry: Mapping[str, float]) -> None:
-        """Write an entry: values by name, "step" among them."""
+    def write(self, entry: Mapping[str, float], video: Path | None = None) -> None:
+        """Write an entry: scalars by ManiSkill's names, and "step", which may be earlier than that of the entry before.
+
+        Args:
+            entry: The entry.
+            video: Video of the evaluation that the entry is about, for Weights & Biases.
+        """
         self._lines.write(_line(entry))
         self._lines.flush()
         self._show(entry)
         if self._wandb:
-            self._wandb.log(entry, step=int(entry["step"]))
+            self._wandb.log({GLOBAL_STEP if name == "step" else name: value for name, value in entry.items()} | _film(video))
 
     def sync(self) -> None:
         """Let all entries reach the disk; a checkpoint of their step may follow."""
@@ -64,7 +110,8 @@ class RunLog:
     def _show(self, entry: Mapping[str, float]) -> None:
         """Write an entry to tensorboard."""
         for name, value in entry.items():
-            self._board.add_scalar(f"train/{name}", value, int(entry["step"]))
+            if name != "step":
+                self._board.add_scalar(name, value, int(entry["step"]))
 
     def close(self) -> None:
         """Finish the log."""
@@ -96,15 +143,27 @@ def _line(entry: Mapping[str, float]) -> str:
     return json.dumps(entry) + "\n"
 
 
-def _start_wandb(project: str, config: dict[str, Any], folder: Path) -> Any:
+def _film(video: Path | None) -> dict[str, Any]:
+    if video is None:
+        return {}
+    import wandb
+
+    return {"eval/video": wandb.Video(str(video), format="mp4")}
+
+
+def _start_wandb(run: WandbRun, config: dict[str, Any], folder: Path) -> Any:
     import wandb
     from wandb.errors import CommError, UsageError
 
     try:
         settings = wandb.Settings(init_timeout=WANDB_TIMEOUT)
-        return wandb.init(project=project, config=config, dir=str(folder), settings=settings)
+        about: dict[str, Any] = dict(project=run.project, entity=run.entity, name=run.name, group=run.group, tags=run.tags)
+        started = wandb.init(**about, config=config | run.config, dir=str(folder), settings=settings)
+        # evaluations finish later than the steps that they are about, which wandb's own count does not allow
+        started.define_metric("*", step_metric=GLOBAL_STEP)
+        return started
     except (CommError, UsageError) as error:
         raise ServerError(
             f"Weights & Biases does not accept the run ({error}); log in with `wandb login`, write it to disk with "
-            "WANDB_MODE=offline, or leave out --wandb-project"
+            "WANDB_MODE=offline, or leave out --track"
         ) from error

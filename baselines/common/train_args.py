@@ -4,10 +4,12 @@ import math
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
+from tyro.conf import arg
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import short_name
 
 from .observation import PoseForm
@@ -25,7 +27,7 @@ ON_GPU = torch.cuda.is_available()
 class TrainArgs:
     """Settings of a training run. The defaults are those of the paper's public code."""
 
-    demos: tuple[Path, ...]
+    demos: Annotated[tuple[Path, ...], arg(name="demo-path", aliases=["--demos"])]
     """Trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout."""
     env_id: str = "ManiFeel-PegInsertion-v1"
     """Environment id of the task that the demonstrations are of."""
@@ -52,7 +54,7 @@ class TrainArgs:
     """Number of generation steps in evaluation."""
     batch_size: int = 8
     """Number of samples in a gradient step of each process."""
-    steps: int | None = None
+    steps: Annotated[int | None, arg(name="total-iters", aliases=["--steps"])] = None
     """Number of gradient steps; if not given, the paper's 50,000 epochs divided by the number of demonstrations."""
     lr: float | None = None
     """Learning rate of AdamW after the warm-up, from which it falls to 0 along a cosine; if not given, that of the paper's
@@ -75,27 +77,38 @@ class TrainArgs:
     """Number format of activations and gradients; weights are always fp32."""
     compile: bool = ON_GPU
     """Compile the networks before training, which takes a minute or two."""
+    exp_name: str | None = None
+    """Name of the run: of its folder, runs/<exp_name>, and of the run in Weights & Biases. If not given, it is
+    <policy>/<task>-<obs_mode>-seed<seed>-<date>-<time>."""
     run_dir: Path | None = None
-    """Folder of log.jsonl, tensorboard events, checkpoints and evaluations; a new one if not given,
-    runs/<policy>/<task>-<obs_mode>-seed<seed>-<date>-<time>."""
-    save_every: int = 5000
+    """Folder of log.jsonl, tensorboard events, checkpoints and evaluations; runs/<exp_name> if not given."""
+    save_freq: Annotated[int, arg(aliases=["--save-every"])] = 5000
     """Number of gradient steps between checkpoints; the last step always has one."""
     keep: int = 10
     """Number of checkpoints that are kept."""
-    eval_episodes: int = 0
-    """Number of the task's seeds on which each checkpoint is evaluated, in other processes; no evaluation if 0."""
-    eval_workers: int = 1
-    """Number of processes of an evaluation."""
+    eval_freq: int | None = None
+    """Number of gradient steps between evaluations, which is a multiple of `save_freq`; every checkpoint is evaluated if not
+    given. The last one always is."""
+    num_eval_episodes: Annotated[int, arg(aliases=["--eval-episodes"])] = 0
+    """Number of the task's seeds on which a checkpoint is evaluated, in other processes; no evaluation if 0."""
+    num_eval_envs: Annotated[int, arg(aliases=["--eval-workers"])] = 1
+    """Number of environments of an evaluation, each in a process."""
     eval_env_kwargs: str = "{}"
     """Arguments of the task in evaluation, as a json object."""
-    log_every: int = 50
+    capture_video: bool = False
+    """Record the first episode of each evaluation as a video, in <run_dir>/evaluations/videos."""
+    log_freq: Annotated[int, arg(aliases=["--log-every"])] = 50
     """Number of gradient steps between entries of the log."""
     resume: bool = False
     """Continue from the last checkpoint in run_dir."""
     overwrite: bool = False
     """Delete the checkpoints, the log and the evaluations of an earlier run in run_dir, and begin anew."""
-    wandb_project: str | None = None
-    """Project of Weights & Biases that receives the log, too; WANDB_MODE=offline writes it to disk."""
+    track: bool = False
+    """Send the log to Weights & Biases, too; WANDB_MODE=offline writes it to disk."""
+    wandb_project_name: Annotated[str, arg(aliases=["--wandb-project"])] = "ManiFeel"
+    """Project of Weights & Biases."""
+    wandb_entity: str | None = None
+    """Team or user of Weights & Biases; the user's default if not given."""
 
     def public_code_lr(self) -> float:
         """The learning rate of the paper's public code for these settings."""
@@ -103,22 +116,39 @@ class TrainArgs:
 
 
 FREE_ON_RESUME = {
-    *("demos", "tacrgb_weights", "run_dir", "resume", "overwrite", "device", "compile", "log_every", "wandb_project"),
-    *("steps", "total_steps", "step", "save_every", "keep", "inference_steps", "trained_on", "training_seconds"),
-    *("eval_episodes", "eval_workers", "eval_env_kwargs"),
+    *("demos", "tacrgb_weights", "exp_name", "run_dir", "resume", "overwrite", "device", "compile", "log_freq"),
+    *("steps", "total_steps", "step", "save_freq", "keep", "inference_steps", "trained_on", "training_seconds"),
+    *("eval_freq", "num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "capture_video"),
+    *("track", "wandb_project_name", "wandb_entity"),
 }
 """Settings that may change when a run is resumed."""
 
 
-def default_run_dir(args: TrainArgs, policy: str) -> Path:
-    """Folder of a new run, named by what it trains and by the present time.
+def check_run(args: TrainArgs) -> None:
+    """Check what the settings say of a run as a whole.
+
+    Raises:
+        InvalidArgumentError: The run to resume is not named, or is to be overwritten, or evaluations fall between checkpoints.
+    """
+    if args.resume and (args.run_dir is args.exp_name is None or args.overwrite):
+        raise InvalidArgumentError(
+            "--resume needs --run-dir or --exp-name, the folder or the name of the run to continue, and excludes --overwrite"
+        )
+    if args.eval_freq is not None and (args.eval_freq < 1 or args.eval_freq % args.save_freq):
+        raise InvalidArgumentError(
+            f"--eval-freq {args.eval_freq} must be a multiple of --save-freq {args.save_freq}, as checkpoints are evaluated"
+        )
+
+
+def default_exp_name(args: TrainArgs, policy: str) -> str:
+    """Name of a new run, after what it trains and the present time.
 
     Args:
         args: Settings of the run.
         policy: Registered name of the policy.
     """
     now = datetime.now().strftime("%Y%m%d-%H%M%S")
-    return Path("runs") / policy / f"{short_name(args.env_id)}-{args.obs_mode}-seed{args.seed}-{now}"
+    return f"{policy}/{short_name(args.env_id)}-{args.obs_mode}-seed{args.seed}-{now}"
 
 
 def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:

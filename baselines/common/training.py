@@ -15,15 +15,16 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
-from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
+from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
+from manifeel_ms3.tasks.registry import task_spec
 
 from .agent import spec_of
-from .background_evaluation import BackgroundEvaluation
+from .background_evaluation import SUCCESS, BackgroundEvaluation
 from .checkpoint import (
     LAST,
     TRAINING,
@@ -45,8 +46,8 @@ from .memory import keep_freed_memory, lay_out_channels_last
 from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
 from .processes import Processes
-from .run_log import RunLog
-from .train_args import FREE_ON_RESUME, TrainArgs, default_run_dir, default_steps
+from .run_log import RunLog, wandb_run_of
+from .train_args import FREE_ON_RESUME, TrainArgs, check_run, default_exp_name, default_steps
 
 log = logging.getLogger(__name__)
 CHECKPOINTS, EVALUATIONS = "checkpoints", "evaluations"
@@ -74,10 +75,11 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
         TrainingError: The loss is not a finite number.
     """
-    if args.resume and (args.run_dir is None or args.overwrite):
-        raise InvalidArgumentError("--resume needs --run-dir, the folder of the run to continue, and excludes --overwrite")
+    check_run(args)
     processes = Processes(args.device)
-    run_dir = Path(processes.of_first(str(args.run_dir or default_run_dir(args, policy_class.name))))
+    args = replace(args, env_id=task_spec(args.env_id).env_id)
+    exp_name = processes.of_first(args.exp_name or default_exp_name(args, policy_class.name))
+    run_dir = args.run_dir or Path("runs") / exp_name
     with owned(run_dir) if processes.first else nullcontext():
         if saved_checkpoints(run_dir / CHECKPOINTS) and not (args.resume or args.overwrite):
             raise FileExistsAlreadyError(
@@ -86,7 +88,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
             )
         if processes.first:
             log.info("the run is in %s", run_dir)
-        return Trainer(replace(args, run_dir=run_dir), policy_class, processes).run()
+        return Trainer(replace(args, exp_name=exp_name, run_dir=run_dir), policy_class, processes).run()
 
 
 class Trainer:
@@ -127,7 +129,7 @@ class Trainer:
             self.policy.parameters(), args.ema_max_decay, use_ema_warmup=True, power=args.ema_power, inv_gamma=1.0, foreach=True
         )
         self.order = SampleOrder(len(self.dataset), args.seed)
-        self.losses = RecentLosses(args.log_every, self.device)
+        self.losses = RecentLosses(args.log_freq, self.device)
         self.step, self.begin = 0, time.time()
         if args.resume:
             self._resume()
@@ -136,7 +138,12 @@ class Trainer:
 
         self.model = self.processes.with_mean_gradients(self.policy).train()
         self.evaluation = BackgroundEvaluation(
-            self.run_dir / EVALUATIONS, args.eval_episodes, args.eval_workers, args.eval_env_kwargs, args.device
+            self.run_dir / EVALUATIONS,
+            args.num_eval_episodes,
+            args.num_eval_envs,
+            args.eval_env_kwargs,
+            args.device,
+            args.capture_video,
         )
         self.log = self._open_log() if processes.first else None
 
@@ -155,12 +162,12 @@ class Trainer:
             task = bar.add_task("training", total=self.total_steps, completed=self.step)
             while self.step < self.total_steps:
                 self.take_step()
-                due = self.step % self.args.save_every == 0 or self.step == self.total_steps
+                due = self.step % self.args.save_freq == 0 or self.step == self.total_steps
                 if self.losses.full or due:  # the only place that waits for the device
                     bar.update(task, description=f"training, loss {self._log_loss():.4f}")
                 if due:
                     self._save_and_evaluate()
-                if self.step % self.args.log_every == 0:
+                if self.step % self.args.log_freq == 0:
                     self._log_evaluations()
                 bar.update(task, completed=self.step)
         return self._finish()
@@ -224,21 +231,29 @@ class Trainer:
             for name in (CHECKPOINTS, EVALUATIONS):
                 if (self.run_dir / name).is_dir():
                     remove_folder(self.run_dir / name)
-        opened = RunLog(self.run_dir, self.config, self.step, self.args.wandb_project)
+        opened = RunLog(self.run_dir, self.config, self.step, wandb_run_of(self.args, str(self.config["policy_name"])))
         if self.args.resume:
             make_last(newest_checkpoint(self.checkpoints))
-            evaluated = {entry.get("evaluated_step") for entry in opened.entries}
-            for checkpoint in saved_checkpoints(self.checkpoints) if self.args.eval_episodes else []:
-                if int(checkpoint.name) not in evaluated:
+            evaluated = {entry["step"] for entry in opened.entries if SUCCESS in entry}
+            for checkpoint in saved_checkpoints(self.checkpoints):
+                if self._is_evaluated(int(checkpoint.name)) and int(checkpoint.name) not in evaluated:
                     self.evaluation.submit(checkpoint)
         return opened
+
+    def _is_evaluated(self, step: int) -> bool:
+        """Whether the checkpoint of a step is evaluated."""
+        due = step % (self.args.eval_freq or self.args.save_freq) == 0 or step == self.total_steps
+        return self.args.num_eval_episodes > 0 and due
 
     def _log_loss(self) -> float:
         """Log the mean loss since the last entry, and return it."""
         mean = self.losses.take_mean(self.step, self.dataset.names)
         if self.log:
             epoch = self.step / math.ceil(len(self.dataset) / self.batch_size)
-            self.log.write(dict(step=self.step, loss=mean, lr=self.schedule.get_last_lr()[0], epoch=epoch))
+            seconds = time.time() - self.begin
+            scalars = {"losses/total_loss": mean, "charts/learning_rate": self.schedule.get_last_lr()[0], "charts/epoch": epoch}
+            scalars |= {"time/total_seconds": seconds, "time/iterations_per_second": self.step / max(seconds, 1e-9)}
+            self.log.write(dict(step=self.step) | scalars)
         return mean
 
     def _save_and_evaluate(self) -> None:
@@ -247,15 +262,15 @@ class Trainer:
             return
         self.log.sync()
         checkpoint = self.save()
-        if self.args.eval_episodes:
+        if self._is_evaluated(self.step):
             self.evaluation.submit(checkpoint)
         prune(self.checkpoints, self.args.keep, self.evaluation.in_use)
 
     def _log_evaluations(self, wait: bool = False) -> None:
         """Log the evaluations that have finished; wait for all of them if asked."""
         if self.log:
-            for rate in self.evaluation.finished(wait):
-                self.log.write(dict(step=self.step) | rate)
+            for entry in self.evaluation.finished(wait):
+                self.log.write(entry, self.evaluation.video_of(int(entry["step"])))
 
     def _finish(self) -> Path:
         """Wait for the evaluations and for the other processes, and return the last checkpoint."""
@@ -356,7 +371,8 @@ def with_taxel_shape(spec: ObservationSpec, episode: Episode) -> ObservationSpec
 
 def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
     """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json knows."""
-    return as_json(args) | dict(
+    settings = {name: value for name, value in as_json(args).items() if name != "wandb_entity"}  # who it is, is not published
+    return settings | dict(
         policy_name=policy_class.name,
         action_dim=dataset.actions.shape[1],
         taxel_shape=list(dataset.spec.taxel_shape),

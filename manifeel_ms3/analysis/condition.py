@@ -25,8 +25,9 @@ NO_SETTINGS = frozenset(
         *("seed", "step"),  # what a condition has several of
         *("action_dim", "taxel_shape", "num_samples"),  # follow from the task and its demonstrations
         *("demos", "run_dir", "resume", "overwrite", "device", "compile", "trained_on", "training_seconds"),  # where and how
-        *("total_steps", "save_every", "keep", "log_every"),
-        *("eval_episodes", "eval_workers", "eval_env_kwargs", "wandb_project"),
+        *("total_steps", "save_freq", "keep", "log_freq"),
+        *("num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "eval_freq", "capture_video"),
+        *("exp_name", "track", "wandb_project_name", "wandb_entity"),
     }
 )
 """Entries of a policy's configuration that make no other policy. Every other entry does."""

@@ -317,8 +317,7 @@ def main(args: Args) -> list[ProbeResult]:
     recorded = dict(_recorded_tasks(args.demos))
     if not recorded:
         raise DemonstrationError(
-            f"{args.demos} holds no <task>/trajectory.*.h5 with observations; record them with "
-            "`python -m manifeel_ms3.demonstrations.dataset`"
+            f"{args.demos} holds no <task>/trajectory.*.h5 with observations; record them with `manifeel dataset`"
         )
     asked = [(probe, spec.env_id, path) for path, spec in recorded.items() for probe in spec.probes]
     results: list[ProbeResult] = []

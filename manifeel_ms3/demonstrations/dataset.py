@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -54,10 +54,10 @@ class Args:
     out: Path = Path("data/demos")
     """Folder to write."""
     tasks: tuple[str, ...] = field(default_factory=lambda: tuple(all_tasks()))
-    """Ids of the tasks to record."""
-    num: int | None = None
+    """Ids or short names of the tasks to record."""
+    num: Annotated[int | None, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = None
     """Number of episodes of each task; as many as the paper recorded if not given."""
-    workers: int = 1
+    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
     """Number of worker processes."""
     obs_mode: str = "rgb+tacrgb+tacff"
     """Observations to render, joined by "+"; "none" writes states and actions alone."""
@@ -82,7 +82,7 @@ def main(args: Args) -> Path:
 
 
 def _record_all(args: Args) -> Path:
-    counts = {task: args.num or task_spec(task).paper_demos for task in args.tasks}
+    counts = {spec.env_id: args.num or spec.paper_demos for spec in map(task_spec, args.tasks)}
     observed = args.obs_mode != "none"
     _check_room(args, counts if observed else {})
     files = {
@@ -170,7 +170,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = Path(folder) / MANIFEST_FILE
     if not path.is_file():
-        raise DemonstrationError(f"{path} does not exist; `python -m manifeel_ms3.demonstrations.dataset` writes one")
+        raise DemonstrationError(f"{path} does not exist; `manifeel dataset` writes one")
     try:
         manifest = read_json(path, MANIFEST, "a manifest")
     except InvalidFileError as error:

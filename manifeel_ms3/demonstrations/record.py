@@ -7,7 +7,7 @@ killed continues where it stopped when the same command is given again.
 import logging
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +18,7 @@ from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
-from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
@@ -33,10 +33,10 @@ class Args:
     """Arguments of the command."""
 
     env_id: tyro.conf.Positional[str]
-    """Id of the task, such as ManiFeel-PegInsertion-v1."""
-    num: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 50
+    """Id of the task, such as ManiFeel-PegInsertion-v1, or its short name, such as PegInsertion."""
+    num: Annotated[int, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = 50
     """Number of successful episodes that the file shall hold."""
-    workers: int = 1
+    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
     """Number of worker processes."""
     seed: int = 0
     """First seed to try. Seeds from 100000 on are for evaluation."""
@@ -80,8 +80,10 @@ class Args:
         """Seeds that may be tried.
 
         Raises:
-            InvalidArgumentError: There are not `num` seeds for demonstrations from `seed` on.
+            InvalidArgumentError: No episode is asked for, or there are not `num` seeds for demonstrations from `seed` on.
         """
+        if self.num < 1:
+            raise InvalidArgumentError(f"--num-demos {self.num}: at least 1 episode must be asked for")
         if not 0 <= self.seed <= FIRST_EVALUATION_SEED - self.num:
             raise InvalidArgumentError(
                 f"{self.num} episodes from seed {self.seed} on are asked for; demonstrations have the seeds 0 to "
@@ -104,6 +106,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         InUseError: Another process records into the file.
         WorkFailedError: Too many seeds failed, or a worker process died.
     """
+    args = replace(args, env_id=task_spec(args.env_id).env_id)
     require_demonstrator(args.env_id)
     path, seeds, env_kwargs = args.path, args.seeds, args.all_env_kwargs
     header = make_header(args.env_id, env_kwargs) | dict(failed_seeds=[])

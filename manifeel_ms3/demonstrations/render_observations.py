@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -50,9 +50,9 @@ class Args:
     """Width and height of camera images in pixels; the task's 256 if not given."""
     control_mode: str | None = None
     """Controller to which the actions are converted, such as pd_joint_pos; that of the recording if not given."""
-    workers: int = 1
+    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
     """Number of worker processes."""
-    num: int | None = None
+    num: Annotated[int | None, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = None
     """Number of episodes to render; all of them if not given."""
 
 

@@ -5,7 +5,7 @@ import sys
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import gymnasium as gym
 import numpy as np
@@ -30,7 +30,7 @@ class Args:
 
     path: tyro.conf.Positional[Path]
     """Path of the trajectory file."""
-    num: int | None = None
+    num: Annotated[int | None, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = None
     """Number of episodes to replay; all of them if not given."""
 
 

@@ -18,7 +18,7 @@ import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -74,12 +74,12 @@ class Args:
     overwrite: bool = False
     """Discard the finished episodes of an evaluation that was interrupted, and begin again. Without this flag the evaluation
     goes on if nothing has changed, and is refused otherwise. It cannot be known whether the policy of a server has changed."""
-    episodes: int = 50
+    episodes: Annotated[int, tyro.conf.arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     seeds: Path | None = None
-    """Text file with the seeds of the episodes, one a line, which replaces --episodes: a private list of initial states, to
-    which no policy can have been fitted. The result holds the seeds, too."""
-    workers: int = 1
+    """Text file with the seeds of the episodes, one a line, which replaces --num-eval-episodes: a private list of initial
+    states, to which no policy can have been fitted. The result holds the seeds, too."""
+    workers: Annotated[int, tyro.conf.arg(name="num-eval-envs", aliases=["--workers"])] = 1
     """Number of processes that simulate episodes side by side; one more process holds the policy of a checkpoint."""
     inference_steps: int | None = None
     """Number of denoising or integration steps for one action chunk; the checkpoint's own number if not given."""

@@ -154,8 +154,7 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
     found = [path for folder in folders for path in sorted(folder.rglob("*.json")) if path.stem.isdigit()]
     if not found:
         raise ResultError(
-            f"{[str(folder) for folder in folders]} hold no results; train with --eval-episodes 50, or run "
-            "`python -m baselines.studies`"
+            f"{[str(folder) for folder in folders]} hold no results; train with --num-eval-episodes 50, or run `manifeel study`"
         )
     return [read_result(path) for path in found]
 

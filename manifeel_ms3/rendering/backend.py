@@ -2,11 +2,14 @@
 
 import functools
 import gc
+import logging
+import multiprocessing
 import os
 
 import sapien
 import torch
 
+log = logging.getLogger(__name__)
 NO_RENDERER = (
     "no Vulkan renderer was found, and {wanted} needs one. Without a GPU, install Mesa 24.3 or newer (Debian 12: "
     "`apt install -t bookworm-backports mesa-vulkan-drivers` and `apt install libvulkan1 libegl1 libgl1`; Ubuntu 24.04: "
@@ -51,6 +54,13 @@ def use_one_thread_after_fork() -> None:
     """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's threads, which a fork loses."""
     if os.getpid() != _IMPORTED_IN:
         torch.set_num_threads(1)
+
+
+@functools.cache
+def announce_first_image(backend: str) -> None:
+    """Say once, in the main process, why the first image on a CPU takes long: SAPIEN prepares its renderer in each process."""
+    if backend == "cpu" and multiprocessing.parent_process() is None:
+        log.warning("Preparing the renderer on the CPU, once in this process; this takes about 10 seconds.")
 
 
 @functools.cache

@@ -2,7 +2,7 @@
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (SAPIEN's stubs ask for arrays of single precision, and leave out what is internal)
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +75,7 @@ def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
         lamp.shadow_near, lamp.shadow_far = shadow.near, shadow.far
 
 
-def aim_lamp(lamp: Lamp, direction: tuple[float, float, float]) -> None:
+def aim_lamp(lamp: Lamp, direction: Sequence[float] | np.ndarray) -> None:
     """Let a lamp shine in a direction, over the middle of what its shadow covers."""
     unit = np.asarray(direction) / np.linalg.norm(direction)
     lamp.local_pose = sapien.Pose([0.5, 0.0, 0.0], sapien.math.shortest_rotation(np.array([1.0, 0.0, 0.0]), unit))

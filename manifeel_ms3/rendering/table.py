@@ -20,20 +20,23 @@ WOOD = (0.68, 0.59, 0.49)
 ROUGHNESS = 0.5
 
 
-@functools.cache
 def wood() -> RenderMaterial:
     """Surface of the table; only where there is a renderer."""
-    pixels = np.dstack([_boards(), np.full((PIXELS, PIXELS), 255, np.uint8)])
-    levels = int(np.log2(PIXELS)) + 1
-    texture = RenderTexture2D(pixels, "R8G8B8A8Unorm", mipmap_levels=levels, srgb=True)
     material = RenderMaterial(roughness=ROUGHNESS, specular=0.5)
-    material.base_color_texture = texture
+    material.base_color_texture = wood_texture(0)
     return material
 
 
-def _boards() -> np.ndarray:
+@functools.cache
+def wood_texture(seed: int) -> RenderTexture2D:
+    """Texture of the table, painted once in a process; seed 0 is the usual one."""
+    pixels = np.dstack([boards(seed), np.full((PIXELS, PIXELS), 255, np.uint8)])
+    return RenderTexture2D(pixels, "R8G8B8A8Unorm", mipmap_levels=int(np.log2(PIXELS)) + 1, srgb=True)
+
+
+def boards(seed: int) -> np.ndarray:
     """Image uint8 (PIXELS, PIXELS, 3) of boards along its rows, which continues on the opposite side."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     fine, broad = _streaks(rng, 60, 1.0), _streaks(rng, 250, 9.0)
     brightness = np.empty((PIXELS, PIXELS))
     seams = np.zeros((PIXELS, PIXELS))

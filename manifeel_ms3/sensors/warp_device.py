@@ -6,10 +6,12 @@ import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import torch
 import warp as wp
 
+STDERR = 2  # file descriptor
 MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since handing them over takes longer (chosen)
 
 setattr(wp.config, "quiet", True)  # noqa: B010 (newer releases of warp no longer declare it)
@@ -19,9 +21,25 @@ if hasattr(wp, "LOG_WARNING"):  # newer releases
 _threads = 1  # that `launch_split` may use, changed by `use_torch_threads_for_warp`
 
 
+@functools.cache
+def _start_warp() -> None:
+    """Start warp, whose native code writes to stderr if it finds no GPU, whatever its log level."""
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    shown = os.dup(STDERR)
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), STDERR)
+            wp.init()
+    finally:
+        os.dup2(shown, STDERR)
+        os.close(shown)
+
+
 def warp_device(device: torch.device):
     """Warp's device that corresponds to torch's."""
-    wp.init()
+    _start_warp()
     return wp.device_from_torch(device)
 
 

@@ -36,8 +36,7 @@ def main(args: Args) -> None:
             table.add_row(spec.name, spec.category, steps, spec.policy_camera, _summary(spec.env_class))
         Console().print(table)
         return
-    by_name = {spec.name: env_id for env_id, spec in all_tasks().items()}
-    spec = task_spec(by_name.get(args.task, args.task))
+    spec = task_spec(args.task)
     Console().print(Markdown(f"# {spec.env_id}\n\n{inspect.getdoc(spec.env_class)}"))
 
 

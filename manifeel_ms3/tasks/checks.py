@@ -14,7 +14,9 @@ Limits = Mapping[str, tuple[float, str]]
 """The largest half range that can be played, by the name of a randomization's field, and what happens beyond it."""
 
 
-def checked_randomization(env_name: str, kind: Any, overrides: Any, limits: Limits) -> Any:
+def checked_randomization(
+    env_name: str, kind: Any, overrides: Any, limits: Limits, argument: str = "randomization", example: str = "socket_xy"
+) -> Any:
     """Make a task's randomization from the fields that a caller overrides.
 
     Args:
@@ -22,19 +24,21 @@ def checked_randomization(env_name: str, kind: Any, overrides: Any, limits: Limi
         kind: Dataclass of the randomization.
         overrides: Half ranges by field name.
         limits: Largest half ranges by field name.
+        argument: Name of the argument that holds the fields, for messages.
+        example: Name of a field, for messages.
 
     Raises:
         InvalidArgumentError: A field is unknown, or its value is no number, negative or too large.
     """
     known = kind.__dataclass_fields__
-    for name, value in by_name("randomization", overrides, "dict(socket_xy=0.01)").items():
+    for name, value in by_name(argument, overrides, f"dict({example}=0.01)").items():
         if name not in known:
-            raise InvalidArgumentError(f"randomization[{name!r}] is unknown for {env_name}; known: {list(known)}")
+            raise InvalidArgumentError(f"{argument}[{name!r}] is unknown for {env_name}; known: {list(known)}")
         if not (is_number(value) and value >= 0):
-            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} must be a finite number >= 0")
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} must be a finite number >= 0")
         limit, reason = limits.get(name, (np.inf, ""))
         if value > limit:
-            raise InvalidArgumentError(f"randomization[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
     return kind(**overrides)
 
 

@@ -134,14 +134,15 @@ def task_spec(env_id: str) -> TaskSpec:
     """The specification of a task.
 
     Args:
-        env_id: Id of the task. A module before a colon ("manifeel_ms3:ManiFeel-PegInsertion-v1"), as ManiSkill's files
-            have it, is left aside: it is never imported.
+        env_id: Id of the task, or its short name, such as "PegInsertion". A module before a colon, as in the id of ManiSkill's
+            files ("manifeel_ms3:ManiFeel-PegInsertion-v1"), is left aside: it is never imported.
 
     Raises:
         UnknownNameError: The task is not registered; the message lists those that are.
     """
     _load_plugins()
-    return _known(env_id.rpartition(":")[2])
+    name = env_id.rpartition(":")[2]
+    return _known(next((known for known in _SPECS if short_name(known) == name), name))
 
 
 def instruction_of(env_class: type) -> str:

@@ -6,11 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
-import numpy as np
 import sapien
 import torch
 from gymnasium.envs.registration import EnvSpec
-from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 
@@ -21,39 +19,28 @@ from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import (
     FORKED,
     NO_RENDERER,
+    announce_first_image,
     available_render_backend,
     renderer_lost,
     use_one_thread_after_fork,
 )
-from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
-from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, drawn_sizes, fine_shadow, presentation_shader
-from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
+from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .bench import build_bench
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import split_obs_mode
 from .registry import gym_id, instruction_of
-from .sensing import SensingEnv
+from .scenery import SceneryEnv
 from .states import is_part_of, unflattened
-from .viewpoints import looking_at, looking_down
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
-LIGHTING = {"normal": 1.0, "dim": 0.05}
-"""Share of the normal light; the paper gives no figure for its dim light."""
 HOLD_SECONDS = 0.5
 """Time for which a goal must hold until the episode is a success, in s."""
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s."""
-IMAGE_SIZE = 256
-"""Width and height of the cameras' images, in pixels (public code of the paper)."""
-FIELD_OF_VIEW = np.deg2rad(75)
-"""Field of view of the cameras, in rad (public code of the paper)."""
-FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
-"""Links whose shadow falls beside what the shadow map covers."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
@@ -63,7 +50,7 @@ CONTACTS: dict[str, Any] = dict(
 """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
 
 
-class VisuotactileEnv(SensingEnv):
+class VisuotactileEnv(SceneryEnv):
     """Base class of the ManiFeel tasks: a Panda with two tactile fingers at the origin of a table, x ahead, z up.
 
     The observation mode joins ManiSkill's modes with `tacrgb` and `tacff` by "+". An observation holds what the mode asks for:
@@ -100,6 +87,8 @@ class VisuotactileEnv(SensingEnv):
         quality: Quality of the cameras' images: "normal", or "fast", which leaves out the shadow.
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
+        visual_randomization: Fields of `VisualRandomization` to override, by name: `dict(light_level=0.3)`. Looks are drawn
+            from the episode's seed, and `info["looks"]` holds them; by default they are the same in every episode.
         kwargs: Other arguments of ManiSkill's `BaseEnv`.
 
     Raises:
@@ -124,10 +113,6 @@ class VisuotactileEnv(SensingEnv):
     """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
     max_reward = 4.0
     """Largest value of the dense reward."""
-    front_camera_at = (0.68, 0.0, 0.15)
-    """Position of the front camera, in m (public code of the paper)."""
-    side_camera_at = (0.5, -0.17, 0.17)
-    """Position of the side camera, in m (public code of the paper)."""
     agent: PandaGelSight
     _spec: EnvSpec | None = None
 
@@ -149,6 +134,7 @@ class VisuotactileEnv(SensingEnv):
         quality: str = "normal",
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
+        visual_randomization: dict[str, float] | None = None,
         **kwargs,
     ):
         own_mode, self._tactile_outputs = split_obs_mode(obs_mode or "state")
@@ -164,8 +150,7 @@ class VisuotactileEnv(SensingEnv):
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
         self._finger = Finger.of(configs["right"], self.grips_round_parts)
-        self._lighting = one_of("lighting", lighting, LIGHTING)
-        self._quality = one_of("quality", quality, SHADOWS)
+        self._set_looks(lighting, quality, visual_randomization or {}, kwargs.get("num_envs", 1))
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -177,8 +162,7 @@ class VisuotactileEnv(SensingEnv):
         check_num_envs(kwargs.get("num_envs", 1))
         use_one_thread_after_fork()
         backend = available_render_backend(render_backend)
-        if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
-            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+        self._require_renderer(backend, own_mode, kwargs.get("render_mode"))
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -189,6 +173,12 @@ class VisuotactileEnv(SensingEnv):
             human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
+
+    def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
+        if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):
+            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+        if self._wanted_images(own_mode, None):
+            announce_first_image(backend)
 
     @staticmethod
     def _wanted_images(own_mode: str, render_mode: str | None) -> str:
@@ -257,34 +247,6 @@ class VisuotactileEnv(SensingEnv):
             scene_config=SceneConfig(**self.contacts),
         )
 
-    @property
-    def _default_sensor_configs(self):
-        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
-        return [
-            CameraConfig(
-                name,
-                looking_down(*views[name]),
-                IMAGE_SIZE,
-                IMAGE_SIZE,
-                FIELD_OF_VIEW,
-                near=0.01,
-                far=10,
-                shader_config=camera_shader(),
-            )
-            for name in self._camera_names
-            if name in views
-        ]
-
-    @property
-    def _default_human_render_camera_configs(self):
-        pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
-        drawn, view = SIZE * SUPERSAMPLING, np.deg2rad(45)
-        return CameraConfig("render_camera", pose, drawn, drawn, view, near=0.01, far=10, shader_config=presentation_shader())
-
-    def render_rgb_array(self, camera_name: str | None = None):
-        with fine_shadow(self._lamps, SHADOWS[self._quality]):
-            return super().render_rgb_array(camera_name)
-
     def _load_agent(self, options: dict):
         # not by its name in `robot_uids`, by which ManiSkill makes robots without arguments
         self.agent = PandaGelSight(
@@ -293,19 +255,11 @@ class VisuotactileEnv(SensingEnv):
         self.agent.mounted_cameras = tuple(name for name in self._camera_names if name == "wrist")
 
     def _load_scene(self, options: dict):
-        build_bench(self.scene)
+        self._build_bench()
         self._load_task()
 
-    def _setup_sensors(self, options: dict):
-        set_picture_formats()
-        super()._setup_sensors(options)
-
-    def _load_lighting(self, options: dict):
-        self._lamps = add_lights(self.scene, LIGHTING[self._lighting], SHADOWS[self._quality])
-        links = self.agent.robot.links_map
-        cast_no_shadow([self.scene.actors["table"], self.scene.actors["floor"], *(links[name] for name in FAR_LINKS)])
-
     def _after_reconfigure(self, options: dict):
+        self._make_random_looks()
         self._make_tactile_sensors()
         self._measured: dict[str, torch.Tensor] | None = None
         self._steps_at_goal = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
@@ -358,6 +312,7 @@ class VisuotactileEnv(SensingEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict):
         with torch.device(self.device):
             self._initialize_task(env_idx)
+        self._draw_looks(int(self._episode_seed[0]))
         self._steps_at_goal[env_idx] = 0
         self._success_paper[env_idx] = False
         self._contact_force[env_idx] = 0.0
@@ -406,6 +361,8 @@ class VisuotactileEnv(SensingEnv):
         info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
         if self.paper_goal_reached(measures) is not None:
             info["success_paper"] = self._success_paper.clone()
+        if self._looks:
+            info["looks"] = dict(self._looks)
         return info | self._drawn_imperfections()
 
     # ---------------------------------------------------------------- observation

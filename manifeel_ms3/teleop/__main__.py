@@ -5,7 +5,7 @@ Needs the extra `teleop`.
 
 import logging
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,7 +60,7 @@ def main(args: Args) -> Path:
     with missing_extras_named():
         from .local_server import LOOPBACK_NAMES
         from .page import Page
-    task_spec(args.env_id)
+    args = replace(args, env_id=task_spec(args.env_id).env_id)
     kwargs: dict[str, Any] = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))
     if args.cameras is not None:
         kwargs["cameras"] = list(args.cameras)

@@ -22,9 +22,9 @@ import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.evaluation.provenance import git_commit, machine, package_versions
 from manifeel_ms3.files import write_text
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.provenance import git_commit, machine, package_versions
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 from manifeel_ms3.sensors.visualisation import force_field_images
 
@@ -108,6 +108,7 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
         strip=_strip(found),
         names=[picture.shape for picture in found.pictures],
         readings=found.readings,
+        left_out=found.left_out,
     )
 
 

@@ -1,7 +1,7 @@
 """Known loads on a sensor: what was applied, what the sensor reports, and what a penalty field would say."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,8 @@ LOOP_LOADS = (2.0, 4.0, 6.0, 8.0, 10.0)
 """Loads, in N, of the loop of loading and unloading, which begins and ends at 0."""
 DEPTH_LOADS = (1.0, 3.0, 10.0)
 """Loads, in N, of a ball whose depth is compared with the law of the gel layer."""
+MOST_SLIDING = 2e-3
+"""Distance, in m, from which an object counts as having slid off: the load then no longer acts where it was put."""
 CLEARANCE = 2e-4
 """Height over the pad at which an object begins, in m."""
 SHAPES: dict[str, tuple[dict[str, Any], float]] = {
@@ -78,6 +80,8 @@ class Measurements:
     """Loading and unloading (n, 2): applied and reported normal force, N."""
     depths: np.ndarray
     """A ball in the middle of the pad (n, 3): load in N, depth, and depth by the law of the layer, m."""
+    left_out: list[str] = field(default_factory=list)
+    """Loads that were left out, and why."""
 
 
 def measure(
@@ -105,7 +109,7 @@ def measure(
     for name, (shape, touching) in SHAPES.items():
         on_shape(name)
         press = Press(indenter(name, **shape), **arguments)
-        found.readings += _readings(press, name, touching, loads)
+        found.readings += _readings(press, name, touching, loads, found.left_out)
         found.pictures.append(_picture(press, name, touching))
         if name.startswith("box"):
             found.loop = _loop(press, touching)
@@ -121,16 +125,20 @@ def largest_load(press: Press, name: str) -> float:
     return 0.9 * stiffness * press.sensor.config.housing.protrusion
 
 
-def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]) -> Iterator[Reading]:
+def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...], left_out: list[str]) -> Iterator[Reading]:
     config = with_options(press.sensor.config, {"units": "tacsl"})
     penalty = TactileSensor(config, press.env.scene, press.env.agent.robot, ("force_field",))
     for load in loads:
         if load > largest_load(press, name):
+            left_out.append(f"{name} at {load:g} N: it would reach the housing")
             continue
         twist = 0.0 if name.startswith("ball") else TWIST_ARM * load  # a ball on a point contact would spin
         applied = np.array([load, *(share * load for share in SHEAR_SHARES), twist])
         press.place(touching + CLEARANCE, *PLACE)
         press.push(*applied)
+        if press.slid > MOST_SLIDING:
+            left_out.append(f"{name} at {load:g} N: it slid by {1e3 * press.slid:.0f} mm in the engine")
+            continue
         penalty.reset(torch.arange(1))
         penalty.capture()
         indented = penalty.get_obs()["force_field"][..., 0].sum().item()
@@ -178,4 +186,5 @@ def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
     def excess(depth: float) -> float:
         return gel.normal_stiffness * area * np.maximum(depth - gap, 0.0).sum() - load
 
-    return float(brentq(excess, 0.0, radius / 2))
+    root: Any = brentq(excess, 0.0, radius / 2)  # typed as the full output, too, which is not asked for
+    return float(root)

@@ -1,6 +1,6 @@
 """Objects pressed on the right pad by known forces, through the engine's own contacts."""
 
-# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # (ManiSkill and SAPIEN annotate poses and bodies by their base classes)
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -124,6 +124,7 @@ class Press:
         self.body.set_linear_velocity([0, 0, 0])
         self.body.set_angular_velocity([0, 0, 0])
         self.load = np.zeros(4)
+        self._placed = np.array([x, y])
         self._last = self.actor.pose.sp
         self.sensor.reset(torch.arange(1))
 
@@ -189,6 +190,12 @@ class Press:
         field, wrench = self.field, self.sensor.wrench()[0].numpy()
         centre = (field[..., :1] * self.taxels).sum((0, 1)) / field[..., 0].sum()
         return float(np.abs(centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max())
+
+    @property
+    def slid(self) -> float:
+        """Distance of the object's origin along the face from where it was placed, m."""
+        pose = self.env.agent.gels["right"].pose.sp.inv() * self.actor.pose.sp
+        return float(np.linalg.norm(pose.p[:2] - self._placed))
 
     @property
     def depth(self) -> np.ndarray:

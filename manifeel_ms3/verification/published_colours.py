@@ -36,7 +36,7 @@ def gradients(surface: np.ndarray, pixel_size: float) -> tuple[np.ndarray, np.nd
 
 def places(shape: tuple[int, int]) -> list[np.ndarray]:
     """Normalised rows and columns (H, W) of an image, in [-1, 1]."""
-    return list(np.meshgrid(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), indexing="ij"))
+    return list(np.meshgrid(*(np.linspace(-1, 1, count) for count in shape), indexing="ij"))
 
 
 def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> np.ndarray:
@@ -50,7 +50,8 @@ def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> n
     v = ((phi + np.pi) / (2 * np.pi / last) - 0.5) % last
     i, j = u.astype(int), v.astype(int)
     shape = (surface.shape[0], surface.shape[1])
-    terms = portrait_place(*places(shape), shape)
+    rows_at, cols_at = places(shape)
+    terms = portrait_place(rows_at, cols_at, shape)
     total = np.zeros((*shape, 3))
     for rows, row_share in ((i, 1 - (u - i)), (i + 1, u - i)):
         for cols, col_share in ((j, 1 - (v - j)), ((j + 1) % last, v - j)):

@@ -12,6 +12,8 @@ from manifeel_ms3.analysis.paper import ENCODERS, MODES, POLICIES, TACFF, TACRGB
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.protocol import collect, of_the_protocol
 from manifeel_ms3.evaluation.result import ResultError, results_in
+from manifeel_ms3.tasks.registry import task_spec
+from tests.conftest import PEG
 
 from .made_up import write_run
 
@@ -50,7 +52,9 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
         write_run(tmp_path, VISION, rate, seed, checkpoints=10)
     page = page_of(tmp_path)
     ran, beside = (line for line in page.splitlines() if "3 x 10 x 50" in line)
-    assert ran.startswith("| PegInsertion revision 2 | rgb wrist | diffusion_policy |  | 50 | paper | `")
+    assert ran.startswith(
+        f"| PegInsertion revision {task_spec(PEG).revision} | rgb wrist | diffusion_policy |  | 50 | paper | `"
+    )
     assert beside.startswith("| I | PegInsertion | rgb | diffusion_policy |  | 50 | 14 ± 1% | 20% [")
     assert beside.endswith("| 10% | 3 x 10 x 50 | paper |")  # the deviation of 10, 20 and 30 %
     assert "| I | USBInsertion | rgb | diffusion_policy |  | 50 | 49 ± 3% | not run |" in page
@@ -246,5 +250,5 @@ def test_the_papers_own_numbers_agree_with_its_claims_but_where_it_contradicts_i
 
 
 def test_folders_without_results_are_named(tmp_path):
-    with pytest.raises(ResultError, match="--eval-episodes 50"):
+    with pytest.raises(ResultError, match="--num-eval-episodes 50"):
         claims.main(claims.Args((tmp_path,)))

@@ -125,7 +125,7 @@ def test_questions_are_asked_where_the_paper_says_that_touch_decides():
 
 
 def test_audit_says_what_is_missing(recorded, tmp_path):
-    with pytest.raises(DemonstrationError, match=r"demonstrations\.dataset"):
+    with pytest.raises(DemonstrationError, match="manifeel dataset"):
         information_audit.main(information_audit.Args(tmp_path / "nothing"))
     path = recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5"
     with h5py.File(path, "r+") as file:

@@ -256,3 +256,24 @@ def test_action_networks_map_actions_to_noise_and_use_step_and_condition(kind):
 def test_papers_unet_has_the_published_channels():
     net = ConditionalUnet1D(6, 146)
     assert [block[0].second[0].out_channels for block in net.down] == [512, 1024, 2048]
+
+
+def test_force_fields_are_normalised_taxel_by_taxel():
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([[1.0, 0.1], [0.01, 0.0]])[None, ..., None]  # N, of four taxels: a corner, two inside, one untouched
+    fields = size * torch.rand(50, 2, 2, 3, generator=generator)
+    normalizer = Normalizer.of_taxels((2, 2))
+    normalizer.fit(fields)
+    seen = normalizer.normalize(fields)
+    assert seen[:, 0].amax((0, 1)).tolist() == pytest.approx([1, 1, 1])
+    assert seen[:, 0, 1].std(0).min() > 0.4  # a tenth of the corner's force is seen as large as that
+    assert 0.1 < seen[:, 1, 0].abs().max() < 0.3  # less than a twentieth is not magnified as far
+    assert (seen[:, 1, 1] == 0).all()
+    assert torch.allclose(normalizer.restore(seen), fields, atol=1e-6)
+
+
+def test_touch_in_the_papers_units_fills_the_range_too():
+    fields = 1e-4 * torch.rand(50, 3, 4, 3, generator=torch.Generator().manual_seed(0))  # m
+    normalizer = Normalizer.of_taxels((3, 4))
+    normalizer.fit(fields)
+    assert normalizer.normalize(fields).abs().amax((0, 3)).min().item() == pytest.approx(1.0)

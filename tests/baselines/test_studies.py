@@ -68,6 +68,19 @@ grids:
     assert len({job.key for job in jobs}) == len(jobs)
 
 
+def test_other_looks_are_further_evaluations_of_the_same_policies():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/perturbation.yaml"))
+    evaluated = {}
+    for job in jobs:
+        if job.kind == "evaluate":
+            evaluated.setdefault(job.needs[0].key, []).append(json.loads(job.settings["env_kwargs"]))
+    assert set(evaluated) == {job.key for job in jobs if job.kind == "train"}
+    for arguments in evaluated.values():
+        assert arguments[0] == {}
+        assert [list(other) for other in arguments[1:]] == [["visual_randomization"]] * 8
+    assert all(job.settings["env_kwargs"] == "{}" for job in jobs if job.kind == "record")
+
+
 def test_a_job_is_named_by_all_that_it_depends_on(study):
     keys = {job.kind: job.key for job in jobs_of(read_study(study))}
     study.write_text(TINY.replace("demos: 1", "demos: 2"))

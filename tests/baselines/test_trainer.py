@@ -114,9 +114,7 @@ def trainer_args(demos, tmp_path):
     policy = dataclasses.replace(
         paper.policy, encoder=EncoderConfig(force_field="small"), down_dims=(16, 32), diffusion_step_embed_dim=16
     )
-    run = dict(
-        demos=(demos,), obs_mode="tacff", cameras=(), policy=policy, run_dir=tmp_path, batch_size=4, steps=6, log_every=4
-    )
+    run = dict(demos=(demos,), obs_mode="tacff", cameras=(), policy=policy, run_dir=tmp_path, batch_size=4, steps=6, log_freq=4)
     return dataclasses.replace(paper, **run, device="cpu", precision="fp32", compile=False)
 
 

@@ -63,8 +63,8 @@ def run(request, demos, tmp_path_factory):
         steps=120,
         lr=1e-3,
         warmup_steps=5,
-        save_every=60,
-        log_every=30,
+        save_freq=60,
+        log_freq=30,
         device="cpu",
         precision="fp32",
         compile=False,
@@ -110,7 +110,7 @@ def test_loss_falls(run, checkpoint):
     log = log_of(run.args.run_dir)
     assert [entry["step"] for entry in log] == [30, 60, 90, 120]
     consistency = getattr(run.args.policy, "consistency", False)  # its loss is a small disagreement, and noisy
-    assert min(entry["loss"] for entry in log) < (0.9 if consistency else 0.8) * log[0]["loss"]
+    assert min(entry["losses/total_loss"] for entry in log) < (0.9 if consistency else 0.8) * log[0]["losses/total_loss"]
 
 
 def test_checkpoints_hold_the_arguments_of_the_recorded_task(run, checkpoint):
@@ -127,7 +127,7 @@ def test_checkpoints_are_json_and_safetensors(run, checkpoint):
 
 
 def test_only_the_last_checkpoints_are_kept(run, tmp_path):
-    run.again(run_dir=tmp_path, steps=20, save_every=4, keep=3)
+    run.again(run_dir=tmp_path, steps=20, save_freq=4, keep=3)
     kept = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert kept == ["00000012", "00000016", "00000020", "last"]
 
@@ -154,7 +154,7 @@ def test_the_seed_fixes_everything(run, tmp_path):
     losses = []
     for name, seed in (("first", 0), ("same", 0), ("other", 1)):
         run.again(run_dir=tmp_path / name, seed=seed, steps=30)
-        losses.append(log_of(tmp_path / name)[0]["loss"])
+        losses.append(log_of(tmp_path / name)[0]["losses/total_loss"])
     assert losses[0] == losses[1] != losses[2]
 
 
@@ -170,7 +170,7 @@ def test_resume_without_a_checkpoint(run, tmp_path):
 
 def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_path):
     with pytest.raises(TrainingError, match=r"the loss of step \d+ is (nan|inf), on episode \d step \d+, .*--lr"):
-        run.again(run_dir=tmp_path, lr=1e30, save_every=10, log_every=10)
+        run.again(run_dir=tmp_path, lr=1e30, save_freq=10, log_freq=10)
     weights = sorted((tmp_path / "checkpoints").glob("*/model.safetensors"))
     assert all(torch.isfinite(tensor).all() for path in weights for tensor in read_tensors(path).values())
 
@@ -179,7 +179,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_pat
 def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
     run.again(run_dir=tmp_path, precision="bf16")
     for half, full in zip(log_of(tmp_path), log_of(run.args.run_dir), strict=True):
-        assert half["loss"] == pytest.approx(full["loss"], rel=0.1)
+        assert half["losses/total_loss"] == pytest.approx(full["losses/total_loss"], rel=0.1)
 
 
 def test_agent_acts_and_repeats_itself_after_reset(make_env, run, checkpoint):
@@ -252,8 +252,12 @@ def test_checkpoints_are_evaluated_one_after_the_other(evaluation, tmp_path):
     assert evaluation.finished() == []
     assert evaluation.in_use == set(folders)
     rates = evaluation.finished(wait=True)
-    assert [rate["evaluated_step"] for rate in rates] == [1, 2]
-    assert rates[0]["success_once"] == json.loads((tmp_path / "evaluations/00000001.json").read_text())["success_once"]["rate"]
+    assert [rate["step"] for rate in rates] == [1, 2]
+    assert {"eval/success_at_end", "eval/fail_once", "eval/return", "eval/episode_len"} <= set(rates[0])
+    assert (
+        rates[0]["eval/success_once"]
+        == json.loads((tmp_path / "evaluations/00000001.json").read_text())["success_once"]["rate"]
+    )
     assert evaluation.in_use == set()
 
 
@@ -269,14 +273,14 @@ def test_an_evaluation_that_fails_does_not_stop_training(evaluation, tmp_path, c
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
 def test_two_processes_train_one_policy(run, tmp_path):
     arguments = ["cpu", "--demos", str(run.args.demos[0]), "--obs-mode", "tacff", "--steps", "60", "--batch-size", "16"]
-    arguments += ["--save-every", "60", "--log-every", "20", "--run-dir", str(tmp_path)]
+    arguments += ["--save-freq", "60", "--log-freq", "20", "--run-dir", str(tmp_path)]
     arguments += ["--policy.down-dims", "32", "64", "--policy.diffusion-step-embed-dim", "32"]
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     done = subprocess.run(
         [*command, "baselines/diffusion_policy/train.py", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    losses = [entry["loss"] for entry in log_of(tmp_path)]
+    losses = [entry["losses/total_loss"] for entry in log_of(tmp_path)]
     assert len(losses) == 3
     assert losses[-1] < 0.8 * losses[0]
     assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60

@@ -90,7 +90,7 @@ def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
 
 
 def test_set_without_manifest_says_what_writes_one(tmp_path):
-    with pytest.raises(DemonstrationError, match=r"demonstrations\.dataset"):
+    with pytest.raises(DemonstrationError, match="manifeel dataset"):
         validate(tmp_path)
 
 

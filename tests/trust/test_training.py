@@ -119,12 +119,12 @@ def test_b06_what_was_logged_after_the_checkpoint_does_not_stay(tmp_path):
     after = (run_dir / "log.jsonl").read_text().splitlines()
     assert after[:saved] == lines
     assert [json.loads(line)["step"] for line in after] == list(range(1, STEPS + 1)) == steps_on_board(run_dir)
-    assert all(json.loads(line)["loss"] < 99 for line in after)
+    assert all(json.loads(line)["losses/total_loss"] < 99 for line in after)
 
 
 def test_b06_no_log_is_an_empty_one(tmp_path):
     assert entries_until(tmp_path / "log.jsonl", 5) == []
-    (tmp_path / "log.jsonl").write_bytes(b'[1]\n{"loss": 1}\n\xff\xfe\n{"step": 2}\n{"step": 6}\n')
+    (tmp_path / "log.jsonl").write_bytes(b'[1]\n{"losses/total_loss": 1}\n\xff\xfe\n{"step": 2}\n{"step": 6}\n')
     assert entries_until(tmp_path / "log.jsonl", 5) == [dict(step=2)]
 
 

@@ -31,7 +31,7 @@ def tiny_args(run_dir: Path | None, **changes: Any) -> TrainArgs:
         paper.policy, encoder=EncoderConfig(force_field="small"), down_dims=(8, 16), diffusion_step_embed_dim=8
     )
     run = dict(demos=(DEMOS,), obs_mode="tacff", cameras=(), policy=policy, run_dir=run_dir, num_demos=1, image_size=32)
-    run |= dict(batch_size=4, steps=STEPS, warmup_steps=2, save_every=2, keep=3, log_every=1)
+    run |= dict(batch_size=4, steps=STEPS, warmup_steps=2, save_freq=2, keep=3, log_freq=1)
     return dataclasses.replace(paper, **run | changes, device="cpu", precision="fp32", compile=False)
 
 

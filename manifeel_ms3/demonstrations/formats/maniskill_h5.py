@@ -63,9 +63,7 @@ def read_header(path: Path) -> dict[str, Any]:
     path = Path(path)
     for needed in (path, path.with_suffix(".json")):
         if not needed.is_file():
-            raise DemonstrationError(
-                f"demonstration file {needed} does not exist; record one with `python -m manifeel_ms3.demonstrations.record`"
-            )
+            raise DemonstrationError(f"demonstration file {needed} does not exist; record one with `manifeel record`")
     try:
         return read_json(path.with_suffix(".json"), HEADER, "a trajectory's json")
     except InvalidFileError as error:
@@ -161,10 +159,7 @@ def observation_keys(path: Path) -> list[str]:
             f"sensor_data/{sensor}/{kind}" for sensor in sensors for kind in ("rgb", "force_field") if kind in sensors[sensor]
         ]
         if "traj_0/obs/extra/tcp_pose" not in file:
-            raise DemonstrationError(
-                f"{path} holds states and actions alone; "
-                "`python -m manifeel_ms3.demonstrations.render_observations` adds observations"
-            )
+            raise DemonstrationError(f"{path} holds states and actions alone; `manifeel render-observations` adds observations")
     return [*keys, "extra/tcp_pose"]
 
 

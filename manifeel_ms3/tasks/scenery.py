@@ -1,0 +1,119 @@
+"""What every task's cameras see: bench, light, cameras, and their randomization."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# (ManiSkill annotates its own poses alone, sizes as tuples, and sensors by their base class)
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.sensors.camera import CameraConfig
+from sapien.physx import PhysxMaterial
+
+from manifeel_ms3.arguments import one_of
+from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.geometry import Box, Part
+from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
+from manifeel_ms3.rendering.looks import CONCRETE
+from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, fine_shadow, presentation_shader
+from manifeel_ms3.rendering.randomization import LARGEST, RandomLooks, VisualRandomization
+from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
+from manifeel_ms3.rendering.table import table_mesh, wood
+
+from .checks import checked_randomization
+from .sensing import SensingEnv
+from .viewpoints import looking_at, looking_down
+
+LIGHTING = {"normal": 1.0, "dim": 0.05}
+"""Share of the normal light; the paper gives no figure for its dim light."""
+QUALITIES = tuple(SHADOWS)
+"""Qualities of the policy's images."""
+IMAGE_SIZE = 256
+"""Width and height of the cameras' images, in pixels (public code of the paper)."""
+FIELD_OF_VIEW = np.deg2rad(75)
+"""Field of view of the cameras, in rad (public code of the paper)."""
+TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
+TABLE_FRICTION = 0.5
+"""Coulomb's coefficient."""
+FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), CONCRETE)
+FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
+"""Links whose shadow falls beside what the shadow map covers."""
+
+
+class SceneryEnv(SensingEnv):
+    """An environment with the robot at a wooden table in a light room.
+
+    Subclasses set `_camera_names` and call `_set_looks` before they call the constructor.
+    """
+
+    front_camera_at = (0.68, 0.0, 0.15)
+    """Position of the front camera, in m (public code of the paper)."""
+    side_camera_at = (0.5, -0.17, 0.17)
+    """Position of the side camera, in m (public code of the paper)."""
+    _camera_names: tuple[str, ...]
+
+    def _set_looks(self, lighting: str, quality: str, randomization: dict[str, float], num_envs: int) -> None:
+        self._lighting = one_of("lighting", lighting, LIGHTING)
+        self._quality = one_of("quality", quality, QUALITIES)
+        self.visual_randomization = checked_randomization(
+            type(self).__name__, VisualRandomization, randomization, LARGEST, "visual_randomization", "light_level"
+        )
+        if randomization and num_envs != 1:
+            raise InvalidArgumentError(
+                f"visual_randomization={randomization!r} needs num_envs=1, not {num_envs}: the environments of one process "
+                "look alike; use several processes"
+            )
+
+    @property
+    def _default_sensor_configs(self):
+        views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
+        lens: dict[str, Any] = dict(width=IMAGE_SIZE, height=IMAGE_SIZE, fov=FIELD_OF_VIEW, near=0.01, far=10)
+        return [
+            CameraConfig(name, looking_down(*views[name]), **lens, shader_config=camera_shader())
+            for name in self._camera_names
+            if name in views
+        ]
+
+    @property
+    def _default_human_render_camera_configs(self):
+        pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
+        drawn, view = SIZE * SUPERSAMPLING, np.deg2rad(45)
+        return CameraConfig("render_camera", pose, drawn, drawn, view, near=0.01, far=10, shader_config=presentation_shader())
+
+    def render_rgb_array(self, camera_name: str | None = None):
+        with fine_shadow(self._lamps, SHADOWS[self._quality]):
+            return super().render_rgb_array(camera_name)
+
+    def _build_bench(self) -> None:
+        """Add table and floor to the scene."""
+        builder, pose = self.scene.create_actor_builder(), sapien.Pose(TABLE.centre)
+        friction = PhysxMaterial(TABLE_FRICTION, TABLE_FRICTION, 0.0)
+        builder.add_box_collision(pose, np.asarray(TABLE.size) / 2, friction)
+        if self.scene.can_render():
+            builder.add_visual_from_file(str(table_mesh(TABLE.size)), pose, material=wood())
+        builder.initial_pose = sapien.Pose()
+        builder.set_physx_body_type("static")
+        builder.build("table")
+        FLOOR.build(self.scene, "static", sapien.Pose())
+
+    def _load_lighting(self, options: dict):
+        self._lamps = add_lights(self.scene, LIGHTING[self._lighting], SHADOWS[self._quality])
+        links = self.agent.robot.links_map
+        cast_no_shadow([self.scene.actors["table"], self.scene.actors["floor"], *(links[name] for name in FAR_LINKS)])
+
+    def _setup_sensors(self, options: dict):
+        set_picture_formats()
+        super()._setup_sensors(options)
+
+    def _make_random_looks(self) -> None:
+        """Remember how the scene looks, so that an episode's looks can be drawn around it."""
+        self._random_looks, self._looks = None, dict[str, torch.Tensor]()
+        if self.visual_randomization != VisualRandomization() and self.scene.can_render():
+            cameras = {name: self._sensors[name].camera._render_cameras[0] for name in self._camera_names}
+            self._random_looks = RandomLooks(self.visual_randomization, self.scene, self._lamps[0], cameras)
+
+    def _draw_looks(self, seed: int) -> None:
+        """Draw the looks of an episode from its seed, if they are random."""
+        if self._random_looks is not None:
+            drawn = self._random_looks.draw(seed)
+            self._looks = {name: torch.as_tensor(value, dtype=torch.float32)[None] for name, value in drawn.items()}
