@@ -11,6 +11,7 @@ import tyro
 from baselines.common.train_args import TrainArgs
 from baselines.registry import PolicySpec, all_policies
 from manifeel_ms3.command_line import run
+from manifeel_ms3.errors import InvalidArgumentError
 
 
 def _form(spec: PolicySpec) -> Any:
@@ -23,6 +24,23 @@ def _form(spec: PolicySpec) -> Any:
 
 
 Args = reduce(or_, map(_form, all_policies().values()))
+
+
+def check_arguments(arguments: list[str]) -> None:
+    """Check that the name of a policy is followed by that of a preset; tyro would list the flags of all presets instead.
+
+    Args:
+        arguments: The command line after `manifeel train`.
+
+    Raises:
+        InvalidArgumentError: It is not.
+    """
+    policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
+    spec = all_policies().get(policy)
+    if spec is None or preset in spec.presets or {"-h", "--help"} & set(arguments):
+        return
+    choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
+    raise InvalidArgumentError(f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}")
 
 
 def main(args: TrainArgs) -> Path:

@@ -93,6 +93,7 @@ def _run(arguments: list[str]) -> Any:
     if arguments and arguments[0] in commands:
         name = arguments[0]
         module = command_module(name)
+        getattr(module, "check_arguments", lambda _: None)(arguments[1:])
         return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
     if arguments and not arguments[0].startswith("-"):
         near = get_close_matches(arguments[0], commands, n=1)

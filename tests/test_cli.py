@@ -44,6 +44,23 @@ def test_a_command_runs(capsys):
     assert Path(page[1]).is_file()
 
 
+def test_training_without_a_preset_says_which_there_are(capsys):
+    assert cli.main(["train", "diffusion_policy", "--demos", "peg.h5"]) == 1
+    said = capsys.readouterr().err.splitlines()[0]
+    assert "needs the name of a preset" in said
+    assert "cpu (" in said
+    assert "paper (" in said
+
+
+def test_an_unknown_observation_is_refused_before_a_process_is_started(tmp_path, capsys):
+    out = tmp_path / "new" / "peg.h5"
+    assert cli.main(["record", PEG, "-n", "1", "--obs-mode", "rgb+foo", "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "token 'foo' is unknown" in said.err
+    assert "recording" not in said.out  # no progress bar has begun
+    assert not out.parent.exists()
+
+
 def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, capsys):
     def refuse(_):
         one_of("fit", "huge", ("paper", "tight"))

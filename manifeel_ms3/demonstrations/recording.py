@@ -12,6 +12,7 @@ import gymnasium as gym
 from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
+from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 from .formats.maniskill_h5 import DemonstrationError, read_header
@@ -47,8 +48,10 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
 
     Raises:
         UnknownNameError: The task is not registered.
+        InvalidArgumentError: The observation mode has an unknown token.
     """
     spec = task_spec(env_id)
+    split_obs_mode(env_kwargs["obs_mode"])  # before any process is started
     kept = {name: value for name, value in env_kwargs.items() if name != "render_backend"}
     return dict(
         env_info=dict(env_id=spec.gym_id, env_kwargs=kept, max_episode_steps=spec.max_episode_steps),
