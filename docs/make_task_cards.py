@@ -21,11 +21,12 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import paper_demos
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks
-from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, LIGHTING, VisuotactileEnv
+from manifeel_ms3.tasks.scenery import LIGHTING
+from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, VisuotactileEnv
 
 DOCS = Path(__file__).parent
 CARDS, FILMS, PICTURES = DOCS / "tasks", DOCS / "films", DOCS / "images" / "tasks"
-CAPTION = "Front, side and wrist camera, left and right pad, at four fifths of a demonstration."
+CAPTION = "The scene, front, side and wrist camera, left and right pad, at four fifths of a demonstration."
 
 
 def main() -> None:
@@ -91,7 +92,7 @@ def _facts(spec: TaskSpec) -> str:
         "Demonstrations": f"{spec.paper_demos} recorded in the paper, {paper_demos(spec.name)} of them trained on",
         "Revision": spec.revision,
     }
-    return f"## At a glance\n\n{markdown_table(('', ''), rows.items())}"
+    return f"## At a glance\n\n{markdown_table(('What', 'Value'), rows.items())}"
 
 
 def _randomization(spec: TaskSpec) -> str:

@@ -21,6 +21,7 @@ from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
 from tests.conftest import PEG, needs_renderer
+from tests.links import dead_links, missing_targets
 from tests.sample import states_sample
 from tests.tiny_study import TINY
 
@@ -63,6 +64,11 @@ def test_a_command_that_is_shown_is_one(line, capsys):
         assert name == "pip" or words[:2] == ["manifeel", "--help"], line
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.stem}")
+def test_a_page_links_files_that_exist(page):
+    assert not missing_targets(page)
+
+
 def test_the_site_builds_without_a_warning(tmp_path):
     pytest.importorskip("mkdocs")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
@@ -70,6 +76,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site/api/sensors/index.html").read_text()
     assert "TactileSensor" in page
+    assert not dead_links(tmp_path / "site")
 
 
 # -------------------------------------------------------------------- run, page by page
