@@ -28,16 +28,16 @@ demo: $(RUN)/report.html
 	@echo "The report: $(abspath $<)"
 
 $(DEMOS): | $(READY)
-	$(PYTHON) -m manifeel_ms3.demonstrations.record $(TASK) -n 120 --workers 2 --out $@ \
+	$(PYTHON) -m manifeel_ms3.demonstrations.record $(TASK) --num-demos 120 --workers 2 --out $@ \
 		--obs-mode rgb+tacff --cameras wrist --tactile-sensors right --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/.trained: | $(DEMOS)
-	$(PYTHON) baselines/diffusion_policy/train.py cpu --demos $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
+	$(PYTHON) baselines/diffusion_policy/train.py cpu --demo-path $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
 		$$(ls $(RUN)/checkpoints/*/config.json >/dev/null 2>&1 && echo --resume)
 	touch $@
 
 $(RUN)/evaluation.json: $(RUN)/.trained
-	$(PYTHON) -m manifeel_ms3.evaluation.evaluate --checkpoint $(RUN)/checkpoints/last --episodes 10 --workers 2 \
+	$(PYTHON) -m manifeel_ms3.evaluation.evaluate --checkpoint $(RUN)/checkpoints/last --num-eval-episodes 10 --num-eval-envs 2 \
 		--out $@ --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/report.html: $(RUN)/evaluation.json

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from manifeel_ms3.geometry.balls import SEAT_HEIGHT, SEAT_SPACING
-from manifeel_ms3.sensors import TactileSensor, sensor_config
+from manifeel_ms3.sensors import OpticsConfig, TactileSensor, sensor_config
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS, BallSortingEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
@@ -61,7 +61,9 @@ class BallSortingExpert:
         self.skills.gripper = 1.0
         self.guess = int(rng.integers(2))
         self.stand = perceived_position(env.stand, rng)
-        self._pad = TactileSensor(sensor_config(env.sensor, "feel", "gel_right"), env.scene, env.agent.robot, ("rgb",))
+        # whatever the sensor, in the colours that `rough` and `touching` are tuned for
+        pad = sensor_config(env.sensor, "feel", "gel_right", optics=OpticsConfig())
+        self._pad = TactileSensor(pad, env.scene, env.agent.robot, ("rgb",))
         self._untouched = self._tactile_image()
 
     def actions(self) -> Actions:

@@ -51,10 +51,10 @@ def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
         if dataclasses.is_dataclass(value):
             check_bounds(value, uid, f"{name}.")
         bounds = entry.metadata.get("bounds")
-        numbers = value if isinstance(value, Sequence) else (value,)
+        numbers: Sequence[Any] = value if isinstance(value, Sequence) else (value,)
         if bounds and any(number not in bounds for number in numbers):
             raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be {bounds}")
-        if entry.metadata.get("amount") and (len(value) != 2 or value[0] > value[1]):
+        if entry.metadata.get("amount") and (len(numbers) != 2 or numbers[0] > numbers[1]):
             raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be a number, or a pair (least, most)")
 
 

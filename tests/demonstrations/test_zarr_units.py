@@ -12,12 +12,12 @@ from manifeel_ms3.demonstrations import DemonstrationError, export
 from manifeel_ms3.demonstrations.formats.diffusion_policy_zarr import recorded_arguments
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.paths import data_dir
 from tests.conftest import PEG
+from tests.sample import observed_sample
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 zarr = pytest.importorskip("zarr")
-SAMPLE = data_dir() / f"sample/{PEG}/trajectory.h5"
+SAMPLE = observed_sample(PEG)
 FIELD = "sensor_data/tactile_right/force_field"
 
 
