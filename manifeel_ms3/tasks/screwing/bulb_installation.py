@@ -77,7 +77,7 @@ class BulbInstallationEnv(ScrewingEnv):
     Randomization = BulbRandomization
     screw = bulb_and_holder()
     grips_round_parts = True
-    grip_indentation = 1.27e-3  # m: where the five contact points of each pad carry the grip force
+    grip_indentation = 1.5e-3  # m; tuned: with 1.27e-3 two of four demonstrations fail
     contacts = CONTACTS | dict(
         enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
         contact_offset=4e-5,  # m; without them, what moves further than twice that in a physics step slips through a thread
