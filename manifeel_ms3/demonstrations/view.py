@@ -75,7 +75,7 @@ def main(args: Args) -> None:
 
     Raises:
         DemonstrationError: The file is missing or broken, or has no such episode.
-        MachineError: The viewer does not start, because there is no screen, say.
+        MachineError: The viewer does not start, for example because there is no screen.
         MissingExtraError: Rerun is not installed.
     """
     recording = rerun_recording(args.file, args.episode)
