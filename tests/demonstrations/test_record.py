@@ -221,8 +221,8 @@ def test_the_header_names_the_module_that_registers_the_task(monkeypatch):
     env_class = type("TheirEnv", (), dict(__module__="their_package.tasks"))
     their = TaskSpec("Their-v1", env_class, "insertion", max_episode_steps=7, paper_demos=1)
     monkeypatch.setitem(registry._SPECS, "Their-v1", their)
-    assert make_header("Their-v1", {})["env_info"]["env_id"] == "their_package.tasks:Their-v1"
-    assert make_header(PEG, {})["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
+    assert make_header("Their-v1", dict(obs_mode="none"))["env_info"]["env_id"] == "their_package.tasks:Their-v1"
+    assert make_header(PEG, dict(obs_mode="none"))["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
 
 
 def test_a_worker_that_is_killed_loses_no_finished_episode(recorded, tmp_path):

@@ -55,7 +55,7 @@ def test_an_episode_in_joint_mode_is_shown(tmp_path):
     file.with_suffix(".json").write_text(json.dumps(header))
     streams = view.read_streams(file, 0)
     names, values = streams.series["actions"]
-    assert names[:1] + names[6:] == ["panda_joint1, rad", "panda_joint7, rad", "gripper"]
+    assert names[:1] + names[6:] == ["panda_joint1", "panda_joint7", "gripper"]
     assert values.shape == (3, len(names))
     assert streams.title == f"{PEG}, seed 5"
 
