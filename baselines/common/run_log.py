@@ -25,6 +25,8 @@ WANDB_TIMEOUT = 30
 
 GLOBAL_STEP = "global_step"
 """Name of the gradient step in Weights & Biases, over which everything is drawn."""
+TIME = "time/"
+"""Beginning of the names of scalars that are only shown, and not kept in log.jsonl: how long training takes."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,8 @@ class RunLog:
             entry: The entry.
             video: Video of the evaluation that the entry is about, for Weights & Biases.
         """
-        self._lines.write(_line(entry))
+        kept = {name: value for name, value in entry.items() if not name.startswith(TIME)}  # the same in every run of a seed
+        self._lines.write(_line(kept))
         self._lines.flush()
         self._show(entry)
         if self._wandb:
