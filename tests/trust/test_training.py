@@ -44,7 +44,7 @@ def undisturbed(tmp_path_factory) -> tuple[Path, float]:
 
 def steps_on_board(run_dir: Path) -> list[int]:
     board = EventAccumulator(str(run_dir), size_guidance=dict(scalars=0))
-    return [event.step for event in board.Reload().Scalars("train/loss")]
+    return [event.step for event in board.Reload().Scalars("losses/total_loss")]
 
 
 def require_equal(run_dir: Path, other: Path) -> None:
