@@ -22,6 +22,7 @@ from manifeel_ms3.geometry import (
 from manifeel_ms3.geometry.balls import ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import battery, bowl, container
 from manifeel_ms3.geometry.gears import neighbour_gear
+from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.verification.press import PadBench
 from tests.conftest import needs_renderer
 
@@ -30,7 +31,7 @@ PARTS = [
       for part in (fit.plug, fit.socket)),
     *(part for screw in (nut_and_bolt(), bulb_and_holder()) for part in (screw.held, screw.fixed)),
     neighbour_gear("small"), neighbour_gear("large"), ball_stand(), golf_ball(), tennis_ball(), battery(), container(True),
-    bowl("bowl", (0.5, 0.5, 0.5)),
+    bowl("bowl", Look((0.5, 0.5, 0.5))),
 ]  # fmt: skip
 TOLERANCE = 5e-5  # m
 
