@@ -1,7 +1,7 @@
 """Folders of the data that ships with the package, and of derived assets."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,3 +53,25 @@ def writable_cache() -> Iterator[Path]:
         raise MachineError(
             f"derived files cannot be kept in {folder} ({error}); set {CACHE_DIR} to a folder that can be written"
         ) from error
+
+
+def derived_file(name: str, make: Callable[[], str]) -> Path:
+    """Path of a text file among the derived assets, which is made where it is missing.
+
+    Processes that make it at the same time do not disturb each other.
+
+    Args:
+        name: Path of the file in the folder of derived assets.
+        make: Function that returns the text.
+
+    Raises:
+        MachineError: The file cannot be written.
+    """
+    path = cache_dir() / name
+    if not path.is_file():
+        with writable_cache():
+            path.parent.mkdir(exist_ok=True)
+            draft = path.with_suffix(f".{os.getpid()}{path.suffix}")
+            draft.write_text(make(), encoding="utf-8")
+            draft.replace(path)
+    return path

@@ -9,9 +9,8 @@ from mani_skill.utils import common
 from torch.nn.functional import interpolate
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.obs_modes import PAD
 
-PAD = "tactile_"
-"""Start of the names of tactile pads among the sensors of an observation."""
 Observation = dict[str, Any]
 
 

@@ -24,8 +24,7 @@ class FilmBlock(nn.Module):
 class ConditionalMLP(nn.Module):
     """Predicts the noise (B, T, A) in actions (B, T, A) at diffusion steps (B,), given conditions (B, C).
 
-    On one CPU core a step of training takes a tenth of a small U-Net's time, since it consists of a few matrix products
-    (`benchmarks/train_speed.py`).
+    It consists of a few matrix products, which a CPU computes in less time than the convolutions of a U-Net.
 
     Args:
         action_dim: Numbers of an action, A.

@@ -11,7 +11,7 @@ import numpy as np
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import TactileSensorConfig
-from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.obs_modes import PAD, split_obs_mode
 
 POSE = "extra/tcp_pose"
 """Key of the pose of the tool centre point."""
@@ -106,7 +106,7 @@ def observation_spec(
 
 def is_tactile(key: str) -> bool:
     """Whether an observation is a tactile sensor's."""
-    return key.startswith("sensor_data/tactile_")
+    return key.startswith(f"sensor_data/{PAD}")
 
 
 def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:

@@ -27,7 +27,7 @@ class PolicyConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
     action_network: Literal["unet", "mlp"] = "unet"
-    """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which learns sooner on a CPU."""
+    """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which takes less time on a CPU."""
     mlp_width: int = 256
     """Number of features of the MLP."""
     mlp_blocks: int = 3

@@ -16,7 +16,7 @@ from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
 from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
@@ -251,7 +251,7 @@ class Trainer:
         if self.log:
             epoch = self.step / math.ceil(len(self.dataset) / self.batch_size)
             seconds = time.time() - self.begin
-            scalars = {"losses/total_loss": mean, "charts/learning_rate": self.schedule.get_last_lr()[0], "charts/epoch": epoch}
+            scalars = {TRAINING_LOSS: mean, "charts/learning_rate": self.schedule.get_last_lr()[0], "charts/epoch": epoch}
             scalars |= {"time/total_seconds": seconds, "time/iterations_per_second": self.step / max(seconds, 1e-9)}
             self.log.write(dict(step=self.step) | scalars)
         return mean

@@ -66,12 +66,13 @@ class Finger:
         across, along = (float(min(side, s)) for side, s in zip(sides, self.gel_size, strict=True))
         return across, along, self.protrusion
 
-    def solid_boxes(self, size: tuple[float, float, float]) -> list[tuple[tuple, tuple]]:
-        """Sizes and centres, in the pad frame, m, of the boxes that a gel's flat face of this size collides as."""
-        across, along, high = size
+    @property
+    def solid_boxes(self) -> list[tuple[tuple, tuple]]:
+        """Sizes and centres, in the pad frame, m, of the boxes that the gel's face, or the middle of a dome, collides as."""
+        across, along, high = self.flat_box
         middle, z = MIDDLE, -high / 2
         if not self.grips_round_parts or middle >= min(across, along):
-            return [(size, (0.0, 0.0, z))]
+            return [(self.flat_box, (0.0, 0.0, z))]
         boxes: list[tuple[tuple, tuple]] = [((middle, middle, high), (0.0, 0.0, z))]
         for side in (-1, 1):
             boxes.append((((across - middle) / 2, along, high), (side * (across + middle) / 4, 0.0, z)))
@@ -129,7 +130,7 @@ def gel_pad(side: str, parent: str, outward: float, finger: Finger, folder: Path
         for tag, mesh in (("visual", finger.dome(DRAWN_POINTS)), ("collision", solid)):
             mesh.export(folder / f"gel_{tag}.obj")
             _add_mesh(link, tag, f"gel_{tag}.obj", colour)
-    for size, place in finger.solid_boxes(finger.flat_box):
+    for size, place in finger.solid_boxes:
         _add_box(link, size, place, tags=("collision",))
     _add_inertia(link, mass=GEL_MASS, size=finger.gel_box, centre=centre)
     joint = ET.Element("joint", name=f"{name}_joint", type="fixed")

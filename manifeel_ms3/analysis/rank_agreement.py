@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import kendalltau
 
 from .condition import Condition
-from .estimates import TAILS, resampled_success
+from .estimates import TAILS, Estimate, resampled_success
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import reported
@@ -48,13 +48,8 @@ class Ranked:
     results: ConditionResults
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """A measure of agreement with its interval of 95 %."""
-
-    value: float
-    low: float
-    high: float
+class Agreement(Estimate):
+    """A measure of agreement with its interval of 95 %; it is no share, and not written in percent."""
 
     def __str__(self) -> str:
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"

@@ -16,7 +16,7 @@ from typing import Any
 import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
@@ -137,7 +137,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
         if not (path.parent / "checkpoints/last").exists():  # the run has no checkpoint yet
             continue
         config = checkpoint_config(path.parent / "checkpoints/last")
-        entries = [entry for line in path.read_text().splitlines() if "losses/total_loss" in (entry := json.loads(line))]
+        entries = [entry for line in path.read_text().splitlines() if TRAINING_LOSS in (entry := json.loads(line))]
         name = f"{config['policy_name']}, {config['obs_mode']}, seed {config['seed']}"
         runs.setdefault(config["env_id"], []).append((name, entries))
     if not runs:
@@ -146,7 +146,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
     axes = fig.subplots(1, len(runs), squeeze=False)[0]
     for ax, (task, curves) in zip(axes, runs.items(), strict=True):
         for name, entries in curves:
-            ax.plot([entry["step"] for entry in entries], [entry["losses/total_loss"] for entry in entries], label=name, lw=1)
+            ax.plot([entry["step"] for entry in entries], [entry[TRAINING_LOSS] for entry in entries], label=name, lw=1)
         ax.set(title=task, xlabel="gradient step", ylabel="loss", yscale="log")
         ax.legend(fontsize=7)
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -68,9 +68,7 @@ class Args:
         Raises:
             InvalidArgumentError: `env_kwargs` is not a json object.
         """
-        sensing: dict[str, Any] = dict(
-            obs_mode=self.obs_mode, cameras=list(self.cameras), tactile_sensors=list(self.tactile_sensors)
-        )
+        sensing: dict[str, Any] = dict(cameras=list(self.cameras), tactile_sensors=list(self.tactile_sensors))
         if self.sensor is not None:
             sensing["sensor"] = self.sensor
         return dict(obs_mode=self.obs_mode, sim_backend="physx_cpu") | sensing | json_object("--env-kwargs", self.env_kwargs)

@@ -9,6 +9,8 @@ from manifeel_ms3.errors import InvalidFileError
 
 TRAINING_STATE = "training.safetensors"
 """File that only training reads; it is deleted from older checkpoints, and is not part of their hash."""
+TRAINING_LOSS = "losses/total_loss"
+"""Name of the training loss in log.jsonl, the log beside the checkpoints."""
 CHUNK = 2**20
 """Number of bytes that are read at a time."""
 

@@ -21,12 +21,11 @@ from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks import registry
+from manifeel_ms3.tasks.obs_modes import PAD
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 GYM_ID = "manifeel_ms3/LeRobot-v0"
 """Id under which gymnasium makes a `LeRobotEnv`."""
-PAD = "tactile_"
-"""What the names of the tactile sensors begin with."""
 
 
 class LeRobotEnv(gym.Env):

@@ -21,6 +21,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import make_env
 
+from .checkpoint_config import TRAINING_LOSS
 from .floors import Floor, floors_of
 from .gentle import success_under_force
 from .policy import checked_device, load_policy
@@ -40,8 +41,6 @@ STRIP_SIDE = 160
 """Width and height of an image in the strip, in pixels; report.html.j2 has the same height for the names of the rows."""
 CURVE_HEIGHT = 340
 """Height of a figure, in pixels."""
-LOSS = "losses/total_loss"
-"""Name of the training loss in the log of a run."""
 FORCE_MARGIN, FORCE_POINTS = 1.2, 601
 """End of the axis of forces over the largest force on it, and number of its points."""
 RATES = {
@@ -101,8 +100,8 @@ def force_curve(result: dict[str, Any]) -> str:
 
 def training_curve(log_file: Path) -> str:
     """HTML of a plotly figure with the loss over gradient steps; plotly itself must be on the page already."""
-    entries = [entry for line in log_file.read_text().splitlines() if LOSS in (entry := json.loads(line))]
-    figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e[LOSS] for e in entries], mode="lines"))
+    entries = [entry for line in log_file.read_text().splitlines() if TRAINING_LOSS in (entry := json.loads(line))]
+    figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e[TRAINING_LOSS] for e in entries], mode="lines"))
     figure.update_layout(
         xaxis_title="gradient step",
         yaxis_title="loss",

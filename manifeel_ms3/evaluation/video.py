@@ -1,6 +1,7 @@
 """Videos of an episode, with the images of every camera and finger pad side by side."""
 
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,12 +64,24 @@ def encode_video(frames: list[Frame], fps: int = CONTROL_FREQ) -> bytes:
         frames: Images of every step.
         fps: Frames per second.
     """
+    tiled = (np.concatenate([_tile(image) for image in frame.images.values()], axis=1) for frame in frames)
+    return encode_mp4(tiled, fps, BLOCK)
+
+
+def encode_mp4(images: Iterable[np.ndarray], fps: int, block: int) -> bytes:
+    """An MP4 file with images as its frames.
+
+    Args:
+        images: RGB images (H, W, 3) uint8 of one size.
+        fps: Frames per second.
+        block: Number of pixels of which widths and heights are made multiples.
+    """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "episode.mp4"
-        writer: Any  # the stubs of imageio do not know `append_data`
-        with imageio.get_writer(path, fps=fps, macro_block_size=BLOCK, quality=QUALITY) as writer:
-            for frame in frames:
-                writer.append_data(np.concatenate([_tile(image) for image in frame.images.values()], axis=1))
+        path = Path(folder) / "video.mp4"  # imageio knows the format by the suffix
+        writer: Any  # the stubs of imageio lack `append_data`
+        with imageio.get_writer(path, fps=fps, macro_block_size=block, quality=QUALITY) as writer:
+            for image in images:
+                writer.append_data(image)
         return path.read_bytes()
 
 

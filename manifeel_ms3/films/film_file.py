@@ -2,21 +2,18 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
-import imageio.v2 as imageio
 import numpy as np
 from PIL import Image
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.video import encode_mp4
 from manifeel_ms3.files import atomic_write
 
 SUFFIXES = (".mp4", ".webp", ".gif")
 BLOCK = 2
 """Widths and heights are cut to multiples of this number of pixels, which H.264 needs."""
-MP4_QUALITY = 7
-"""Quality of the mp4 encoding from 0 to 10, as imageio has it (chosen; captions stay sharp)."""
 WEBP_QUALITY = 70
 """Quality of the WebP encoding from 0 to 100 (chosen; captions stay sharp)."""
 WEBP_EFFORT = 4
@@ -50,7 +47,7 @@ def write_film(episodes: Iterable[list[Image.Image]], path: Path, fps: int, widt
     frames = [_resized(frame, width) for episode in episodes for frame in episode + episode[-1:] * round(END_SECONDS * fps)]
     with atomic_write(path) as partial:
         if path.suffix.lower() == ".mp4":
-            _write_mp4(frames, partial, fps)
+            partial.write_bytes(encode_mp4(map(np.asarray, frames), fps, BLOCK))
         else:
             _write_animation(frames, partial, path.suffix.lower()[1:].upper(), fps)
 
@@ -59,16 +56,6 @@ def _resized(frame: Image.Image, width: int | None) -> Image.Image:
     width = width or frame.width
     height = round(frame.height * width / frame.width)
     return frame.resize((width // BLOCK * BLOCK, height // BLOCK * BLOCK), Image.Resampling.LANCZOS)
-
-
-def _write_mp4(frames: list[Image.Image], path: Path, fps: int) -> None:
-    with TemporaryDirectory() as folder:
-        film = Path(folder) / "film.mp4"  # imageio knows the format by the suffix
-        writer: Any  # the stubs of imageio do not know `append_data`
-        with imageio.get_writer(film, fps=fps, macro_block_size=BLOCK, quality=MP4_QUALITY) as writer:
-            for frame in frames:
-                writer.append_data(np.asarray(frame))
-        path.write_bytes(film.read_bytes())
 
 
 def _write_animation(frames: list[Image.Image], path: Path, kind: str, fps: int) -> None:

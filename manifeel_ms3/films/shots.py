@@ -9,6 +9,7 @@ import numpy as np
 from mani_skill.utils import common
 
 from manifeel_ms3.sensors.visualisation import observation_images
+from manifeel_ms3.tasks.obs_modes import PAD
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 SCENE_SIZE = 480
@@ -85,7 +86,7 @@ class FilmingWrapper(gym.Wrapper):
 
     def _images(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
         scene: Any = self.env.render()
-        shown = (self._view.camera, f"tactile_{self._view.pad}")
+        shown = (self._view.camera, PAD + self._view.pad)
         sensors = {name: data for name, data in obs["sensor_data"].items() if name in shown}
         return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors))
 

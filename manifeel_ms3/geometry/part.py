@@ -1,7 +1,6 @@
 """A part: one description of a rigid body's shape that yields both what is drawn and what collides."""
 
 import hashlib
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
-from manifeel_ms3.paths import cache_dir, writable_cache
+from manifeel_ms3.paths import derived_file
 from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.sensors.depth.surfaces import give_relief
 
@@ -117,14 +116,7 @@ def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
         lines += [f"f {a} {b} {c}" for a, b, c in mesh.faces + first]
         first += len(mesh.vertices)
     text = "\n".join(lines)
-    path = cache_dir() / "parts" / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.obj"
-    if not path.is_file():
-        with writable_cache():
-            path.parent.mkdir(exist_ok=True)
-            draft = path.with_suffix(f".{os.getpid()}.obj")
-            draft.write_text(text, encoding="utf-8")
-            draft.replace(path)
-    return path
+    return derived_file(f"parts/{hashlib.sha256(text.encode()).hexdigest()[:16]}.obj", lambda: text)
 
 
 @dataclass(frozen=True)

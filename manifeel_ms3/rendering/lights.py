@@ -16,17 +16,18 @@ AMBIENT_LIGHT, KEY_LIGHT = 0.42, 1.9  # intensities, chosen by eye
 KEY_DIRECTION = (-0.35, 0.45, -1.0)
 """Direction in which the lamp shines, from above, in front and the right of the robot; chosen by eye."""
 
+SHADOW_CENTRE = (0.5, 0.0, 0.0)
+"""Middle of what the lamp's shadow covers, in m: that of the tasks' parts."""
+
 
 @dataclass(frozen=True)
 class Shadow:
-    """Map of what the lamp reaches."""
+    """Map of what the lamp reaches, around `SHADOW_CENTRE`."""
 
     size: int
     """Width and height, in pixels."""
     half_extent: float
     """Half of the width that it covers, in m."""
-    centre: tuple[float, float, float] = (0.5, 0.0, 0.0)
-    """Middle of what it covers, in m: that of the tasks' parts."""
     near: float = -1.0
     """Distance from the centre towards the lamp from which it is drawn, in m, negative."""
     far: float = 1.5
@@ -78,7 +79,7 @@ def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
 def aim_lamp(lamp: Lamp, direction: Sequence[float] | np.ndarray) -> None:
     """Let a lamp shine in a direction, over the middle of what its shadow covers."""
     unit = np.asarray(direction) / np.linalg.norm(direction)
-    lamp.local_pose = sapien.Pose([0.5, 0.0, 0.0], sapien.math.shortest_rotation(np.array([1.0, 0.0, 0.0]), unit))
+    lamp.local_pose = sapien.Pose(SHADOW_CENTRE, sapien.math.shortest_rotation(np.array([1.0, 0.0, 0.0]), unit))
 
 
 def cast_no_shadow(bodies: Iterable[Actor | Link]) -> None:

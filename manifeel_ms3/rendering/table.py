@@ -1,14 +1,13 @@
 """The table top of wooden boards: its texture, painted here, and its mesh with the texture's coordinates."""
 
 import functools
-import os
 from pathlib import Path
 
 import numpy as np
 import trimesh
 from sapien.render import RenderMaterial, RenderTexture2D
 
-from manifeel_ms3.paths import cache_dir, writable_cache
+from manifeel_ms3.paths import derived_file
 
 TILE = 0.8
 """Side of the square, in m, that the texture covers; it repeats beyond."""
@@ -65,14 +64,7 @@ def _streaks(rng: np.random.Generator, length: float, width: float) -> np.ndarra
 
 def table_mesh(size: tuple[float, float, float]) -> Path:
     """File with a box of this size, in m, about the origin, whose texture's coordinates are lengths on each face."""
-    path = cache_dir() / "parts" / f"table-{'x'.join(f'{side:g}' for side in size)}-{TILE:g}.obj"
-    if not path.is_file():
-        with writable_cache():
-            path.parent.mkdir(exist_ok=True)
-            draft = path.with_suffix(f".{os.getpid()}.obj")
-            draft.write_text(_box_obj(size), encoding="utf-8")
-            draft.replace(path)
-    return path
+    return derived_file(f"parts/table-{'x'.join(f'{side:g}' for side in size)}-{TILE:g}.obj", lambda: _box_obj(size))
 
 
 def _box_obj(size: tuple[float, float, float]) -> str:

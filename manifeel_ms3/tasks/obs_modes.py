@@ -4,6 +4,8 @@ from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
 
+PAD = "tactile_"
+"""Start of the names of tactile pads among the sensors of an observation."""
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 STATE_TOKENS = ("state", "state_dict")
 WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")

@@ -28,7 +28,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
-from .obs_modes import split_obs_mode
+from .obs_modes import PAD, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
 from .states import is_part_of, unflattened
@@ -142,7 +142,7 @@ class VisuotactileEnv(SceneryEnv):
         self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
         self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
         self.sensor = sensor
-        names = {side: f"tactile_{side}" for side in SIDES}
+        names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self._camera_names, [names[s] for s in self._sides])
         configs = {
             side: task_sensor(sensor, name, f"gel_{side}", {**(tactile or {}), **own.get(name, {})}, imperfections)

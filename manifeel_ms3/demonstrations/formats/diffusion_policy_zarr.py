@@ -18,6 +18,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 from manifeel_ms3.sensors.config import TactileSensorConfig
+from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
 from .maniskill_h5 import each_demonstration, observation_keys, read_header
@@ -55,9 +56,9 @@ def array_name(key: str) -> str:
     if key == "extra/tcp_pose":
         return "state"
     _, sensor, kind = key.split("/")
-    if not sensor.startswith("tactile_"):
+    if not sensor.startswith(PAD):
         return sensor
-    side = sensor.removeprefix("tactile_")
+    side = sensor.removeprefix(PAD)
     return f"{side}_tactile_camera_taxim" if kind == "rgb" else f"tactile_force_field_{side}"
 
 

@@ -1,5 +1,7 @@
 """Where LeRobot's datasets (format 3.0) keep things, and the names of their features."""
 
+from manifeel_ms3.tasks.obs_modes import PAD
+
 INFO = "meta/info.json"
 CARD = "README.md"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -8,8 +10,6 @@ VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 description can name any file."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """Features that number frames, episodes and tasks; every LeRobot dataset has them."""
-PAD = "tactile_"
-"""What the names of the tactile sensors begin with."""
 
 
 def feature_name(key: str) -> str:

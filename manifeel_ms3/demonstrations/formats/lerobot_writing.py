@@ -11,12 +11,13 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.files import write_json
+from manifeel_ms3.tasks.obs_modes import PAD
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
-from .lerobot_layout import CARD, COUNTERS, DATA, INFO, PAD, VIDEO, feature_name
+from .lerobot_layout import CARD, COUNTERS, DATA, INFO, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
 from .maniskill_h5 import each_demonstration, observation_keys, read_header
 
