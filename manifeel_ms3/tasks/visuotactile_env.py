@@ -144,8 +144,9 @@ class VisuotactileEnv(SceneryEnv):
         self.sensor = sensor
         names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self._camera_names, [names[s] for s in self._sides])
+        pad_options = by_name("tactile", tactile or {}, '{"units": "tacsl", "optics.noise": 2.0}')
         configs = {
-            side: task_sensor(sensor, name, f"gel_{side}", {**(tactile or {}), **own.get(name, {})}, imperfections)
+            side: task_sensor(sensor, name, f"gel_{side}", {**pad_options, **own.get(name, {})}, imperfections)
             for side, name in names.items()
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}

@@ -18,7 +18,7 @@ import pytest
 from manifeel_ms3.demonstrations import DemonstrationError, dataset, render_observations
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, episode_folder, write_episode
-from manifeel_ms3.demonstrations.recording import make_header, open_recording
+from manifeel_ms3.demonstrations.recording import STATES_FILE, make_header, open_recording
 from manifeel_ms3.errors import InUseError, ManifeelError
 from manifeel_ms3.files import remove_folder
 from manifeel_ms3.ownership import owned
@@ -243,7 +243,7 @@ def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_pa
         Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",)))
     with owned(tmp_path / "manifest.json"), pytest.raises(InUseError):
         dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
-    with owned(tmp_path / PEG / "states.h5"), pytest.raises(InUseError):
+    with owned(tmp_path / PEG / STATES_FILE), pytest.raises(InUseError):
         dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
     Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",))).finish()  # nothing was saved
     assert not list(tmp_path.glob("t.*"))
