@@ -19,7 +19,8 @@ class EncoderConfig:
 
     image: str = "resnet18"
     """Network of each camera: "resnet18" averages its features over the image, as the paper's public code does;
-    "resnet18_keypoints" has the spatial softmax of the paper's text; "small_cnn" is for a CPU."""
+    "resnet18_keypoints" has the spatial softmax of the paper's text; "small_cnn" is for a CPU, "fine_cnn" for a CPU and
+    images of 160 pixels."""
     tacrgb: str = "resnet18"
     """Network of each TacRGB image, by its name in `TACRGB_ENCODERS`."""
     freeze_tacrgb: bool = False
@@ -96,6 +97,24 @@ class SmallCNN(nn.Sequential):
             *_conv(24, 48, stride=2),
             *_conv(48, 64, stride=2),
             *_conv(64, 64),
+            nn.Conv2d(64, 16, 1),
+            nn.Flatten(),
+            nn.Linear(16 * places, features),
+            nn.SiLU(),
+        )
+
+
+class FineCNN(nn.Sequential):
+    """A small image network for a CPU that sees fine detail: its first convolution has a stride of 4, so that images of 160
+    pixels cost what `SmallCNN` needs for 80."""
+
+    def __init__(self, size: int, features: int):
+        places = math.ceil(size / 16) ** 2
+        super().__init__(
+            *_conv(3, 32, kernel_size=7, stride=4),
+            *_conv(32, 48, stride=2),
+            *_conv(48, 64),
+            *_conv(64, 64, stride=2),
             nn.Conv2d(64, 16, 1),
             nn.Flatten(),
             nn.Linear(16 * places, features),
@@ -184,6 +203,7 @@ IMAGE_ENCODERS: dict[str, MakeImageEncoder] = {
     "resnet18": _pooled,
     "resnet18_keypoints": _key_points,
     "small_cnn": SmallCNN,
+    "fine_cnn": FineCNN,
 }
 """Networks over camera images."""
 TACRGB_ENCODERS: dict[str, MakeImageEncoder] = dict(IMAGE_ENCODERS)

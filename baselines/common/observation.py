@@ -25,6 +25,11 @@ MIN_IMAGE_SIZE = 16
 """Smallest side of an image that policies take, pixels."""
 TAXEL_SHAPE = TactileSensorConfig.taxel_shape
 """Rows and columns of taxels of the default sensor."""
+CameraView = Literal["whole", "work"]
+"""Parts of a camera image that networks take: all of it, or the square in which the work is done."""
+WORK_SQUARES = dict(wrist=(0.28, 0.14, 0.72), front=(0.0, 0.125, 0.75), side=(0.0, 0.125, 0.75))
+"""Top, left and side of the square of each camera's image in which the work is done, as shares of the image's side. Beside it
+the wrist camera sees its own housing, the other cameras the bare table before the work (seen in demonstrations of all tasks)."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,8 @@ class ObservationSpec:
     """Rows and columns of taxels in a force field."""
     pose: PoseForm = "quaternion"
     """Form of the tool's pose."""
+    camera_view: CameraView = "whole"
+    """Part of the camera images that networks take."""
 
     @property
     def keys(self) -> list[str]:
@@ -67,6 +74,7 @@ def observation_spec(
     tactile_image_size: int | None = None,
     taxel_shape: tuple[int, int] = TAXEL_SHAPE,
     pose: PoseForm = "quaternion",
+    camera_view: CameraView = "whole",
 ) -> ObservationSpec:
     """Observations of a policy that is trained with an observation mode; the tool pose is always among them.
 
@@ -78,11 +86,11 @@ def observation_spec(
         tactile_image_size: Height and width to which TacRGB images are resized, pixels; those of the cameras if not given.
         taxel_shape: Rows and columns of taxels in a force field.
         pose: Form of the tool's pose.
+        camera_view: Part of the camera images that networks take.
 
     Raises:
-        InvalidArgumentError: The mode holds privileged observations, or some that the encoders do not take, or a size or the
-        form
-            of the pose is not allowed.
+        InvalidArgumentError: The mode holds privileged observations, or some that the encoders do not take, or a size, the form
+            of the pose or the part of the images is not allowed.
     """
     if tactile_image_size is None:
         tactile_image_size = image_size
@@ -93,6 +101,8 @@ def observation_spec(
             )
     if pose not in get_args(PoseForm):
         raise InvalidArgumentError(f"pose={pose!r}: the forms of a pose are {list(get_args(PoseForm))}")
+    if camera_view not in get_args(CameraView):
+        raise InvalidArgumentError(f"camera_view={camera_view!r}: the parts of an image are {list(get_args(CameraView))}")
     own, touch = split_obs_mode(obs_mode)
     if own not in ("rgb", "none"):
         raise InvalidArgumentError(
@@ -101,7 +111,7 @@ def observation_spec(
     images = [f"sensor_data/{camera}/rgb" for camera in cameras if own == "rgb"]
     images += [f"sensor_data/tactile_{side}/rgb" for side in tactile_sensors if "rgb" in touch]
     fields = [f"sensor_data/tactile_{side}/force_field" for side in tactile_sensors if "force_field" in touch]
-    return ObservationSpec(tuple(images), tuple(fields), image_size, tactile_image_size, taxel_shape, pose)
+    return ObservationSpec(tuple(images), tuple(fields), image_size, tactile_image_size, taxel_shape, pose, camera_view)
 
 
 def is_tactile(key: str) -> bool:
@@ -112,10 +122,20 @@ def is_tactile(key: str) -> bool:
 def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:
     """One observation over time, (T, ...), as networks take it: images resized, poses in the form that the policy takes."""
     if key in spec.images:
+        if spec.camera_view == "work" and not is_tactile(key):
+            value = work_square(value, key.split("/")[1])
         return prepare_images(value, spec.size_of(key))
     if key == POSE:
         return rotation_6d_pose(value) if spec.pose == "rotation_6d" else quaternion_pose(value)
     return value.astype(np.float32)
+
+
+def work_square(images: np.ndarray, camera: str) -> np.ndarray:
+    """The square of a camera's images (T, H, W, 3) in which the work is done; images of other cameras are returned whole."""
+    if camera not in WORK_SQUARES:
+        return images
+    top, left, side = (round(share * images.shape[1]) for share in WORK_SQUARES[camera])
+    return images[:, top : top + side, left : left + side]
 
 
 def prepare_images(images: np.ndarray, size: int) -> np.ndarray:

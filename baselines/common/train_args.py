@@ -12,7 +12,7 @@ from tyro.conf import arg
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import short_name
 
-from .observation import PoseForm
+from .observation import CameraView, PoseForm
 from .policy import PolicyConfig
 
 PUBLIC_CODE_LR = 1e-4
@@ -39,6 +39,9 @@ class TrainArgs:
     """Sides of the tactile sensors that the policy observes: "left" or "right"."""
     image_size: int = 256
     """Height and width to which camera images are resized, pixels."""
+    camera_view: CameraView = "whole"
+    """Part of the camera images that the policy observes: "whole" images as in the paper, or "work", the square of each
+    camera's image in which the work is done, so that the same number of pixels shows it finer."""
     tactile_image_size: int = 256
     """Height and width to which TacRGB images are resized, pixels; 224 for T3 and AnyTouch in the paper."""
     pose: PoseForm = "quaternion"

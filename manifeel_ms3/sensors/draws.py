@@ -1,27 +1,31 @@
 """Random numbers that are functions of an episode's seed, for many episodes at once."""
 
 import numpy as np
+import torch
+import warp as wp
 
-# SplitMix64 (Steele, Lea & Flood 2014, "Fast splittable pseudorandom number generators"): its increment and mixing constants
-INCREMENT, FIRST, SECOND = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-MANTISSA = np.uint64(11)  # bits that do not fit a float64
+from .warp_device import warp_device
+
+STREAM_STRIDE = 1 << 20
+"""Distance of the offsets at which streams begin: more than the numbers that any stream draws."""
 
 
-def _mixed(state: np.ndarray) -> np.ndarray:
-    state = (state ^ (state >> np.uint64(30))) * FIRST
-    state = (state ^ (state >> np.uint64(27))) * SECOND
-    return state ^ (state >> np.uint64(31))
+@wp.kernel
+def _draw(seed: wp.array(dtype=wp.int32), begin: int, drawn: wp.array2d(dtype=wp.float32)):
+    p, k = wp.tid()
+    drawn[p, k] = wp.randf(wp.rand_init(seed[p], begin + k), -1.0, 1.0)
 
 
 def uniform_draws(seeds: np.ndarray, stream: int, count: int) -> np.ndarray:
-    """Numbers (P, count), uniform in [-1, 1); each row is a function of its seed and of the stream.
+    """Numbers (P, count), uniform in [-1, 1); each row is a function of its seed's lowest 32 bits and of the stream.
 
     Args:
         seeds: Seeds (P,) of P episodes.
         stream: Number that separates draws for different purposes.
         count: Numbers for each seed.
     """
-    with np.errstate(over="ignore"):  # arithmetic modulo 2^64
-        row = _mixed(np.asarray(seeds).astype(np.uint64) * INCREMENT + np.uint64(stream + 1))
-        bits = _mixed(row[:, None] + INCREMENT * np.arange(1, count + 1, dtype=np.uint64))
-    return (bits >> MANTISSA) * 2.0**-52 - 1.0
+    cpu = warp_device(torch.device("cpu"))
+    low = np.asarray(seeds).astype(np.int64).astype(np.int32)
+    drawn = wp.empty((len(low), count), dtype=wp.float32, device=cpu)
+    wp.launch(_draw, drawn.shape, [wp.array(low, device=cpu), stream * STREAM_STRIDE, drawn], device=cpu)
+    return drawn.numpy().astype(np.float64)
