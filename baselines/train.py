@@ -49,5 +49,10 @@ def main(args: TrainArgs) -> Path:
     return spec.train(args)
 
 
+def next_step(_args: TrainArgs, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} is the trained policy; `manifeel eval --checkpoint {made}` evaluates it"
+
+
 if __name__ == "__main__":
-    sys.exit(run(lambda _: main(tyro.cli(Args)), None))
+    sys.exit(run(main, tyro.cli(Args), next_step))

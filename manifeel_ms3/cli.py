@@ -4,11 +4,13 @@
     manifeel train diffusion_policy cpu --demos trajectory.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
-Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). Other
-packages add commands through the entry point group `manifeel.commands`. Only the module of the command that is run is imported,
+Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). If it has
+a function `next_step(args, answer)`, its text is shown at the end. Other packages add commands through the entry point group
+`manifeel.commands`. Only the module of the command that is run is imported,
 except for a shell's completion, which needs the flags of all commands.
 """
 
+import logging
 import sys
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -25,6 +27,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import PluginError, UnknownNameError
 from manifeel_ms3.plugins import Command
 
+log = logging.getLogger(__name__)
 COMMANDS = {
     "tasks": Command("manifeel_ms3.tasks.__main__", "List the tasks, or describe one of them."),
     "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and how to repair what it cannot."),
@@ -94,7 +97,11 @@ def _run(arguments: list[str]) -> Any:
         name = arguments[0]
         module = command_module(name)
         getattr(module, "check_arguments", lambda _: None)(arguments[1:])
-        return module.main(tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:]))
+        args = tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:])
+        answer = module.main(args)
+        if hasattr(module, "next_step"):
+            log.info("%s", module.next_step(args, answer))
+        return answer
     if arguments and not arguments[0].startswith("-"):
         near = get_close_matches(arguments[0], commands, n=1)
         meant = f" (did you mean {near[0]!r}?)" if near else ""

@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 from .errors import InvalidArgumentError, ManifeelError, MissingExtraError
 from .paths import troubleshooting
 
+log = logging.getLogger(__name__)
 TRACEBACK = "MANIFEEL_TRACEBACK"
 """Environment variable; if it is not empty, commands also show the traceback of a `ManifeelError`."""
 INTERRUPTED = 130
@@ -28,7 +29,7 @@ DISTRIBUTIONS = {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml", "
 """Names of distributions by the names of their modules, where the two differ."""
 
 
-def run(main: Callable[[Any], Any], args: Any) -> int:
+def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], str] | None = None) -> int:
     """Run `main(args)` and return the exit code.
 
     The code is 1 if `main` raises a `ManifeelError` or returns a number other than 0, such as the number of faults that it
@@ -37,10 +38,14 @@ def run(main: Callable[[Any], Any], args: Any) -> int:
     Args:
         main: Function of the command.
         args: Its only argument.
+        next_step: Function from `args` and the answer of `main` to what it made and what one can do with it; this is logged
+            at the end.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
         answer = main(args)
+        if next_step:
+            log.info("%s", next_step(args, answer))
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")
         gc.freeze()  # or else the end of the interpreter searches all objects of torch for garbage, which takes 1.4 s

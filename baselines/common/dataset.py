@@ -54,13 +54,14 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
 def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     """The arguments of the task with which demonstrations were recorded, such as its lighting or fit, by which evaluation goes.
 
-    LeRobot datasets do not hold them. Zarr stores of the paper's own data stand for the paper's units of touch.
+    LeRobot datasets of other sources do not hold them. Zarr stores of the paper's own data stand for the paper's units.
 
     Raises:
         DemonstrationError: Two files were recorded with different arguments.
     """
-    formats = [(file, format_of(file).env_kwargs) for file in files]
-    known = [(file, _of_task(recorded(file))) for file, recorded in formats if recorded is not None]
+    readers = [(file, format_of(file).env_kwargs) for file in files]
+    recorded = [(file, read(file)) for file, read in readers if read is not None]
+    known = [(file, _of_task(arguments)) for file, arguments in recorded if arguments is not None]
     for (first, expected), (second, found) in pairwise(known):
         for name in sorted(expected | found):
             if expected.get(name) != found.get(name):

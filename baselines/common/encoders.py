@@ -105,8 +105,10 @@ class SmallCNN(nn.Sequential):
 
 
 class FineCNN(nn.Sequential):
-    """A small image network for a CPU that sees fine detail: its first convolution has a stride of 4, so that images of 160
-    pixels cost what `SmallCNN` needs for 80."""
+    """A small image network for a CPU that sees fine detail.
+
+    Its first convolution has a stride of 4, so that images of 160 pixels cost what `SmallCNN` needs for 80.
+    """
 
     def __init__(self, size: int, features: int):
         places = math.ceil(size / 16) ** 2

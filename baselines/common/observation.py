@@ -29,7 +29,7 @@ CameraView = Literal["whole", "work"]
 """Parts of a camera image that networks take: all of it, or the square in which the work is done."""
 WORK_SQUARES = dict(wrist=(0.28, 0.14, 0.72), front=(0.0, 0.125, 0.75), side=(0.0, 0.125, 0.75))
 """Top, left and side of the square of each camera's image in which the work is done, as shares of the image's side. Beside it
-the wrist camera sees its own housing, the other cameras the bare table before the work (seen in demonstrations of all tasks)."""
+the wrist camera sees its own housing, the others the bare table before the work (looked at in demonstrations of all tasks)."""
 
 
 @dataclass(frozen=True)

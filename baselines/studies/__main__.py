@@ -96,6 +96,8 @@ def main(args: Args) -> None:
         errors = _run(study, jobs, args.root.absolute(), args.address, console)
     failed = [job for job in jobs if not is_done(job, args.root)]
     console.print(f"{len(jobs) - len(failed)} of {len(jobs)} jobs of {args.study} are done, in {args.root}")
+    if not failed:
+        console.print(f"`manifeel results --results {args.root} --out results.md` sets them beside the paper's", soft_wrap=True)
     if failed:
         reasons = "\n".join(f"  {job.kind}: {job.title}: {_reason(job, args.root, errors)}" for job in failed)
         raise StudyFailed(f"{len(failed)} jobs are not done; give the same command to try them again:\n{reasons}")

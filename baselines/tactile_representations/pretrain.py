@@ -7,7 +7,6 @@ The first is what the paper ManiFeel does for all its tasks. UniT is trained as 
 masked autoencoding; the option `--tacrgb-weights` of a policy's training takes the result.
 """
 
-import logging
 import math
 import sys
 from collections.abc import Callable, Iterable
@@ -38,7 +37,6 @@ from .sparsh import Sparsh
 from .t3 import T3
 from .unit import UniT
 
-log = logging.getLogger(__name__)
 MAE_BETAS, MAE_WEIGHT_DECAY = (0.9, 0.95), 0.05
 """Decay rates of AdamW's moments, and its weight decay (He et al. 2022, table 8)."""
 VQGAN_BETAS = (0.5, 0.9)
@@ -117,7 +115,6 @@ def main(args: Args) -> list[float]:
             bar.advance(task)
     with atomic_write(args.out) as partial:
         save_file({name: t.contiguous() for name, t in representation.state_dict().items()}, partial)
-    log.info("%s", args.out)
     return losses
 
 
@@ -215,5 +212,11 @@ def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
     optimizer.step()
 
 
+def next_step(args: Args, _losses: list[float]) -> str:
+    """What the command made, and what one can do with it."""
+    flags = f"--policy.encoder.tacrgb {args.representation} --tacrgb-weights {args.out}"
+    return f"{args.out} holds the weights; `manifeel train ... {flags}` trains a policy with them"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

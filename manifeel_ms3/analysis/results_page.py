@@ -5,7 +5,6 @@ of a run, the leaderboard) have plotly's interactive ones.
 """
 
 import json
-import logging
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,7 +33,6 @@ from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, col
 from .rank_agreement import rank_table
 from .success_curves import write_curves
 
-log = logging.getLogger(__name__)
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
 PANEL = (5.0, 3.4)
@@ -112,7 +110,6 @@ def main(args: Args) -> Path:
     has_curves = write_curves(results, success, success.with_suffix(".csv"))
     curves = success.relative_to(args.out.parent) if has_curves else None
     write_text(args.out, "".join(page(results, loss, similarities, curves)))
-    log.info("%s", args.out)
     return args.out
 
 
@@ -267,5 +264,10 @@ def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
     return f"{hours:.2f} h" if hours else None, ", ".join(sorted(machines)) or None
 
 
+def next_step(_args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} has all tables; `manifeel claims` tests what the paper claims on the same results"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -180,5 +180,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+def next_step(args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} lists the files; `manifeel validate {args.out}/*/*.h5` checks them, `manifeel summary FILE` describes one"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

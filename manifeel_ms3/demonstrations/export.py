@@ -1,6 +1,5 @@
 """Export demonstrations: `python -m manifeel_ms3.demonstrations.export trajectory.h5 --to lerobot --out folder`."""
 
-import logging
 import shutil
 import sys
 from collections.abc import Callable
@@ -21,7 +20,6 @@ from .formats.demonstration_format import Progress
 from .formats.lerobot_writing import write_lerobot
 from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
 
-log = logging.getLogger(__name__)
 Format = Literal["lerobot", "zarr", "npz"]
 
 
@@ -74,9 +72,17 @@ def main(args: Args) -> Path:
     with progress_bar() as bar:
         write(args.file, draft, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
     draft.replace(args.out)
-    log.info("%s", args.out)
     return args.out
 
 
+def next_step(args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    if args.to == "npz":
+        return f"{made} holds one file for each episode; `numpy.load` opens them"
+    return (
+        f"{made} is a data set of the format {args.to}; `manifeel train diffusion_policy cpu --demo-path {made}` trains on it"
+    )
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

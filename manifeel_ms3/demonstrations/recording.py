@@ -271,3 +271,20 @@ def make_recorder(
     """Make the state of a worker process; `source_kwargs` are the arguments of the environment `Recorder.source`."""
     source = None if source_kwargs is None else make_env(env_id, **source_kwargs)
     return Recorder(make_env(env_id, **env_kwargs), env_id, drafts, source)
+
+
+def next_step_with(path: Path) -> str:
+    """What a trajectory file holds, and the commands that take it.
+
+    Args:
+        path: Path of the file.
+    """
+    header = read_header(path)
+    recorded = header["env_info"]
+    count, seen = len(header["episodes"]), recorded["env_kwargs"]
+    held = f"{path} holds {count} episode{'s' * (count != 1)}"
+    if seen["obs_mode"] == "none":
+        return f"{held}; `manifeel render-observations {path} --out FILE` adds observations"
+    sensing = f"--obs-mode {seen['obs_mode']} --cameras {' '.join(seen['cameras'])}"
+    train = f"manifeel train diffusion_policy cpu --demo-path {path} --env-id {recorded['env_id'].rpartition(':')[2]} {sensing}"
+    return f"{held}; `manifeel view {path}` shows them, `{train}` trains a policy"

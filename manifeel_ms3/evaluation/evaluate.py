@@ -34,7 +34,7 @@ from .engine import Evaluation, run_episodes
 from .journal import Journal
 from .policy import BATCH_SIZES, PolicySource, checked_device
 from .redaction import redacted
-from .result import as_published, provenance, published_config, result_of, write_result
+from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
 from .starts import read_seeds
 
@@ -126,7 +126,6 @@ def main(args: Args) -> Path:
             write_result(_result(evaluation, journal.in_order), out)
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
-    log.info("%s", out)
     return out
 
 
@@ -250,5 +249,12 @@ def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:
     return path
 
 
+def next_step(_args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    episodes = read_result(made)["episodes"]
+    outcome = f"{made}: {sum(episode['success_once'] for episode in episodes)} of {len(episodes)} episodes succeed"
+    return f"{outcome}; `manifeel film {made} --out FILE.mp4` shows one, `manifeel results` sets all results beside the paper's"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -1,4 +1,4 @@
-"""The time and force limits of tasks, from demonstrations: `python -m manifeel_ms3.evaluation.limits data/demos/*/trajectory.h5`.
+"""Time and force limits of tasks, from demonstrations: `python -m manifeel_ms3.evaluation.limits data/demos/*/trajectory.h5`.
 
 The registration of each task (`max_episode_steps`, `force_limit`) holds the numbers that this prints, and `demo_steps`.
 """

@@ -7,7 +7,6 @@ figures of the documentation are static images, which matplotlib draws (`manifee
 
 import base64
 import json
-import logging
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,6 @@ with missing_extras_named():
 
     from .video import Frame, encode_video, record_episode
 
-log = logging.getLogger(__name__)
 STRIP_FRAMES = 8
 """Number of steps that the strip of images shows."""
 STRIP_SIDE = 160
@@ -161,9 +159,13 @@ def main(args: Args) -> Path:
     )
     out = args.out or args.run_dir / "report.html"
     write_text(out, page)
-    log.info("%s", out)
     return out
 
 
+def next_step(_args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} is a page to open in a browser"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -118,7 +118,6 @@ def main(args: Args) -> Path:
     sources = [read_source(path, args.episode) for path in args.files]
     takes = [_film(source, args) for source in sources]
     write_film([list(film_frames(take)) for take in takes], args.out, args.fps, args.width)
-    log.info("%s (%.1f MB)", args.out, args.out.stat().st_size / 1e6)
     return args.out
 
 
@@ -218,5 +217,10 @@ def _name_difference(source: Source, success: bool) -> None:
     )
 
 
+def next_step(_args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} ({made.stat().st_size / 1e6:.1f} MB) plays in any browser"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -1,3 +1,6 @@
+# pyright: reportInvalidTypeForm=false, reportGeneralTypeIssues=false, reportAssignmentType=false
+# pyright: reportCallIssue=false, reportArgumentType=false, reportIndexIssue=false, reportOperatorIssue=false
+# (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
 """Random numbers that are functions of an episode's seed, for many episodes at once."""
 
 import numpy as np

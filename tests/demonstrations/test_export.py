@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.common.dataset import read_episodes
+from baselines.common.dataset import read_episodes, recorded_env_kwargs
 from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
@@ -56,6 +56,22 @@ def test_lerobot(tmp_path):
     assert np.allclose(stats["observation.state"]["std"], poses.std(0), atol=1e-6)
     images = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
     assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
+
+
+def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):
+    folder = exported("lerobot", tmp_path)
+    assert recorded_env_kwargs([folder]) == recorded_env_kwargs([SAMPLE])
+    with pytest.raises(DemonstrationError, match="of ManiFeel-PegInsertion-v1, not of ManiFeel-BallSorting-v1"):
+        lerobot.read_lerobot(folder, KEYS, env_id="ManiFeel-BallSorting-v1")
+    origin = folder / "meta/manifeel.json"
+    origin.write_text(json.dumps(dict(env_id=PEG, env_kwargs=dict(fit="tight"))))
+    with pytest.raises(DemonstrationError, match=r"with fit='tight'.*train on files"):
+        recorded_env_kwargs([folder, SAMPLE])
+    origin.write_text(json.dumps(dict(env_id=PEG)))
+    with pytest.raises(DemonstrationError, match=r"env_kwargs.*export the dataset again"):
+        recorded_env_kwargs([folder])
+    origin.unlink()  # a dataset of another source
+    assert recorded_env_kwargs([folder]) == {}
 
 
 def test_a_lerobot_dataset_says_what_it_is(tmp_path):

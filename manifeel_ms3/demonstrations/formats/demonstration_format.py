@@ -58,5 +58,6 @@ class DemonstrationFormat:
     """Reads episodes."""
     write: Callable[[Path, Path, Progress], None] | None = None
     """Writes the episodes of a trajectory file (first path) into a new folder (second path); None where only recording does."""
-    env_kwargs: Callable[[Path], dict[str, Any]] | None = None
-    """Arguments of the environment with which the episodes were recorded; None for a format that does not hold them."""
+    env_kwargs: Callable[[Path], dict[str, Any] | None] | None = None
+    """Arguments of the environment with which the episodes were recorded, None where a file does not hold them; None for a
+    format that never does."""

@@ -26,7 +26,7 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 
 from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Progress
-from .lerobot_layout import INFO, VIDEO, earlier_feature_name, feature_name
+from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
 from .own_files import broken_if_fails, stored_bytes
 
@@ -61,6 +61,12 @@ DESCRIPTION = {
     },
 }
 """Json schema of the fields that are read from meta/info.json."""
+ABOUT = {
+    "type": "object",
+    "required": ["env_id", "env_kwargs"],
+    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}},
+}
+"""Json schema of meta/manifeel.json."""
 
 
 def is_lerobot(path: Path) -> bool:
@@ -91,6 +97,23 @@ def read_info(folder: Path) -> dict[str, Any]:
     return info
 
 
+def recorded_arguments(folder: Path) -> dict[str, Any] | None:
+    """Arguments of the task with which a dataset was recorded; None if it was not exported by this package.
+
+    Raises:
+        DemonstrationError: The file that names them is broken.
+    """
+    return _origin(folder).get("env_kwargs")
+
+
+def _origin(folder: Path) -> dict[str, Any]:
+    path = Path(folder) / ORIGIN
+    try:
+        return read_json(path, ABOUT, "the origin of a LeRobot dataset") if path.is_file() else {}
+    except InvalidFileError as error:
+        raise DemonstrationError(f"{error}; export the dataset again") from error
+
+
 def read_lerobot(
     folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
 ) -> list[dict[str, np.ndarray]]:
@@ -103,13 +126,15 @@ def read_lerobot(
         keys: Observations to read.
         num: Number of episodes; all of them if not given.
         progress: Wraps the iteration over episodes, to show a progress bar.
-        env_id: Ignored: datasets of other sources do not name tasks of this package.
+        env_id: Id of the task that the episodes must be of, if the dataset names its task.
 
     Raises:
-        DemonstrationError: The dataset is broken, or lacks a feature.
+        DemonstrationError: The dataset is broken, is of another task, or lacks a feature.
         MissingExtraError: pyarrow or imageio is not installed.
     """
     info = read_info(folder)
+    if env_id not in (None, found := _origin(folder).get("env_id", env_id)):
+        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
     names = {key: next((n for n in _names(key) if n in info["features"]), feature_name(key)) for key in keys}
     if missing := [name for name in (*names.values(), "action") if name not in info["features"]]:
         raise DemonstrationError(f"{folder} lacks {missing}; it holds {sorted(info['features'])}")
@@ -255,4 +280,4 @@ def _decode(path: Path, shape: list[int]) -> Iterator[np.ndarray]:
         yield from reader.iter_data()
 
 
-LEROBOT = DemonstrationFormat("lerobot", is_lerobot, count_episodes, read_lerobot, write_lerobot)
+LEROBOT = DemonstrationFormat("lerobot", is_lerobot, count_episodes, read_lerobot, write_lerobot, recorded_arguments)

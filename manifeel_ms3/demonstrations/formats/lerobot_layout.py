@@ -3,6 +3,8 @@
 from manifeel_ms3.tasks.obs_modes import PAD
 
 INFO = "meta/info.json"
+ORIGIN = "meta/manifeel.json"
+"""File beside LeRobot's own that names the task and its arguments, by which evaluation goes."""
 CARD = "README.md"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

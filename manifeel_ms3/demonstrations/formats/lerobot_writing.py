@@ -17,7 +17,7 @@ from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
-from .lerobot_layout import CARD, COUNTERS, DATA, INFO, VIDEO, feature_name
+from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
 from .maniskill_h5 import each_demonstration, observation_keys, read_header
 
@@ -68,6 +68,8 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     write_json(folder / "meta/stats.json", {name: joined_statistics(name, entries) for name in writer.features})
     info = _info(writer, len(entries), start)
     (folder / CARD).write_text(card(header, task, info), encoding="utf-8")
+    recorded = header["env_info"]
+    write_json(folder / ORIGIN, dict(env_id=recorded["env_id"].rpartition(":")[2], env_kwargs=recorded["env_kwargs"]))
     write_json(folder / INFO, info)  # last: a folder without it is not a dataset
 
 
