@@ -115,11 +115,11 @@ class FineCNN(nn.Sequential):
         super().__init__(
             *_conv(3, 32, kernel_size=7, stride=4),
             *_conv(32, 48, stride=2),
-            *_conv(48, 64),
-            *_conv(64, 64, stride=2),
-            nn.Conv2d(64, 16, 1),
+            *_conv(48, 48),
+            *_conv(48, 64, stride=2),
+            nn.Conv2d(64, 8, 1),
             nn.Flatten(),
-            nn.Linear(16 * places, features),
+            nn.Linear(8 * places, features),
             nn.SiLU(),
         )
 

@@ -1,5 +1,7 @@
 """Scaling of a network's inputs and outputs to [-1, 1] by their ranges in the demonstrations."""
 
+from collections.abc import Iterable
+
 import torch
 import torch.nn as nn
 
@@ -61,3 +63,41 @@ class Normalizer(nn.Module):
         """Undo `normalize`."""
         centre, half = self._scale()
         return data * half + centre
+
+
+class ActionNormalizer(Normalizer):
+    """Map of actions to [-1, 1], in which small actions can be given more room.
+
+    Where parts touch, demonstrators move by a few percent of their largest action. On a linear scale such motions count for
+    next to nothing in a squared error, although contact depends on them. On the scale "root", each action is first replaced by
+    its square root with its sign, so that 4 % of the largest action becomes 20 %.
+
+    Args:
+        action_dim: Numbers of an action.
+        root: Whether actions are replaced by their roots.
+        pairs: Indices of numbers that are the x and y of a vector: the root is that of the vector's length, so that it turns
+            as the vector does.
+    """
+
+    def __init__(self, action_dim: int, root: bool = False, pairs: Iterable[tuple[int, int]] = ()):
+        super().__init__(action_dim)
+        self.root, self.pairs = root, [list(pair) for pair in pairs]
+
+    def fit(self, data: torch.Tensor) -> None:
+        super().fit(self._spread(data))
+
+    def normalize(self, data: torch.Tensor) -> torch.Tensor:
+        return super().normalize(self._spread(data))
+
+    def restore(self, data: torch.Tensor) -> torch.Tensor:
+        restored = super().restore(data)
+        return restored * self._length(restored) if self.root else restored
+
+    def _spread(self, actions: torch.Tensor) -> torch.Tensor:
+        return actions / self._length(actions).clamp(min=torch.finfo(torch.float32).tiny).sqrt() if self.root else actions
+
+    def _length(self, actions: torch.Tensor) -> torch.Tensor:
+        length = actions.abs()
+        for pair in self.pairs:
+            length[..., pair] = actions[..., pair].norm(dim=-1, keepdim=True)
+        return length

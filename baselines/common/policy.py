@@ -9,7 +9,7 @@ import torch.nn as nn
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
 from .mlp import ConditionalMLP
-from .normalizer import Normalizer
+from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
 from .unet import ConditionalUnet1D
 
@@ -26,6 +26,9 @@ class PolicyConfig:
     """Number of actions of a prediction that are executed before the next prediction."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
+    action_scale: Literal["linear", "root"] = "linear"
+    """Scale of the actions in the loss: "linear" as in the paper, or "root", on which small actions, by which parts are brought
+    together, count for more."""
     action_network: Literal["unet", "mlp"] = "unet"
     """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which takes less time on a CPU."""
     mlp_width: int = 256
@@ -74,13 +77,17 @@ class VisuotactilePolicy(nn.Module):
         normalizers = {POSE: Normalizer(spec.pose_features)}
         normalizers |= {key: Normalizer.of_taxels(spec.taxel_shape) for key in spec.force_fields}
         self.obs_normalizers = nn.ModuleDict({module_name(key): one for key, one in normalizers.items()})
-        self.action_normalizer = Normalizer(action_dim)
+        self.action_normalizer = ActionNormalizer(action_dim, config.action_scale == "root", self.action_pairs())
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:
         """The observation encoder, and the network over action sequences."""
         config = self.config
         encoder = ObservationEncoder(config.encoder, self.spec, config.obs_horizon)
         return encoder, make_action_network(config, self.action_dim, encoder.out_features)
+
+    def action_pairs(self) -> list[tuple[int, int]]:
+        """Indices of those numbers of an action that must be scaled as the x and y of one vector; none by default."""
+        return []
 
     def generation_loss(self, clean: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
         """The loss, a scalar, of normalised actions (B, pred_horizon, A) given conditions (B, ...)."""

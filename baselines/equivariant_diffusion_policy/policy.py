@@ -45,6 +45,9 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
         network = make_action_network(config, config.action_fields, encoder.out_features)
         return encoder, EquivariantActionNetwork(self.action_dim, config.action_fields, network)
 
+    def action_pairs(self):
+        return ACTION_PAIRS[self.action_dim]
+
     def fit_normalizers(self, observations, actions):
         super().fit_normalizers(observations, actions)
         pose = self.obs_normalizer(POSE)
@@ -52,7 +55,7 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
         _share_scale(pose, position)
         for pair in columns:
             _share_scale(pose, pair, centred=True)
-        for pair in ACTION_PAIRS[self.action_dim]:
+        for pair in self.action_pairs():
             _share_scale(self.action_normalizer, pair, centred=True)
 
 
