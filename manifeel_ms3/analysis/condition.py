@@ -33,6 +33,7 @@ NO_SETTINGS = frozenset(
 """Entries of a policy's configuration that make no other policy. Every other entry does."""
 OF_MODALITIES = {
     "image_size": ("rgb",),
+    "camera_view": ("rgb",),
     "policy.encoder.image": ("rgb",),
     "policy.encoder.image_features": ("rgb",),
     "tactile_image_size": ("tacrgb",),

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from baselines.common.dataset import SequenceDataset, read_episodes, recorded_env_kwargs
 from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
-from baselines.common.normalizer import Normalizer
-from baselines.common.observation import POSE, observation_spec, prepare, quaternion_pose, rotation_6d_pose
+from baselines.common.normalizer import ActionNormalizer, Normalizer
+from baselines.common.observation import POSE, WORK_SQUARES, observation_spec, prepare, quaternion_pose, rotation_6d_pose
 from baselines.common.policy import PolicyConfig, make_action_network
 from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
@@ -130,6 +130,24 @@ def test_images_are_resized_alike_for_training_and_evaluation():
     assert np.array_equal(prepare(spec.images[0], images[1:2], spec)[0], prepared[1])
 
 
+@pytest.mark.parametrize("camera", ["wrist", "front", "side"])
+def test_policies_can_take_the_square_in_which_the_work_is_done(camera):
+    spec = observation_spec("rgb+tacrgb", (camera,), ("right",), 32, camera_view="work")
+    image, pad = (np.random.default_rng(0).integers(0, 256, (2, *size, 3), np.uint8) for size in ((256, 256), (240, 320)))
+    key, touch = spec.images
+    top, left, side = (round(share * 256) for share in WORK_SQUARES[camera])
+    seen = prepare(key, image, spec)
+    assert seen.shape == (2, 32, 32, 3)
+    elsewhere = np.zeros_like(image)
+    elsewhere[:, top : top + side, left : left + side] = image[:, top : top + side, left : left + side]
+    assert np.array_equal(prepare(key, elsewhere, spec), seen)
+    assert not np.array_equal(prepare(key, image, observation_spec("rgb", (camera,), (), 32)), seen)
+    whole = observation_spec("tacrgb", (), ("right",), 32)
+    assert np.array_equal(prepare(touch, pad, spec), prepare(touch, pad, whole))
+    with pytest.raises(InvalidArgumentError, match=r"camera_view='half'.*\['whole', 'work'\]"):
+        observation_spec("rgb", (camera,), (), 32, camera_view="half")
+
+
 def test_tacrgb_has_a_size_of_its_own():
     spec = observation_spec("rgb+tacrgb", ("wrist",), ("right",), 64, 48)
     camera, pad = (prepare(key, np.zeros((2, 80, 80, 3), np.uint8), spec) for key in spec.images)
@@ -160,6 +178,29 @@ def test_normalizer_maps_the_datas_range_and_back():
     assert normalizer.normalize(data)[:, :2].tolist() == [[-1, -1], [1, 1]]
     assert torch.allclose(normalizer.restore(normalizer.normalize(data)), data)
     assert normalizer.normalize(data)[:, 2].abs().max() == 0  # what never moved stays small
+
+
+@pytest.mark.parametrize("pairs", [[], [(0, 1), (3, 4)]])
+def test_small_actions_have_more_room_on_the_root_scale(pairs):
+    actions = torch.cat([torch.rand(100, 6) * 2 - 1, torch.eye(6), -torch.eye(6), torch.zeros(1, 6)])
+    linear, root = ActionNormalizer(6), ActionNormalizer(6, root=True, pairs=pairs)
+    for normalizer in (linear, root):
+        normalizer.fit(actions)
+        assert torch.allclose(normalizer.restore(normalizer.normalize(actions)), actions, atol=1e-6)
+        assert normalizer.normalize(actions).abs().max() <= 1 + 1e-6
+    slide = 0.04 * torch.eye(6)
+    assert torch.allclose(linear.normalize(slide).diagonal(), torch.full((6,), 0.04), atol=0.02)
+    assert torch.allclose(root.normalize(slide).diagonal(), torch.full((6,), 0.2), atol=0.02)
+
+
+def test_the_root_of_a_vector_turns_as_the_vector_does():
+    turn = torch.as_tensor(Rotation.from_euler("z", 0.7).as_matrix(), dtype=torch.float32)
+    actions = torch.rand(50, 6) * 2 - 1
+    turned = torch.cat([actions[:, :3] @ turn.T, actions[:, 3:] @ turn.T], dim=1)
+    normalizer = ActionNormalizer(6, root=True, pairs=[(0, 1), (3, 4)])  # its range is [-1, 1] before it is fitted
+    expected = normalizer.normalize(actions)
+    expected = torch.cat([expected[:, :3] @ turn.T, expected[:, 3:] @ turn.T], dim=1)
+    assert torch.allclose(normalizer.normalize(turned), expected, atol=1e-6)
 
 
 def test_resnet18_has_group_norm_and_the_published_size():
@@ -215,7 +256,7 @@ def test_conditions_have_the_sizes_of_the_paper(mode, changes, per_step):
     assert encoder.out_features == 2 * per_step
 
 
-@pytest.mark.parametrize("image", ["small_cnn", "resnet18", "resnet18_keypoints"])
+@pytest.mark.parametrize("image", ["small_cnn", "fine_cnn", "resnet18", "resnet18_keypoints"])
 @pytest.mark.parametrize("crop", [40, 76])
 def test_crops_are_of_cameras_alone_and_may_be_larger_than_the_images(image, crop):
     spec = observation_spec("rgb+tacrgb", ("wrist",), ("right",), 48, 32)
