@@ -17,4 +17,5 @@ def made_up(seed: int, won: bool, length: int = 9, force: float = 1.0, at_end: b
         peak_contact_force=force,
         force_until_success=force if won else None,
         inference_ms=1.0,
+        ending="success" if won else "time-out",
     )

@@ -21,6 +21,7 @@ from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import short_name
 
+from .census import census_table
 from .claims import claims_page
 from .condition import Condition, condition_of
 from .estimates import difference, mean_success
@@ -178,6 +179,7 @@ def page(
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
     yield _table_of_floors(collected)
+    yield census_table(results, [condition for condition, _ in _sorted(found)])
     yield f"{TABLES}\n"
     yield _table_of_the_paper(found)
     yield rank_table(found)

@@ -6,7 +6,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -52,24 +52,30 @@ class EpisodeOutcome:
     """Largest contact force up to the first success, in N; None without success."""
     inference_ms: float = 0.0
     """Mean time of `Policy.act`, in ms, without the time that it waited for other episodes."""
+    ending: str | None = None
+    """How the episode ended: "success"; "lost", if it could not be won any more; "error"; what was missing at the time
+    limit (`VisuotactileEnv.shortcomings`), or "time-out" for a task that does not say; None where nothing was measured."""
     error: str | None = None
     """What the policy did wrong, if anything; the episode then counts as failed."""
 
 
 ONLY_TO_THE_END = ("success_at_end", "fail_at_end")
 """Fields of an outcome that exist only where episodes run to the time limit."""
+NOT_ALWAYS = (*ONLY_TO_THE_END, "ending")
+"""Fields of an outcome that result files may lack; those of earlier versions lack the ending."""
 
 
 def failed_outcome(seed: int, error: str | None, stop_at_success: bool) -> EpisodeOutcome:
     """The outcome of an episode of which nothing could be measured."""
     at_end = None if stop_at_success else False
-    return EpisodeOutcome(seed=seed, success_at_end=at_end, fail_at_end=at_end, error=error)
+    ending = "error" if error else None
+    return EpisodeOutcome(seed=seed, success_at_end=at_end, fail_at_end=at_end, ending=ending, error=error)
 
 
 def outcome_as_json(outcome: EpisodeOutcome) -> dict[str, Any]:
     """An outcome as result files hold it; what was not measured has no entry."""
     entries = {name.rstrip("_"): value for name, value in asdict(outcome).items()}
-    return {name: value for name, value in entries.items() if value is not None or name not in ONLY_TO_THE_END}
+    return {name: value for name, value in entries.items() if value is not None or name not in NOT_ALWAYS}
 
 
 def outcome_from_json(entries: dict[str, Any]) -> EpisodeOutcome:
@@ -127,7 +133,7 @@ def evaluate_episode(
         task.renders_cameras = True
     if on_step is not None:
         on_step(obs)
-    return metrics.outcome(to_the_end=not stop_at_success, error=fault)
+    return metrics.outcome(not stop_at_success, fault, shortcoming=_shortcoming(task, metrics))
 
 
 @dataclass
@@ -146,6 +152,8 @@ class _Metrics:
     """At the last step, as `fail`."""
     fail: bool = False
     fail_once: bool = False
+    last: dict[str, Any] = field(default_factory=dict)
+    """The info of the last step."""
 
     def add(self, reward: float, info: dict[str, Any]) -> None:
         """Add a step.
@@ -154,6 +162,7 @@ class _Metrics:
             PolicyFault: The contact force is NaN or infinite: the actions have made the simulation diverge.
         """
         self.steps += 1
+        self.last = info
         force = float(info["contact_force"])
         if not math.isfinite(force) or not math.isfinite(reward):
             raise PolicyFault(f"the simulation has diverged: the contact force is {force}, the reward {reward}")
@@ -164,9 +173,16 @@ class _Metrics:
         if self.success and self.first_success is None:
             self.first_success, self.force_until_success = self.steps, round(self.peak, 3)
 
-    def outcome(self, to_the_end: bool, error: str | None) -> EpisodeOutcome:
-        """The outcome; with an error the episode has failed, whatever was reached before."""
+    def outcome(self, to_the_end: bool, error: str | None, shortcoming: str) -> EpisodeOutcome:
+        """The outcome; with an error the episode has failed, whatever was reached before.
+
+        Args:
+            to_the_end: Whether success and failure did not end the episode.
+            error: What the policy did wrong, if anything.
+            shortcoming: What is missing if the episode neither succeeded nor was lost.
+        """
         won = error is None and self.first_success is not None
+        ending = "error" if error else "success" if won else "lost" if self.fail_once else shortcoming
         return EpisodeOutcome(
             seed=self.seed,
             success_once=won,
@@ -180,8 +196,15 @@ class _Metrics:
             peak_contact_force=round(self.peak, 3),
             force_until_success=self.force_until_success if won else None,
             inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), 3),
+            ending=ending,
             error=error,
         )
+
+
+def _shortcoming(task: Any, metrics: _Metrics) -> str:
+    """What is missing at the end of an episode without success, by the rule of `EpisodeOutcome.ending`."""
+    missing = task.shortcomings(metrics.last) if metrics.steps and hasattr(task, "shortcomings") else {}
+    return next((name for name, holds in missing.items() if bool(holds)), "time-out")
 
 
 def begin_episode(policy: Policy, seed: int) -> None:

@@ -230,6 +230,10 @@ class VisuotactileEnv(SceneryEnv):
         """Whether the episode cannot be won any more, (N,) bool."""
         raise NotImplementedError
 
+    def shortcomings(self, measures: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """What an episode can lack that ends without success, (N,) bool each; an evaluation counts the first that holds."""
+        return {}
+
     def _privileged_state(self) -> dict[str, torch.Tensor]:
         """State of the task's parts that only the state modes observe."""
         raise NotImplementedError

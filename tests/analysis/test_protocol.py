@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from manifeel_ms3.analysis.census import census_table
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
 from manifeel_ms3.analysis.estimates import difference, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
@@ -44,6 +45,24 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
     assert collected[condition].episode_seeds == [100, 101, 102]
     assert collected[condition].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
     assert mean_success(collected[condition]).value == pytest.approx(8 / 12)
+
+
+def test_the_endings_of_the_last_checkpoints_are_counted(tmp_path):
+    for seed in (0, 1):
+        for step in (10, 20):
+            write(tmp_path, seed, step, [step == 20, False, False])
+            path = tmp_path / f"{seed}/{step:08d}.json"
+            result = json.loads(path.read_text())
+            for episode, ending in zip(result["episodes"], ["success", "lost", "beside or above the hole"], strict=True):
+                episode["ending"] = ending
+            result["episodes"][2]["peak_contact_force"] = 1000.0
+            path.write_text(json.dumps(result))
+    results = results_in(tmp_path)
+    *_, row = census_table(results, list(collect(results))).splitlines()
+    assert row.endswith("| 6 | 2 | 2 lost, 2 beside or above the hole | 2 |")
+    for result in results:
+        del result["episodes"][0]["ending"]
+    assert census_table(results, list(collect(results))) == ""
 
 
 def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():

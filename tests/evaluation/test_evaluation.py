@@ -1,10 +1,13 @@
 """Evaluation: fixed seeds, honest intervals, identical outcomes, a page that opens."""
 
 import sys
+from contextlib import closing
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.evaluation import evaluate_episode
@@ -103,6 +106,22 @@ def test_a_policy_that_stands_still_never_succeeds(make_env):
     lost = evaluate_episode(make_env(**BARE), StandStill(), seed=1)
     assert (lost.success_once, lost.success_at_end, lost.first_success, lost.force_until_success) == (False, False, None, None)
     assert lost.episode_len == LIMIT
+    assert lost.ending == "beside or above the hole"
+
+
+def test_an_episode_is_said_to_have_succeeded_whatever_came_after(pulled_out):
+    assert pulled_out[0].ending == "success"
+
+
+@pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
+def test_every_task_says_what_a_policy_that_stands_still_lacks(spec):
+    with closing(gym.make(spec.env_id, obs_mode="none", render_backend="none")) as env:
+        env.reset(seed=0)
+        *_, info = env.step(np.zeros(env.action_space.shape, np.float32))
+        missing = env.unwrapped.shortcomings(info)
+    assert missing
+    assert all(holds.shape == (1,) and holds.dtype == torch.bool for holds in missing.values())
+    assert sum(bool(holds) for holds in missing.values()) >= 1  # else an episode would end in a mere time-out
 
 
 def test_same_policy_and_seed_give_the_same_outcome(make_env):

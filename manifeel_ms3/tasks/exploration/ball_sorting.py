@@ -158,6 +158,12 @@ class BallSortingEnv(VisuotactileEnv):
         lowest = torch.minimum(self.golf.pose.p[:, 2], self.tennis.pose.p[:, 2])
         return lowest < BALL_RADIUS + ON_TABLE
 
+    def shortcomings(self, measures):
+        if self.goal == "bowls":
+            return {"a ball beside its bowl": torch.ones_like(self.swapped)}
+        wrong, right = measures["tennis_away"] >= IN_PLACE, measures["golf_height"] >= IN_PLACE
+        return {"wrong ball taken": wrong, "golf ball taken, not lifted": right, "no ball taken": ~(wrong | right)}
+
     def _privileged_state(self):
         return dict(golf_pose=self.golf.pose.raw_pose, tennis_pose=self.tennis.pose.raw_pose)
 

@@ -134,6 +134,10 @@ class ObjectSearchEnv(VisuotactileEnv):
     def failed(self, measures):
         return (measures["away"] > OUTSIDE) & (measures["height"] < NOT_LIFTED)
 
+    def shortcomings(self, measures):
+        lying = measures["height"] < NOT_LIFTED
+        return {"battery not gripped": lying, "battery gripped, not lifted": ~lying}
+
     def _privileged_state(self):
         return dict(battery_pose=self.battery.pose.raw_pose)
 

@@ -105,6 +105,9 @@ class PegReorientationEnv(InsertionEnv):
             in_hand=torch.acos((fingers * peg).sum(1).clamp(-1.0, 1.0)),  # rad, between the fingers and the peg's axis
         )
 
+    def shortcomings(self, measures):
+        return {"peg not turned in the hand": measures["in_hand"] >= MAX_IN_HAND} | super().shortcomings(measures)
+
     def goal_reached(self, measures):
         turned = (measures["hand_tilt"] < MAX_HAND_TILT) & (measures["in_hand"] < MAX_IN_HAND)
         return super().goal_reached(measures) & turned

@@ -161,6 +161,10 @@ class InsertionEnv(VisuotactileEnv):
         held = self.agent.tcp.pose.inv() * self.plug.pose
         return torch.linalg.norm(held.p - self._grip.p, dim=1) > LOST
 
+    def shortcomings(self, measures):
+        outside = measures["gap"] >= self.fit.depth
+        return {"beside or above the hole": outside, "in the hole, not pressed home": ~outside}
+
     def _privileged_state(self):
         return dict(plug_pose=self.plug.pose.raw_pose, socket_pose=self.socket.pose.raw_pose)
 

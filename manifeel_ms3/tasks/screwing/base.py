@@ -116,6 +116,10 @@ class ScrewingEnv(VisuotactileEnv):
         away = torch.linalg.norm(self.agent.tcp.pose.p - self.held.pose.p, dim=1)
         return (away > LOST) & (measures["offset"] > OFF_AXIS)
 
+    def shortcomings(self, measures):
+        above = measures["descent"] <= 0.0
+        return {"threads not engaged": above, "engaged, not tight": ~above}
+
     def _privileged_state(self):
         return dict(held_pose=self.held.pose.raw_pose, fixed_pose=self.fixed.pose.raw_pose)
 
