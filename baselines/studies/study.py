@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
-from functools import cached_property
+from functools import cache, cached_property
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import yaml
 
+from baselines.common.checkpoint import as_json
 from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.command_line import PACKAGE
@@ -20,6 +21,8 @@ from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
 KINDS: tuple[Kind, ...] = ("record", "pretrain", "train", "evaluate")
+OF_THE_MACHINE = ("device", "precision", "compile")
+"""Settings of a preset that depend on the machine on which it is read."""
 TABLE = "table "
 """What `tasks` begins with where it names a table of the paper instead of listing tasks: "table I"."""
 
@@ -80,6 +83,8 @@ class Grid:
     """Number of evaluation episodes of a checkpoint."""
     checkpoints: int = 10
     """Number of checkpoints to evaluate, counted from the last one."""
+    stop_at_success: bool = False
+    """End evaluation episodes at success or failure, which is cheaper; the results then lack success at the end."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +242,7 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         camera = task_spec(task).policy_camera if camera == "policy" else camera
         record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
         train = _training(grid, record, policy, mode, encoder, num_demos, seed)
-        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints)
+        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop=grid.stop_at_success)
         for further in grid.evaluation_args:
             env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
             title = ", ".join((train.title, json.dumps(further))) if further else train.title
@@ -266,9 +271,24 @@ def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num
         flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
     demonstrations = f"{num_demos} demonstrations" if some else ""
     title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
-    settings = dict(policy=policy, preset=grid.preset, flags=flags, version=version(PACKAGE))
+    recipe = _hash_of_preset(policy, grid.preset)
+    settings = dict(policy=policy, preset=grid.preset, recipe=recipe, flags=flags, version=version(PACKAGE))
     pretrained = (_pretraining(encoder, grid.pretrain[encoder]),) if encoder in grid.pretrain else ()
     return Job("train", title, settings, (record, *pretrained))
+
+
+@cache
+def _hash_of_preset(policy: str, preset: str) -> str:
+    """Hash of a preset's settings, so that a run that was made before the preset changed counts as another run.
+
+    Raises:
+        StudyError: The policy has no such preset.
+    """
+    presets = policy_spec(policy).presets
+    if preset not in presets:
+        raise StudyError(f"the policy {policy} has no preset {preset!r}; choose from {list(presets)}")
+    settings = {name: value for name, value in as_json(presets[preset].args).items() if name not in OF_THE_MACHINE}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def _env_kwargs(grid: Grid) -> str:
