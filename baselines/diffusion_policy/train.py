@@ -37,7 +37,7 @@ class Args(TrainArgs):
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
-        "A small network that learns on two CPU cores in minutes.",
+        "A small network that learns on a CPU core in minutes.",
         for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
     ),
 }

@@ -35,7 +35,7 @@ PRESETS = {
         Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1),
     ),
     "cpu": Preset(
-        "A small network that learns on two CPU cores in minutes.",
+        "A small network that learns on a CPU core in minutes.",
         for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
     ),
 }
