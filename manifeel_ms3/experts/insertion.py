@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
 
-from .skills import CONFIG, DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
+from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
 STRAIGHT = Rotation.identity()
 
@@ -19,8 +19,6 @@ class InsertionExpertConfig:
     Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
     """
 
-    sight_error: float = CONFIG.sight_error
-    """Largest error of the socket's position as it is seen, in m."""
     grasp_error: float = float(np.deg2rad(0.5))
     """Largest error of the plug's pitch in the hand, in rad: how well TacRGB shows it."""
     hover_height: float = 0.010
@@ -85,7 +83,7 @@ class InsertionExpert:
     """Knows the parts, sees roughly where the socket is, and goes by what it feels.
 
     Two things are read from the simulator instead of from images: the socket's position, with an error of up to
-    `sight_error`, and the plug's pose in the hand, with an error of its pitch of up to `grasp_error`.
+    `SkillConfig.sight_error`, and the plug's pose in the hand, with an error of its pitch of up to `grasp_error`.
 
     While the plug is free, the hand is disturbed at random, so that the demonstrations show corrections.
     """
@@ -105,7 +103,7 @@ class InsertionExpert:
 
     def _see_socket(self) -> None:
         """Perceive the socket's position, with a new error."""
-        self.socket = perceived_position(self.env.socket, self._rng, self.config.sight_error)
+        self.socket = perceived_position(self.env.socket, self._rng)
 
     # ---------------------------------------------------------------- the plug in the hand
 

@@ -198,12 +198,12 @@ def above(position: np.ndarray, height: float) -> np.ndarray:
     return position + np.array([0.0, 0.0, height])
 
 
-def perceived_position(actor: Actor, rng: np.random.Generator, error: float = CONFIG.sight_error) -> np.ndarray:
-    """Position (3,), m, base frame, of an actor as a demonstrator sees it: up to `error` (m) off in a random direction.
+def perceived_position(actor: Actor, rng: np.random.Generator) -> np.ndarray:
+    """Position (3,), m, base frame, of an actor as a demonstrator sees it: up to `sight_error` off in a random direction.
 
     The true position is read from the simulator, and the error added to it.
     """
-    angle, radius = rng.uniform(0, 2 * np.pi), error * np.sqrt(rng.uniform())
+    angle, radius = rng.uniform(0, 2 * np.pi), CONFIG.sight_error * np.sqrt(rng.uniform())
     position, _ = position_rotation(actor.pose.raw_pose)
     return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
 

@@ -9,7 +9,7 @@ from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .insertion import STRAIGHT, InsertionExpert, InsertionExpertConfig
 from .leaning_insertion import LeaningGearExpert, LeaningInsertionExpert
-from .skills import CONFIG, Actions, above
+from .skills import Actions, above
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,8 @@ class UprightConfig(InsertionExpertConfig):
     keeps_hand: bool = True
     lowering: float = 0.003
     """Depth below the rim, in m, down to which the plug is lowered at a steady pace where nothing stops it. Tuned."""
-    sight_error: float = 0.004
-    """Largest error of the socket's position as it is seen, in m. It is that of a small network that sees the socket between
-    the fingers, so that most demonstrations land on the rim and show what is done there; with 1.5 mm one in six does."""
-    slide: float = 8e-4
-    """Motion of the plug away from what it stands on, in m per step. Tuned: as fast as it comes to rest in the hole, since a
-    policy hardly learns motions of a few percent of the largest."""
+    slide: float = 3e-4
+    """Motion of the plug away from what it stands on, in m per step. Tuned."""
     sure_force: float = 1.5
     """Downward force, in N, from which the place of a contact can be told. Tuned."""
     unload_every: int = 10
@@ -73,7 +69,7 @@ class UprightGearExpert(UprightInsertionExpert):
     Where teeth stand on teeth, it presses less now and then, so that the gear turns over its neighbours instead of with them.
     """
 
-    config = UprightConfig(twist=0.10, press_force=6.0, sight_error=CONFIG.sight_error, slide=3e-4)  # tuned
+    config = UprightConfig(twist=0.10, press_force=6.0)  # tuned
 
     def _press_force(self, stuck: int) -> float:
         unloaded = stuck // self.config.unload_every % 2 == 1

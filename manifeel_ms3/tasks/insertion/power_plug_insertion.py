@@ -14,7 +14,7 @@ from .base import InsertionEnv
     paper_demos=50,
     paper_tables=("I",),
     demo_steps=57,
-    revision=4,
+    revision=3,
     force_limit=32.0,
 )
 class PowerPlugInsertionEnv(InsertionEnv):
