@@ -13,6 +13,9 @@ from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
 from .unet import ConditionalUnet1D
 
+HEIGHT = 2
+"""Index of the height among the numbers of a pose."""
+
 
 @dataclass
 class PolicyConfig:
@@ -44,8 +47,9 @@ class PolicyConfig:
     diffusion_step_embed_dim: int = 128
     """Size of the embedding of the diffusion step (or of the flow's time)."""
     pose_noise: float = 0.0
-    """Standard deviation of the noise that training adds to the normalised tool pose; without noise, a policy trained on a few
-    demonstrations can recognise each of them by the pose alone."""
+    """Standard deviation of the noise that training adds to the normalised tool pose, but for its height. Without noise, a policy
+    trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart, and says
+    how far the work has come."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
@@ -114,7 +118,9 @@ class VisuotactilePolicy(nn.Module):
         """Features (B, ...) of observations {key: (B, obs_horizon, ...)}."""
         normalised = {key: self.obs_normalizer(key).normalize(obs[key]) for key in (POSE, *self.spec.force_fields)}
         if pose_noise > 0:
-            normalised[POSE] = normalised[POSE] + pose_noise * torch.randn_like(normalised[POSE])
+            noise = pose_noise * torch.randn_like(normalised[POSE])
+            noise[..., HEIGHT] = 0.0
+            normalised[POSE] = normalised[POSE] + noise
         return self.encoder({**obs, **normalised})
 
     def forward(self, obs: dict[str, torch.Tensor], actions: torch.Tensor) -> torch.Tensor:

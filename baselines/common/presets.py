@@ -33,7 +33,8 @@ def for_cpu(
         encoder=encoder,
         action_network="mlp",
         diffusion_step_embed_dim=64,
-        pose_noise=0.03,
+        mlp_width=128,
+        pose_noise=0.1,
         noise_draws=8,
         **policy,
     )

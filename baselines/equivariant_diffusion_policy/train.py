@@ -28,6 +28,7 @@ class Args(TrainArgs):
     inference_steps: int = 100
     """Number of denoising steps of DDIM in evaluation."""
 
+
 SMALL = replace(FINE, image="small_cnn", crop=78)
 """Encoders of the preset `cpu`: the equivariant network over the cameras' images takes larger ones too slowly."""
 PRESETS = {

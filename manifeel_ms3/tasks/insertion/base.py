@@ -25,6 +25,8 @@ MAX_TILT = np.deg2rad(3.0)
 """Angle, in rad, from the socket's axis below which the plug counts as upright."""
 LOST = 0.03
 """Displacement of the plug in the grip, in m, beyond which it is lost."""
+BESIDE = 0.003
+"""Distance, in m, of the plug's end from the socket's axis beyond which it is beside the hole and not in it."""
 CLEAR = 0.010
 """Smallest height of the plug over the socket at the start, in m."""
 MAX_ROTATION = 0.4
@@ -162,7 +164,7 @@ class InsertionEnv(VisuotactileEnv):
         return torch.linalg.norm(held.p - self._grip.p, dim=1) > LOST
 
     def shortcomings(self, measures):
-        outside = measures["gap"] >= self.fit.depth
+        outside = (measures["gap"] >= self.fit.depth) | (measures["offset"] >= BESIDE)
         return {"beside or above the hole": outside, "in the hole, not pressed home": ~outside}
 
     def _privileged_state(self):
