@@ -47,9 +47,9 @@ class PolicyConfig:
     diffusion_step_embed_dim: int = 128
     """Size of the embedding of the diffusion step (or of the flow's time)."""
     pose_noise: float = 0.0
-    """Standard deviation of the noise that training adds to the normalised tool pose, but for its height. Without noise, a policy
-    trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart, and says
-    how far the work has come."""
+    """Standard deviation of the noise that training adds to the normalised tool pose, but for its height. Without noise, a
+    policy trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart,
+    and says how far the work has come."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
