@@ -57,7 +57,7 @@ def train_flags(settings: dict[str, Any]) -> list[str]:
 def evaluate_arguments(job: Job, workers: int, checkpoint: str, out: str) -> list[str]:
     """Arguments of `manifeel eval` for one checkpoint of a job."""
     amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(workers)]
-    stop = ["--stop-at-success"] if job.settings["stop"] else []
+    stop = ["--stop-at-success"] if job.settings["stop_at_success"] else []
     return ["--checkpoint", checkpoint, *amount, *stop, "--env-kwargs", job.settings["env_kwargs"], "--out", out]
 
 

@@ -242,7 +242,7 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         camera = task_spec(task).policy_camera if camera == "policy" else camera
         record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
         train = _training(grid, record, policy, mode, encoder, num_demos, seed)
-        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop=grid.stop_at_success)
+        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop_at_success=grid.stop_at_success)
         for further in grid.evaluation_args:
             env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
             title = ", ".join((train.title, json.dumps(further))) if further else train.title
