@@ -60,7 +60,8 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
     cameras, pads = tuple(config["cameras"]), tuple(config["tactile_sensors"])
     rows, columns = config.get("taxel_shape", TAXEL_SHAPE)
     sizes = config["image_size"], config["tactile_image_size"]
-    return observation_spec(config["obs_mode"], cameras, pads, *sizes, (rows, columns), config["pose"], config["camera_view"])
+    view = config.get("camera_view", "whole")
+    return observation_spec(config["obs_mode"], cameras, pads, *sizes, (rows, columns), config["pose"], view)
 
 
 class PolicyAgent:
