@@ -89,7 +89,12 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
     journal, errors = journal_of(args.out), tmp_path / "stderr"
     with errors.open("w") as file:
         process = subprocess.Popen(
-            command_of(args), cwd=REPOSITORY, env=os.environ | {STUCK: "1"}, stderr=file, start_new_session=True
+            command_of(args),
+            cwd=REPOSITORY,
+            env=os.environ | {STUCK: "1"},
+            stderr=file,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite in the background ignores Ctrl-C
         )
     try:
         wait_for_episodes(journal, 1)
