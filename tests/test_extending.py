@@ -216,6 +216,7 @@ def test_a_command_with_a_name_that_is_taken_or_of_another_kind_is_refused(tmp_p
 def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
     config = dict(policy_name="knitting", env_id=PEG, obs_mode="tacff", cameras=[], tactile_sensors=["right"])
     (tmp_path / "config.json").write_text(json.dumps(config))
-    said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER)
+    out = ("--out", tmp_path / "evaluation.json")
+    said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER, *out)
     assert "is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
     assert "['diffusion_policy', 'equivariant_diffusion_policy', 'flow_matching']" in said
