@@ -15,7 +15,7 @@ from baselines.flow_matching import train as flow_matching
 from manifeel_ms3 import cli
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
-from manifeel_ms3.demonstrations.recording import next_step_with
+from manifeel_ms3.demonstrations.recording import next_step
 from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
@@ -51,7 +51,7 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
     with caplog.at_level("INFO"):
         assert cli.main(["record", "PegInsertion", "-n", "1", "--obs-mode", "none", "--out", str(path)]) == 0
     assert caplog.messages[-1] == f"{path} holds 1 episode; `manifeel render-observations {path} --out FILE` adds observations"
-    assert next_step_with(observed_sample(PEG)).endswith(
+    assert next_step(None, observed_sample(PEG)).endswith(
         f"--env-id {PEG} --obs-mode rgb+tacff --cameras wrist` trains a policy"
     )
 

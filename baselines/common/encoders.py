@@ -97,10 +97,7 @@ class SmallCNN(nn.Sequential):
             *_conv(24, 48, stride=2),
             *_conv(48, 64, stride=2),
             *_conv(64, 64),
-            nn.Conv2d(64, 16, 1),
-            nn.Flatten(),
-            nn.Linear(16 * places, features),
-            nn.SiLU(),
+            *_over_places(64, 16, places, features),
         )
 
 
@@ -117,15 +114,17 @@ class FineCNN(nn.Sequential):
             *_conv(32, 48, stride=2),
             *_conv(48, 48),
             *_conv(48, 64, stride=2),
-            nn.Conv2d(64, 8, 1),
-            nn.Flatten(),
-            nn.Linear(8 * places, features),
-            nn.SiLU(),
+            *_over_places(64, 8, places, features),
         )
 
 
 def _conv(inputs: int, outputs: int, kernel_size: int = 3, stride: int = 1) -> list[nn.Module]:
     return [nn.Conv2d(inputs, outputs, kernel_size, stride, kernel_size // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
+
+
+def _over_places(inputs: int, channels: int, places: int, features: int) -> list[nn.Module]:
+    """A few channels at each place, and one layer over all places."""
+    return [nn.Conv2d(inputs, channels, 1), nn.Flatten(), nn.Linear(channels * places, features), nn.SiLU()]
 
 
 class SmallFieldNet(nn.Module):

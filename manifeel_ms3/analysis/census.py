@@ -24,20 +24,19 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
         results: Contents of result files.
         conditions: Conditions to count, in the order of the rows.
     """
-    rows = [_row(condition, chosen) for condition in conditions if (chosen := _last_of_each_seed(results, condition))]
+    told = _last_of_each_seed(results)
+    rows = [_row(condition, list(told[condition].values())) for condition in conditions if condition in told]
     names = ("task", "sensing", "policy", "id", "episodes", "success", "how the others end", "pressed too hard")
     return f"{CENSUS}{markdown_table(names, rows)}" if rows else ""
 
 
-def _last_of_each_seed(results: Results, condition: Condition) -> Results:
-    """The results of a condition's last checkpoints that say how episodes ended."""
-    last: dict[Any, dict[str, Any]] = {}
-    for result in results:
-        if condition_of(result) == condition and all("ending" in episode for episode in result["episodes"]):
-            seed, step = result["training_seed"], result["config"].get("step", 0)
-            if seed not in last or last[seed]["config"].get("step", 0) < step:
-                last[seed] = result
-    return list(last.values())
+def _last_of_each_seed(results: Results) -> dict[Condition, dict[Any, dict[str, Any]]]:
+    """The results of the last checkpoints that say how episodes ended, by condition and training seed."""
+    last: dict[Condition, dict[Any, dict[str, Any]]] = {}
+    for result in sorted(results, key=lambda result: result["config"].get("step", 0)):
+        if all("ending" in episode for episode in result["episodes"]):
+            last.setdefault(condition_of(result), {})[result["training_seed"]] = result
+    return last
 
 
 def _row(condition: Condition, results: Results) -> tuple[Any, ...]:

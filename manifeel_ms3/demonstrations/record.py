@@ -23,7 +23,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
-from .recording import Recorder, Recording, make_header, make_recorder, next_step_with, open_recording, trajectory_name
+from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording, trajectory_name
 
 log = logging.getLogger(__name__)
 
@@ -150,11 +150,6 @@ def _record_seed(recorder: Recorder, seed: int) -> dict[str, Any] | None:
     """In a worker process: record an episode, and return its entry in the json, or None if it failed."""
     episode = demonstrate(recorder.env, recorder.env_id, seed)
     return recorder.write(episode) if episode.info["success"] else None
-
-
-def next_step(_args: Args, made: Path) -> str:
-    """What the command made, and what one can do with it."""
-    return next_step_with(made)
 
 
 if __name__ == "__main__":

@@ -273,10 +273,11 @@ def make_recorder(
     return Recorder(make_env(env_id, **env_kwargs), env_id, drafts, source)
 
 
-def next_step_with(path: Path) -> str:
-    """What a trajectory file holds, and the commands that take it.
+def next_step(_args: Any, path: Path) -> str:
+    """What a trajectory file holds, and the commands that take it: the end of the commands that write one.
 
     Args:
+        _args: Arguments of the command.
         path: Path of the file.
     """
     header = read_header(path)

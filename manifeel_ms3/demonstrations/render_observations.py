@@ -27,7 +27,7 @@ from manifeel_ms3.workers import WorkerPool
 from .convert_actions import converted
 from .episode import run_episode
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
-from .recording import Recorder, make_header, make_recorder, next_step_with, open_recording
+from .recording import Recorder, make_header, make_recorder, next_step, open_recording
 
 log = logging.getLogger(__name__)
 
@@ -151,11 +151,6 @@ def _first_difference(recorded: Any, replayed: dict[str, Any], name: str = "env_
         elif again is None or not np.array_equal(values[()], again):
             return f"{name}/{key}"
     return None
-
-
-def next_step(_args: Args, made: Path) -> str:
-    """What the command made, and what one can do with it."""
-    return next_step_with(made)
 
 
 if __name__ == "__main__":

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.command_line import missing_extras_named
-from manifeel_ms3.errors import InvalidFileError
-from manifeel_ms3.files import read_json
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
 from .maniskill_h5 import each_demonstration, observation_keys, read_header
-from .own_files import broken_if_fails
+from .own_files import broken_if_fails, read_origin, require_task
 from .zarr_arrays import open_arrays
 
 ENDS, ACTION = "meta/episode_ends", "data/action"
@@ -72,11 +70,7 @@ def recorded_arguments(folder: Path) -> dict[str, Any]:
 
 
 def _attributes(folder: Path) -> dict[str, Any]:
-    path = Path(folder) / ATTRIBUTES
-    try:
-        return read_json(path, ABOUT, "the attributes of a zarr store") if path.is_file() else {}
-    except InvalidFileError as error:
-        raise DemonstrationError(f"{error}; export the data set again") from error
+    return read_origin(Path(folder) / ATTRIBUTES, ABOUT, "the attributes of a zarr store", "export the data set again")
 
 
 def _require_units(folder: Path, field: np.ndarray, episode: int) -> None:
@@ -124,8 +118,7 @@ def read_zarr(
     held = sorted(path.name for path in (folder / "data").glob("*") if path.is_dir())
     if missing := [name for name in (*names.values(), ACTION) if Path(name).name not in held]:
         raise DemonstrationError(f"{folder} lacks {[Path(name).name for name in missing]}; it holds {held}")
-    if env_id not in (None, found := _attributes(folder).get("env_id", env_id)):
-        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
+    require_task(folder, _attributes(folder), env_id)
     arrays = open_arrays(folder, [ENDS, ACTION, *names.values()])
     ends = _ends(folder, arrays)
     for key, name in names.items():

@@ -28,7 +28,7 @@ from manifeel_ms3.files import read_json
 from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Progress
 from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
-from .own_files import broken_if_fails, stored_bytes
+from .own_files import broken_if_fails, read_origin, require_task, stored_bytes
 
 MP4 = b"ftyp"
 """Bytes 4 to 8 of an mp4 file (ISO 14496-12, section 4.3); a playlist of that name would make ffmpeg read other files."""
@@ -107,11 +107,7 @@ def recorded_arguments(folder: Path) -> dict[str, Any] | None:
 
 
 def _origin(folder: Path) -> dict[str, Any]:
-    path = Path(folder) / ORIGIN
-    try:
-        return read_json(path, ABOUT, "the origin of a LeRobot dataset") if path.is_file() else {}
-    except InvalidFileError as error:
-        raise DemonstrationError(f"{error}; export the dataset again") from error
+    return read_origin(Path(folder) / ORIGIN, ABOUT, "the origin of a LeRobot dataset", "export the dataset again")
 
 
 def read_lerobot(
@@ -133,8 +129,7 @@ def read_lerobot(
         MissingExtraError: pyarrow or imageio is not installed.
     """
     info = read_info(folder)
-    if env_id not in (None, found := _origin(folder).get("env_id", env_id)):
-        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
+    require_task(folder, _origin(folder), env_id)
     names = {key: next((n for n in _names(key) if n in info["features"]), feature_name(key)) for key in keys}
     if missing := [name for name in (*names.values(), "action") if name not in info["features"]]:
         raise DemonstrationError(f"{folder} lacks {missing}; it holds {sorted(info['features'])}")

@@ -4,8 +4,10 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from manifeel_ms3.errors import ManifeelError
+from manifeel_ms3.errors import InvalidFileError, ManifeelError
+from manifeel_ms3.files import read_json
 
 from .demonstration_format import DemonstrationError
 
@@ -27,6 +29,34 @@ def stored_bytes(folder: Path) -> dict[Path, int]:
             elif not path.is_dir():
                 raise DemonstrationError(f"{path} is no plain file; get the data set again from its source")
     return sizes
+
+
+def read_origin(path: Path, schema: dict[str, Any], what: str, advice: str) -> dict[str, Any]:
+    """What a data set says of the task that it was recorded of, such as `env_id` and `env_kwargs`; {} if it says nothing.
+
+    Args:
+        path: Path of the json file, which need not exist.
+        schema: Json schema of the file.
+        what: What the file is, for the message.
+        advice: How to mend a broken file.
+
+    Raises:
+        DemonstrationError: The file is broken.
+    """
+    try:
+        return read_json(path, schema, what) if path.is_file() else {}
+    except InvalidFileError as error:
+        raise DemonstrationError(f"{error}; {advice}") from error
+
+
+def require_task(folder: Path, origin: dict[str, Any], env_id: str | None) -> None:
+    """Check that a data set is of a task, if one is asked for and the data set names its own.
+
+    Raises:
+        DemonstrationError: It is of another task.
+    """
+    if env_id not in (None, found := origin.get("env_id", env_id)):
+        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
 
 
 @contextmanager
