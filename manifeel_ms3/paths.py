@@ -20,6 +20,12 @@ def data_dir() -> Path:
     return packaged if packaged.is_dir() else _PACKAGE.parent / "data"
 
 
+def leaderboard_dir() -> Path:
+    """Folder of the leaderboard: that of the working folder, or else that of the clone that this package is imported from."""
+    here = Path("leaderboard")
+    return here if here.is_dir() else _PACKAGE.parent / "leaderboard"
+
+
 def troubleshooting() -> Path:
     """Path of the page that explains errors: beside the data in a wheel, in `docs` in a clone."""
     packaged = _PACKAGE / "data" / "troubleshooting.md"

@@ -12,4 +12,5 @@ grids:
     train: {steps: 12, save-every: 6, warmup-steps: 2, batch-size: 4, policy.down-dims: [8, 16]}
     episodes: 1
     checkpoints: 2
+    half_precision: true
 """

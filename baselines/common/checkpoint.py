@@ -9,7 +9,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.result import published_config
 from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
@@ -38,6 +39,25 @@ def save_checkpoint(
                 save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, partial / name)
             except SafetensorError as error:  # its error where the disk is full
                 raise OSError(str(error)) from error
+        (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
+
+
+def save_in_half_precision(checkpoint: Path, folder: Path) -> None:
+    """Write a copy of a checkpoint for publication: weights rounded to half precision, no state of training, no local paths.
+
+    Args:
+        checkpoint: Folder of the checkpoint.
+        folder: Folder of the copy, which must not exist.
+
+    Raises:
+        CheckpointError: The checkpoint is broken.
+        FileWriteError: The copy cannot be written.
+    """
+    weights = read_tensors(checkpoint / WEIGHTS)
+    rounded = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in weights.items()}
+    with atomic_folder(folder) as partial:
+        save_file(rounded, partial / WEIGHTS)
+        config = published_config(checkpoint_config(checkpoint))
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
 

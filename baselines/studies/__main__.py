@@ -31,6 +31,7 @@ from manifeel_ms3.errors import MachineError, WorkFailedError
 from . import cost
 from .command_lines import shell_command
 from .jobs import FAILED, STARTED, is_done, is_running, perform_in, read_status, restore_child_signals
+from .publish import publish
 from .study import KINDS, Job, Kind, Study, jobs_of, read_study
 
 log = logging.getLogger(__name__)
@@ -45,6 +46,8 @@ RAY_SETTINGS = {
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
 }
 """Environment variables of a Ray that is started here, unless they are set."""
+FILE_WIDTH = 160
+"""Characters of a line where the output is no terminal."""
 LOOPBACK = "127.0.0.1"
 """Address on which a Ray that is started here listens: no other machine reaches it."""
 CODE = Path(__file__).parents[2]
@@ -63,6 +66,13 @@ class Args:
     """Address of a Ray cluster; this machine if not given."""
     dry_run: bool = False
     """Print the plan and the hours that it will take, without running it."""
+    publish: Path | None = None
+    """Folder of a submission on the leaderboard, such as leaderboard/cpu, into which the results that are done are copied, with
+    a checkpoint of each row; nothing is run. Only evaluations with `half_precision: true` are copied."""
+    name: str = ""
+    """Name of that submission; the study's name if not given."""
+    authors: str = "The authors of manifeel_ms3"
+    """Authors of that submission."""
     print_commands: bool = False
     """Print the shell commands that do the same by hand, one line for each job, without running them."""
 
@@ -81,11 +91,15 @@ def main(args: Args) -> None:
     """
     study = read_study(args.study)
     jobs = jobs_of(study)
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
     if args.print_commands:
         for job in jobs:
             line = shell_command(job, args.root, study.resources[job.kind].workers)
             console.print(f"# {job.kind}: {job.title}\n{line}", soft_wrap=True, markup=False, highlight=False)
+        return
+    if args.publish:
+        count = publish(jobs, args.root, args.publish, args.name or study.name, args.authors)
+        console.print(f"{args.publish} has {count} results; `manifeel leaderboard build` makes the page of the leaderboard")
         return
     _require_writable(args.root)
     if args.dry_run:
@@ -233,7 +247,7 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
     """A table of the jobs to do and of their hours on this machine; jobs that differ in their seed share a row."""
     table = Table("job", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
     groups: dict[tuple[Kind, str], list[Job]] = {}
-    for job in jobs:
+    for job in sorted(jobs, key=lambda job: KINDS.index(job.kind)):
         groups.setdefault((job.kind, job.title.partition(", seed")[0]), []).append(job)
     cpu = gpu = 0.0
     for (kind, title), group in track(groups.items(), "measuring", transient=True):

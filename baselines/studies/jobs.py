@@ -17,7 +17,7 @@ from typing import Any
 import psutil
 import tyro
 
-from baselines.common.checkpoint import saved_checkpoints
+from baselines.common.checkpoint import save_in_half_precision, saved_checkpoints
 from baselines.common.training import CHECKPOINTS
 from baselines.registry import policy_spec
 from baselines.tactile_representations import pretrain
@@ -127,6 +127,8 @@ def _evaluate(job: Job, root: Path, workers: int) -> int:
     """Write one result file for each checkpoint, and return the number of episodes."""
     settings, (train,) = job.settings, job.needs
     chosen = saved_checkpoints(train.folder(root) / CHECKPOINTS)[-settings["checkpoints"] :]
+    if settings["half_precision"]:
+        chosen = [_rounded(checkpoint, job.folder(root) / CHECKPOINTS) for checkpoint in chosen]
     for checkpoint in chosen:
         out = job.folder(root) / f"{checkpoint.name}.json"
         if not is_result_of(checkpoint, out):
@@ -136,6 +138,14 @@ def _evaluate(job: Job, root: Path, workers: int) -> int:
             except OtherEvaluationError:  # begun on another machine or with other versions: not to be mixed with these
                 evaluate.main(replace(args, overwrite=True))
     return len(chosen) * settings["episodes"]
+
+
+def _rounded(checkpoint: Path, folder: Path) -> Path:
+    """The copy of a checkpoint in half precision, which is made in a folder where it is missing."""
+    copy = folder / checkpoint.name
+    if not copy.is_dir():
+        save_in_half_precision(checkpoint, copy)
+    return copy
 
 
 def is_result_of(checkpoint: Path, path: Path) -> bool:

@@ -85,6 +85,8 @@ class Grid:
     """Number of checkpoints to evaluate, counted from the last one."""
     stop_at_success: bool = False
     """End evaluation episodes at success or failure, which is cheaper; the results then lack success at the end."""
+    half_precision: bool = False
+    """Evaluate the checkpoints with their weights rounded to half precision, which is how they can be published."""
 
 
 @dataclass(frozen=True)
@@ -217,13 +219,13 @@ def _require_known(entry: dict[Any, Any], known: set[str], place: str) -> None:
 
 
 def jobs_of(study: Study) -> list[Job]:
-    """Every job of a study once, each after the jobs that it needs."""
+    """Every job of a study once, in the order of its grids; each stands after the jobs that it needs."""
     jobs: dict[str, Job] = {}
     for grid in study.grids:
         for evaluate in _evaluations(grid):
             for job in _with_needs(evaluate):
                 jobs.setdefault(job.key, job)
-    return sorted(jobs.values(), key=lambda job: KINDS.index(job.kind))
+    return list(jobs.values())
 
 
 def _with_needs(job: Job) -> Iterator[Job]:
@@ -243,6 +245,7 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
         train = _training(grid, record, policy, mode, encoder, num_demos, seed)
         settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop_at_success=grid.stop_at_success)
+        settings["half_precision"] = grid.half_precision
         for further in grid.evaluation_args:
             env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
             title = ", ".join((train.title, json.dumps(further))) if further else train.title

@@ -5,8 +5,9 @@ of a run, the leaderboard) have plotly's interactive ones.
 """
 
 import json
+import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,7 +18,7 @@ import tyro
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
-from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import short_name
 
@@ -26,9 +27,8 @@ from .claims import claims_page
 from .condition import Condition, condition_of
 from .estimates import difference, mean_success
 from .markdown import markdown_table
-from .matching import answering_all
-from .paper import reported
 from .paper_beside import runtime_table, similarity_table
+from .paper_tables import draw_sensing_by_task, linked, tables_of_the_paper
 from .presets import setup_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
 from .rank_agreement import rank_table
@@ -51,6 +51,17 @@ is the standard deviation over training seeds. "Floor" is the highest success of
 measured on this revision of the task. "Settings" names the preset of the policy and what differs from it, "id" is the
 hash of everything that makes the condition another one. Cost is that of training, all seeds together.
 """
+CHART = """
+![Success by task and sensing, with intervals of 95 %, and the paper's rates]({figure})
+
+Success in the tasks of the paper's Table I by what the policy senses. Black lines are the paper's rates, of larger networks and
+other parts of the benchmark ([fidelity](fidelity.md)); the numbers stand in the tables below.
+"""
+AGAIN = """
+The file of a result is linked from its success. Where it lies in a folder `leaderboard/NAME/seed0`, its checkpoint is beside
+it, and `manifeel eval --entry NAME` runs its episodes again and says in how many the outcomes agree. `manifeel study
+configs/tables_cpu.yaml` makes all results of the small networks.
+"""
 CURVES = """
 ![Success over environment steps trained on]({figure})
 
@@ -67,13 +78,6 @@ Success of policies that have learnt nothing, with Wilson intervals of 95 % and 
 LEFT_OUT = """
 Runs with fewer than {episodes} episodes or {steps:,} gradient steps, and runs whose training was stopped, have another purpose:
 they are listed here and enter nothing below.
-"""
-TABLES = """
-## The paper's tables
-
-Mean ± standard deviation over training seeds. Only conditions with the paper's number of demonstrations appear, and each
-set-up has a row of its own. The paper contradicts itself on ball sorting: its list of set-ups has dim light alone, but Tables I
-and II report different rates for the same policies; here, Tables II and III are run in both lights.
 """
 CLAIMS = """
 ## The paper's claims
@@ -102,7 +106,9 @@ def main(args: Args) -> Path:
     Raises:
         ResultError: There is no result, or one is broken.
     """
-    results = results_in(*args.results)
+    by_file = results_by_file(*args.results)
+    results = list(by_file.values())
+    files = {condition_of(result): os.path.relpath(path, args.out.parent) for path, result in by_file.items()}
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
@@ -110,7 +116,10 @@ def main(args: Args) -> Path:
     success = figure.with_name(f"{args.out.stem}_success.png")
     has_curves = write_curves(results, success, success.with_suffix(".csv"))
     curves = success.relative_to(args.out.parent) if has_curves else None
-    write_text(args.out, "".join(page(results, loss, similarities, curves)))
+    bars = figure.with_name(f"{args.out.stem}_sensing.png")
+    has_bars = draw_sensing_by_task(of_the_protocol(collect(results)), bars)
+    chart = bars.relative_to(args.out.parent) if has_bars else None
+    write_text(args.out, "".join(page(results, loss, similarities, curves, files, chart)))
     return args.out
 
 
@@ -153,7 +162,12 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
 
 
 def page(
-    results: list[dict[str, Any]], loss: Path | None = None, similarities: Sequence[Path] = (), success: Path | None = None
+    results: list[dict[str, Any]],
+    loss: Path | None = None,
+    similarities: Sequence[Path] = (),
+    success: Path | None = None,
+    files: Mapping[Condition, str] | None = None,
+    chart: Path | None = None,
 ) -> Iterator[str]:
     """The Markdown page, part by part.
 
@@ -162,12 +176,20 @@ def page(
         loss: Path of the figure with the loss in training, relative to the page; no figure if not given.
         similarities: Files that `manifeel similarity` wrote.
         success: Path of the figure with success in the course of training, beside its csv file; no figure if not given.
+        files: Links to the result files of conditions; no links if not given.
+        chart: Path of the figure with success by task and sensing; no figure if not given.
     """
     collected = collect(results)
     found = of_the_protocol(collected)
+    files = files or {}
     yield HEAD.format(last=LAST)
+    if chart:
+        yield CHART.format(figure=chart)
+    yield from tables_of_the_paper(found, files)
     yield "\n## What was run\n\n"
-    yield _table_of_conditions(collected, results)
+    yield _table_of_conditions(collected, results, files)
+    if files:
+        yield AGAIN
     if len(found) < len(collected):
         yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
     if success:
@@ -180,8 +202,6 @@ def page(
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
     yield _table_of_floors(collected)
     yield census_table(results, [condition for condition, _ in _sorted(found)])
-    yield f"{TABLES}\n"
-    yield _table_of_the_paper(found)
     yield rank_table(found)
     yield f"{CLAIMS}\n"
     yield claims_page(found)
@@ -189,28 +209,18 @@ def page(
     yield similarity_table(similarities)
 
 
-def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]]) -> str:
+def _table_of_conditions(
+    found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Mapping[Condition, str]
+) -> str:
     rows = []
     for condition, here in _sorted(found):
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
         what = (_task(condition), condition.sensing, condition.policy, condition.encoder, condition.num_demos)
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
-        success = (mean_success(here), _floor(condition), _deviation(here), here.size, note)
+        success = (linked(mean_success(here), files.get(condition)), _floor(condition), _deviation(here), here.size, note)
         rows.append((*what, setup_of(condition), f"`{condition.key}`", *success, cost, machines))
     names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
     return markdown_table((*names, "success", "floor", "std", "of", "note", "cost", "on"), rows)
-
-
-def _table_of_the_paper(found: dict[Condition, ConditionResults]) -> str:
-    rows = []
-    for table, condition, rate in reported():
-        what = (table, condition.task, condition.obs_mode, condition.policy, condition.encoder, condition.num_demos, rate)
-        floor = _floor(condition)
-        answers = [(setup, found[here]) for setup, (here,) in answering_all([condition], found).items()]
-        ran = [(mean_success(here), floor, _deviation(here), here.size, setup) for setup, here in answers]
-        rows += [(*what, *cells) for cells in ran or [("not run", floor, None, None, None)]]
-    names = ("table", "task", "sensing", "policy", "TacRGB encoder", "demonstrations", "paper")
-    return markdown_table((*names, "here", "floor", "std", "of", "settings"), rows)
 
 
 def _floor(condition: Condition) -> str | None:

@@ -1,6 +1,7 @@
 r"""Evaluate a policy on fixed seeds.
 
     python -m manifeel_ms3.evaluation.evaluate --checkpoint runs/x/checkpoints/last
+    python -m manifeel_ms3.evaluation.evaluate --entry cpu/PegInsertion/rgb+tacff
     python -m manifeel_ms3.evaluation.evaluate --policy my_module:MyPolicy --env-id ManiFeel-PegInsertion-v1 \
         --obs-mode rgb+tacff
 
@@ -16,7 +17,7 @@ goes on with the other episodes.
 import json
 import logging
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,6 +32,7 @@ from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
 
 from .checkpoint_config import CheckpointError, checkpoint_config
 from .engine import Evaluation, run_episodes
+from .entries import Entry, find_entry
 from .journal import Journal
 from .policy import BATCH_SIZES, PolicySource, checked_device
 from .redaction import redacted
@@ -52,6 +54,9 @@ class Args:
 
     checkpoint: Path | None = None
     """Checkpoint folder, with config.json and weights."""
+    entry: str | None = None
+    """Entry of the leaderboard to run again instead of a checkpoint of one's own, such as cpu/PegInsertion/rgb+tacff, with the
+    settings of its result; the command says in how many episodes the outcomes agree."""
     policy: str | None = None
     """Policy to evaluate instead of a checkpoint: a class that can be imported ("module:Class"), or the address of a server
     ("http://localhost:8000")."""
@@ -105,6 +110,7 @@ def main(args: Args) -> Path:
 
     Raises:
         CheckpointError: The checkpoint cannot be used.
+        UnknownNameError: There is no such task or entry.
         PolicyError: The policy cannot be made.
         PolicyUnavailableError: The policy's server cannot be reached.
         InvalidArgumentError: The arguments do not say what to evaluate, or on which task.
@@ -113,6 +119,9 @@ def main(args: Args) -> Path:
         InUseError: Another process writes this result.
         FileWriteError: The result cannot be written.
     """
+    entry = None if args.entry is None else find_entry(args.entry)
+    if entry is not None:
+        args = _like_entry(args, entry)
     evaluation = evaluation_from_args(args)
     seeds = evaluation_seeds(args.episodes) if args.seeds is None else read_seeds(args.seeds)
     out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
@@ -124,9 +133,31 @@ def main(args: Args) -> Path:
         with journal.kept():
             run_episodes(evaluation, journal.remaining, args.workers, journal.add)
             write_result(_result(evaluation, journal.in_order), out)
+    if entry is not None:
+        log.info("%s", entry.agreement(journal.in_order))
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
     return out
+
+
+def _like_entry(args: Args, entry: Entry) -> Args:
+    """The arguments with which the result of an entry was made, and a result in the working folder.
+
+    Raises:
+        InvalidArgumentError: Another policy is given besides.
+    """
+    if args.checkpoint is not None or args.policy is not None:
+        raise InvalidArgumentError("--entry brings its checkpoint; leave out --checkpoint and --policy")
+    made, inference = entry.result, entry.result["inference"]
+    return replace(
+        args,
+        checkpoint=entry.checkpoint,
+        out=args.out or Path("evaluation.json"),
+        device=args.device or inference["device"],
+        batch_size=args.batch_size or inference["batch_size"],
+        stop_at_success=made["stop_at_success"],
+        env_kwargs=args.env_kwargs if args.env_kwargs != "{}" else json.dumps(made["env_kwargs"]),
+    )
 
 
 def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Path) -> None:

@@ -151,12 +151,21 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
     Raises:
         ResultError: There is no result, or one is broken.
     """
+    return list(results_by_file(*folders).values())
+
+
+def results_by_file(*folders: Path) -> dict[Path, dict[str, Any]]:
+    """The results that `results_in` returns, by the paths of their files.
+
+    Raises:
+        ResultError: There is no result, or one is broken.
+    """
     found = [path for folder in folders for path in sorted(folder.rglob("*.json")) if path.stem.isdigit()]
     if not found:
         raise ResultError(
             f"{[str(folder) for folder in folders]} hold no results; train with --num-eval-episodes 50, or run `manifeel study`"
         )
-    return [read_result(path) for path in found]
+    return {path: read_result(path) for path in found}
 
 
 def check_result(result: Any, source: Path) -> None:

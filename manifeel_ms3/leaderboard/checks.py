@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
+from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
 
-from .rerun import COMPARED, FORCE_TOLERANCE, FORCES, INVENTED
+from .rerun import INVENTED
 from .submission import Submission, SubmissionError
 from .untrusted import quoted
 

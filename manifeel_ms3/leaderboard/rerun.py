@@ -21,10 +21,11 @@ from scipy.stats import hypergeom
 
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.agreement import differences
+from manifeel_ms3.evaluation.checkpoint_config import HASHED, checkpoint_config, checkpoint_sha256
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.policy import PolicySource, checked_device
-from manifeel_ms3.evaluation.rollout import EpisodeOutcome, outcome_as_json
+from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.provenance import package_versions
 
 from .submission import ABOUT, Rerun, RerunFile, Submission, SubmissionError
@@ -39,16 +40,8 @@ COINCIDENCE = 0.1
 """Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success and
 force within 0.01 N: of the 50 episodes of either result in this repository, at most 3 have forces so near to any one value. A
 success that the policy does not have never agrees."""
-FORCE_TOLERANCE = 0.01
-"""Difference in N between forces that count as the same; a result rounds them to 0.001 N."""
 NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num_demos", "policy")
 """Entries of a policy's configuration that a result must share with its checkpoint."""
-HASHED = ("model.safetensors", "config.json")
-"""Files of a checkpoint whose contents, one after the other, its hash is of."""
-CHUNK = 2**20
-FORCES = ("peak_contact_force", "force_until_success")
-COMPARED = ("success_once", "success_at_end", "fail_once", "fail_at_end", "first_success", "episode_len", *FORCES)
-"""Entries of an episode that must agree when it is run again."""
 
 
 @cache
@@ -82,23 +75,6 @@ def chance_to_pass(total: int, invented: int, drawn: int) -> float:
     """
     found = np.arange(invented + 1)
     return float(hypergeom.pmf(found, total, invented, drawn) @ COINCIDENCE**found)
-
-
-def checkpoint_sha256(checkpoint: Path) -> str:
-    """The hash of a checkpoint, which `cat model.safetensors config.json | sha256sum` prints, too.
-
-    Raises:
-        CheckpointError: One of the two files is missing, or cannot be read.
-    """
-    digest = hashlib.sha256()
-    try:
-        for name in HASHED:
-            with (checkpoint / name).open("rb") as file:
-                while chunk := file.read(CHUNK):
-                    digest.update(chunk)
-    except OSError as error:
-        raise CheckpointError(f"{checkpoint} cannot be hashed ({error}); give a folder with {' and '.join(HASHED)}") from error
-    return digest.hexdigest()
 
 
 def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
@@ -268,7 +244,7 @@ def _faults_of_a_result(
     faults = [
         f"{quoted(path)}: seed {episode['seed']}: {difference}"
         for episode, outcome in zip(submitted, outcomes, strict=True)
-        for difference in _differences(episode, outcome)
+        for difference in differences(episode, outcome)
     ]
     theirs, ours = result["versions"]["torch"], version("torch")
     if faults and theirs != ours:
@@ -276,17 +252,6 @@ def _faults_of_a_result(
             f"{quoted(path)} was made with torch {theirs}, here it is {ours}, which may round differently: install {theirs}"
         )
     return faults
-
-
-def _differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
-    found, again = [], outcome_as_json(outcome)
-    for name in COMPARED:
-        tolerance = FORCE_TOLERANCE if name in FORCES else 0
-        before, now = episode.get(name), again.get(name)
-        differs = before is not now if before is None or now is None else abs(before - now) > tolerance
-        if differs:
-            found.append(f"{name} says {before}, run again it is {now}")
-    return found
 
 
 def rerun_of(submission: Submission, paths: Iterable[Path]) -> tuple[int, int]:

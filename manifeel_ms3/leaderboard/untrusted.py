@@ -13,6 +13,8 @@ from typing import Any, NoReturn
 
 from manifeel_ms3.errors import InvalidFileError
 
+CHECKPOINTS = "checkpoints"
+"""Name of folders that are not read: maintainers keep the checkpoints of an entry beside its results."""
 LARGEST = {".json": 2**20, ".mp4": 16 * 2**20}
 """Largest size of a file in bytes, by the endings that are read; a result of 50 episodes has 13 kB."""
 LARGEST_TOTAL = 128 * 2**20
@@ -48,6 +50,7 @@ class FolderReader:
             return
         try:
             for place, folders, files, descriptor in os.fwalk(folder, onerror=_reraise):
+                folders[:] = [name for name in folders if name != CHECKPOINTS]
                 self._read_level(Path(place).relative_to(folder), folders, files, descriptor)
         except UntrustedFileError as error:
             self.faults.append(str(error))

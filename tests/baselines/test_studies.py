@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shlex
 import signal
 import subprocess
@@ -32,7 +33,8 @@ from manifeel_ms3.analysis.matching import as_the_paper_says
 from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.presets import setup_of
-from manifeel_ms3.errors import MachineError
+from manifeel_ms3.errors import InvalidFileError, MachineError, UnknownNameError
+from manifeel_ms3.evaluation import evaluate as evaluation
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from tests.tiny_study import TINY
@@ -300,7 +302,8 @@ def wait_for(path: Path, process: subprocess.Popen, seconds: float = 240) -> dic
     return json.loads(path.read_text())
 
 
-def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_path):
+def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
     root = tmp_path / "study"
     record, train, evaluate = jobs_of(read_study(study))
     process = start(study, root)
@@ -318,6 +321,18 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
     page = page_of_results.main(page_of_results.Args((root,), tmp_path / "page.md")).read_text()
     assert "| PegInsertion" in page
     assert (tmp_path / "images/page.png").stat().st_size > 1000  # the curve of training
+
+    board = tmp_path / "leaderboard"
+    study_command.main(study_command.Args(study, root, publish=board / "tiny"))
+    monkeypatch.chdir(tmp_path)
+    (entry,) = (path.parents[1].relative_to(board).as_posix() for path in board.rglob("00000012.json"))
+    evaluation.main(evaluation.Args(entry=entry, episodes=1))
+    assert f"1 of 1 episodes agree with those of the entry {entry}" in caplog.text
+    (board / entry / "seed0/checkpoints/00000012/config.json").write_text("{}")
+    with pytest.raises(InvalidFileError, match="the checkpoint was changed; get it anew"):
+        evaluation.main(evaluation.Args(entry=entry, episodes=1))
+    with pytest.raises(UnknownNameError, match=rf"no entry 'tiny/Knitting' .* choose from \['{re.escape(entry)}'\]"):
+        evaluation.main(evaluation.Args(entry="tiny/Knitting"))
 
     before = {path: path.stat().st_mtime for path in root.rglob("*.json")}
     study_command.main(study_command.Args(study, root))  # all is done: Ray is not even started

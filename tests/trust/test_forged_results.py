@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.analysis.protocol import collect
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.result import ResultError, summary_of
 from manifeel_ms3.leaderboard.__main__ import Hash, Submit, main
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.page import leaderboard_table, rows_on
-from manifeel_ms3.leaderboard.rerun import chance_to_pass, checkpoint_sha256, draw, episodes_to_run_again
+from manifeel_ms3.leaderboard.rerun import chance_to_pass, draw, episodes_to_run_again
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from tests.leaderboard.made_up import made_up
 

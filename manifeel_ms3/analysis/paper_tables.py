@@ -1,0 +1,159 @@
+"""The paper's tables in the paper's form: each cell has our success with its interval, and the paper's."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from manifeel_ms3.command_line import missing_extras_named
+
+from .condition import Condition
+from .estimates import Estimate, mean_success
+from .markdown import markdown_table
+from .matching import Found, answering
+from .paper import DP, ENCODERS, MODALITIES, MODES, POLICIES, Rate, paper_condition, tasks_in_table
+from .presets import PAPER, Setup
+
+TEXT = """
+## The paper's tables
+
+A cell has our success with its interval of 95 %, and the paper's after the stroke; a number of ours links to its result file,
+and what stands after ± is the standard deviation over training seeds, where there are several.
+Only conditions with the paper's number of demonstrations appear; each set-up has tables of its own. The paper contradicts
+itself on ball sorting: its list of set-ups has dim light alone, but Tables I and II report different rates for the same
+policies; here, Tables II and III are run in both lights.
+"""
+NEEDS_GPU = """
+Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` foretells their hours on yours.
+"""
+HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
+PANEL = (11.0, 4.2)
+"""Width and height of the bar chart, in inches."""
+DPI = 110
+COLOURS: dict[str, str] = dict(zip(MODES, ("#9aa0a6", "#d9822b", "#2b6cb0"), strict=True))
+BAR = 0.27
+"""Width of a bar; tasks are 1 apart."""
+
+
+def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterator[str]:
+    """Markdown of Tables I to III, part by part.
+
+    Args:
+        found: The results that enter comparisons.
+        files: Links to the result files of conditions.
+    """
+    yield TEXT
+    setups = _setups(found)
+    for setup in setups:
+        if rows := list(_rows_by_sensing(found, files, setup, {(task, DP): rates for task, rates in MODALITIES.items()})):
+            yield f"\n### Table I, what touch adds: Diffusion Policy, {setup}\n\n"
+            yield markdown_table(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
+        by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
+        rows = list(_rows_by_sensing(found, files, setup, by_policy))
+        if {policy for (_, policy), _ in rows} - {DP}:
+            yield f"\n### Table II, three policies: {setup}\n\n"
+            yield markdown_table(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
+        if rows := list(_rows_by_encoder(found, files, setup)):
+            yield f"\n### Table III, encoders of TacRGB: {setup}\n\n"
+            names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
+            yield markdown_table(("task", *names), rows)
+    missing = [] if any(setup.preset == PAPER for setup in setups) else ["the networks of the paper (ResNet-18)"]
+    if not any(True for setup in setups for _ in _rows_by_encoder(found, files, setup)):
+        missing.append("Table III, the encoders with published weights")
+    if missing:
+        yield NEEDS_GPU.format(what=", and ".join(missing))
+
+
+def _setups(found: Found) -> list[Setup]:
+    """The set-ups of conditions of Tables I to III, the paper's preset first."""
+    wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
+    wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
+    setups = {setup for condition in wanted for setup in answering(condition, found)}
+    return sorted(setups, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+
+
+Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
+
+
+def _rows_by_sensing(
+    found: Found, files: Mapping[Condition, str], setup: Setup, rows: Rows
+) -> Iterator[tuple[tuple[str, str], list[str]]]:
+    """Task and policy, and a cell for each observation mode; only rows in which something was run."""
+    for (task, policy), rates in rows.items():
+        answers = [answering(paper_condition(task, mode, policy), found).get(setup) for mode in MODES]
+        if any(answers):
+            cells = [_cell(found, files, answer, rate) for answer, rate in zip(answers, rates, strict=True)]
+            yield (task, policy), cells
+
+
+def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: Setup) -> Iterator[list[str]]:
+    for task in tasks_in_table("III"):
+        wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
+        answers = {name: answering(condition, found).get(setup) for name, condition in wanted.items()}
+        if sum(answer is not None for answer in answers.values()) > 1:  # one alone compares nothing
+            yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
+
+
+def _cell(found: Found, files: Mapping[Condition, str], condition: Condition | None, rate: Rate) -> str:
+    if condition is None:
+        return f"not run / {rate}"
+    results = found[condition]
+    spread = "" if results.seed_deviation is None else f" ± {results.seed_deviation:.0%}"
+    return f"{linked(mean_success(results), files.get(condition))}{spread} / {rate}"
+
+
+def linked(success: Estimate, file: str | None) -> str:
+    """A success with its interval, as text; the number itself links to a file if one is given."""
+    value, _, interval = str(success).partition(" ")
+    return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
+
+
+def draw_sensing_by_task(found: Found, out: Path) -> bool:
+    """Draw the success of Table I as bars: tasks side by side, a bar for each sensing, the paper's rates as black lines.
+
+    The set-up is the one in which most conditions were run.
+
+    Args:
+        found: The results that enter comparisons.
+        out: Path of the figure.
+
+    Returns:
+        Whether there is something to draw.
+
+    Raises:
+        MissingExtraError: The extra `report`, which draws, is not installed.
+    """
+    bars: dict[Setup, dict[tuple[str, str], Estimate]] = {}
+    for task in MODALITIES:
+        for mode in MODES:
+            for setup, condition in answering(paper_condition(task, mode), found).items():
+                bars.setdefault(setup, {})[task, mode] = mean_success(found[condition])
+    if not bars:
+        return False
+    with missing_extras_named():
+        from matplotlib.figure import Figure
+    setup, drawn = max(bars.items(), key=lambda item: len(item[1]))
+    tasks = [task for task in MODALITIES if any((task, mode) in drawn for mode in MODES)]
+    fig = Figure(figsize=PANEL, layout="constrained")
+    ax = fig.subplots()
+    for k, mode in enumerate(MODES):
+        _draw_bars(ax, [tasks.index(task) for task in tasks], (k - 1) * BAR, [drawn.get((task, mode)) for task in tasks], mode)
+    for place, task in enumerate(tasks):
+        for k, rate in enumerate(MODALITIES[task]):
+            label = "the paper" if place == k == 0 else None
+            left = place + (k - 1.5) * BAR
+            ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=2, label=label)
+    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {setup.preset}")
+    ax.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
+    ax.legend(ncols=4, fontsize=8, loc="upper left")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    fig.savefig(out, dpi=DPI)
+    return True
+
+
+def _draw_bars(ax: Any, places: list[int], shift: float, estimates: list[Estimate | None], mode: str) -> None:
+    known = [(place + shift, one) for place, one in zip(places, estimates, strict=True) if one is not None]
+    heights = [one.value for _, one in known]
+    errors = [[one.value - one.low for _, one in known], [one.high - one.value for _, one in known]]
+    centres = [place for place, _ in known]
+    ax.bar(centres, heights, BAR, color=COLOURS[mode], label=HEADINGS[mode])
+    ax.errorbar(centres, heights, errors, fmt="none", ecolor="#333333", elinewidth=1, capsize=2)

@@ -1,0 +1,85 @@
+"""Entries of the leaderboard whose checkpoints are in the repository, so that anyone can run them again.
+
+An entry is a folder such as leaderboard/cpu/PegInsertion/rgb+tacff. Its folder seed0 has the result of the first training seed,
+such as `00007000.json`, and the checkpoint that it is of, `checkpoints/00007000`. The submission.json of the submission (here
+leaderboard/cpu) names the hash of every checkpoint.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from manifeel_ms3.errors import InvalidFileError, UnknownNameError
+from manifeel_ms3.paths import leaderboard_dir
+
+from .agreement import differences
+from .checkpoint_config import checkpoint_sha256
+from .result import read_result
+from .rollout import EpisodeOutcome
+
+CHECKPOINTS = "checkpoints"
+"""Folder beside a result that holds its checkpoint."""
+ABOUT = "submission.json"
+"""File that names the checkpoints' hashes."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A result of the leaderboard with its checkpoint."""
+
+    name: str
+    """Path of the entry's folder on the leaderboard, such as "cpu/PegInsertion/rgb+tacff"."""
+    result: dict[str, Any]
+    """Content of the result file."""
+    checkpoint: Path
+    """Folder of the checkpoint."""
+
+    def agreement(self, outcomes: list[EpisodeOutcome]) -> str:
+        """In how many episodes some outcomes agree with those of the entry, as a sentence; it names what differs."""
+        submitted = {episode["seed"]: episode for episode in self.result["episodes"]}
+        compared = [outcome for outcome in outcomes if outcome.seed in submitted]
+        differing = {one.seed: found for one in compared if (found := differences(submitted[one.seed], one))}
+        said = f"{len(compared) - len(differing)} of {len(compared)} episodes agree with those of the entry {self.name}"
+        if not differing:
+            return said
+        seed, found = next(iter(differing.items()))
+        versions, machine = self.result["versions"], self.result["machine"]
+        return (
+            f"{said}; in the episode of seed {seed}, {found[0]}. It was evaluated with torch {versions['torch']} on "
+            f"{machine['cpu']}; other versions and processors round differently"
+        )
+
+
+def find_entry(name: str) -> Entry:
+    """The entry of a name.
+
+    Args:
+        name: Path of the entry's folder on the leaderboard, such as "cpu/PegInsertion/rgb+tacff".
+
+    Raises:
+        UnknownNameError: There is no such entry with a checkpoint; the message lists those that there are.
+        InvalidFileError: The checkpoint is not the one that the submission names.
+        ResultError: The result is broken.
+    """
+    board = leaderboard_dir()
+    known = {path.parents[2].relative_to(board).as_posix(): path for path in sorted(board.glob(f"*/**/{CHECKPOINTS}/*"))}
+    if name not in known:
+        raise UnknownNameError(f"no entry {name!r} with a checkpoint is in {board}; choose from {list(known)}")
+    checkpoint = known[name]
+    path = checkpoint.parents[1] / f"{checkpoint.name}.json"
+    submission = board / Path(name).parts[0]
+    named = _checkpoints_of(submission / ABOUT).get(path.relative_to(submission).as_posix())
+    if named != (found := checkpoint_sha256(checkpoint)):
+        raise InvalidFileError(
+            f"{checkpoint} has the hash {found}, but {submission / ABOUT} names {named}: the checkpoint was changed; get it "
+            "anew from the repository"
+        )
+    return Entry(name, read_result(path), checkpoint)
+
+
+def _checkpoints_of(path: Path) -> dict[str, str]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8")).get("checkpoints", {})
+    except (OSError, ValueError, AttributeError) as error:
+        raise InvalidFileError(f"{path} cannot be read ({error}); get it anew from the repository") from error
