@@ -179,7 +179,7 @@ def check_result(result: Any, source: Path) -> None:
         ResultError: It does not have the form; the message names the place.
     """
     given = result.get("schema") if isinstance(result, dict) else None
-    if given in EARLIER:
+    if isinstance(given, str) and given in EARLIER:
         raise ResultError(
             f"{source} has the schema {given!r}, which {EARLIER[given]}; this version reads {SCHEMA!r}: evaluate the policy "
             "again, after training it again if its checkpoint is refused, too"

@@ -135,7 +135,10 @@ def test_b03_and_a13_ray_is_reached_from_here_alone_and_imports_nothing_from_the
         (server,) = {address for address, name in seen.items() if name == "gcs_server"} or [None]
         assert server, seen
         host, port = server[0].removeprefix("::ffff:"), server[1]  # an IPv4 address, as a socket for IPv6 may have it
-        stranger = f"import ray; ray.init('{host}:{port}', log_to_driver=False); print(ray.cluster_resources())"
+        here = (
+            "from ray._private import ray_constants; ray_constants.ENABLE_RAY_CLUSTER = False"  # else it asks the outer address
+        )
+        stranger = f"import ray; {here}; ray.init('{host}:{port}', log_to_driver=False); print(ray.cluster_resources())"
         foreign = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
         foreign |= dict(RAY_AUTH_MODE="token", RAY_AUTH_TOKEN="0" * 64, HOME=str(tmp_path))
         refused = subprocess.run(
