@@ -22,8 +22,8 @@ class BallSortingExpertConfig:
 
     grasp_above_centre: float = 0.004
     """Height of the tool over the ball's centre at the grasp, in m: the fingers are clear of the stand."""
-    hover_height: float = 0.075
-    """Height of the tool over the ball's centre before and after a grasp, in m: the fingertips are clear of the ball. Tuned."""
+    hover_height: float = 0.079
+    """Height of the tool over the ball's centre before a grasp, in m: the fingertips are clear of the ball. Tuned."""
     grip: float = -0.4
     """Gripper command that closes on a ball, between 1 (open) and -1 (closed). Tuned."""
     rough: float = 2.0
@@ -38,12 +38,20 @@ class BallSortingExpertConfig:
     """Height of the tool over the table, in m, at which a held ball is just over the floor of a bowl."""
     open_steps: int = 5
     """Number of steps for which the gripper opens. Tuned."""
+    lane: float = 0.035
+    """Distance in x, in m, from the balls at which the hand goes from one to the other. Tuned."""
+    lane_height: float = 0.050
+    """Height of the tool over the balls' centres on that way, in m: the fingertips are clear of the balls. Tuned."""
+    touch_force: float = 1.0
+    """Normal force on each pad, in N, at which a ball is between the fingers. Tuned."""
+    grip_steps: int = 6
+    """Largest number of steps for which the fingers close. Tuned."""
+    feel_steps: int = 3
+    """Number of steps for which a ball is held before its surface is judged. Tuned."""
     free_tolerance: float = 5e-3
     """Distance from a target in free space at which the hand goes on, in m. Tuned."""
     bowl_tolerance: float = 3e-3
     """Distance from the release position at which the hand opens, in m. Tuned."""
-    approach_tolerance: float = 2e-3
-    """Distance from the point over a ball at which the hand goes down, in m. Tuned."""
     grasp_tolerance: float = 1.5e-3
     """Distance from the grasp position at which the fingers close, in m. Tuned."""
 
@@ -59,8 +67,9 @@ class BallSortingExpert:
         rng = np.random.default_rng([seed, 13])
         self.skills = Skills(env)
         self.skills.gripper = 1.0
-        self.guess = int(rng.integers(2))
         self.stand = perceived_position(env.stand, rng)
+        tool, _ = self.skills.tool
+        self.first = int(self.stand[1] < tool[1])  # the seat that is nearer to the hand
         # whatever the sensor, in the colours that `rough` and `touching` are tuned for
         pad = sensor_config(env.sensor, "feel", "gel_right", optics=OpticsConfig())
         self._pad = TactileSensor(pad, env.scene, env.agent.robot, ("rgb",))
@@ -71,18 +80,27 @@ class BallSortingExpert:
         yield from self._sort() if self.env.goal == "bowls" else self._take_golf_ball()
 
     def _take_golf_ball(self) -> Actions:
-        for seat in (self.guess, 1 - self.guess, self.guess):
+        """Try the balls in turn.
+
+        The hand comes to a ball from one side and leaves it to the other, as on a road with two lanes, and opens while it
+        leaves. If it came and left by the same way, a policy without memory could not tell the two apart, and would grasp the
+        same ball again.
+        """
+        for seat in (self.first, 1 - self.first, self.first):
+            yield from self._go_to_lane(seat, 1 - seat)
             yield from self._grasp(seat)
             if self.roughness() > self.config.rough:
                 break
-            yield from self._let_go()
+            self.skills.gripper = 1.0
+            yield from self._go_to_lane(seat, seat)
         yield from self.skills.lift_and_hold(self.config.lift_height, DOWNWARD)
 
     def _sort(self) -> Actions:
         """Put each ball into the bowl of its kind; the second ball is of the kind that the first one was not."""
         skills, config = self.skills, self.config
         kinds = ["golf", "tennis"]
-        for seat in (self.guess, 1 - self.guess):
+        for seat in (self.first, 1 - self.first):
+            yield from skills.reach(self._ball(seat, height=config.hover_height), DOWNWARD, config.free_tolerance)
             yield from self._grasp(seat)
             kind = kinds[0] if len(kinds) == 1 or self.roughness() > config.rough else "tennis"
             kinds.remove(kind)
@@ -94,12 +112,24 @@ class BallSortingExpert:
             yield from self._let_go()
         yield from skills.hold_still()
 
+    def _ball(self, seat: int, x: float = 0.0, height: float = 0.0) -> np.ndarray:
+        """Position of the tool at a ball's centre, moved by `x` and raised by `height`, in m."""
+        return self.stand + np.array([x, SEAT_SPACING * (seat - 0.5), SEAT_HEIGHT + height])
+
     def _grasp(self, seat: int) -> Actions:
-        config = self.config
-        ball = self.stand + np.array([0.0, SEAT_SPACING * (seat - 0.5), SEAT_HEIGHT + config.grasp_above_centre])
-        yield from self.skills.reach(above(ball, config.hover_height), DOWNWARD, config.approach_tolerance)
-        yield from self.skills.reach(ball, DOWNWARD, config.grasp_tolerance)
-        yield from self.skills.set_gripper(config.grip)
+        """Go to a ball, and close the fingers until they have felt it."""
+        skills, config = self.skills, self.config
+        yield from skills.reach(self._ball(seat, height=config.grasp_above_centre), DOWNWARD, config.grasp_tolerance)
+        for _ in range(config.grip_steps):
+            yield from skills.set_gripper(config.grip, steps=1)
+            if skills.squeeze.min() > config.touch_force:
+                break
+        yield from skills.set_gripper(config.grip, config.feel_steps)
+
+    def _go_to_lane(self, seat: int, came_from: int) -> Actions:
+        """Go beside a ball, on the lane by which the hand goes from the ball `came_from` to the other one."""
+        lane = self.config.lane * (2 * came_from - 1)
+        yield from self.skills.reach(self._ball(seat, lane, self.config.lane_height), DOWNWARD, self.config.free_tolerance)
 
     def _let_go(self) -> Actions:
         here, _ = self.skills.tool

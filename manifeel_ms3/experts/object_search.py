@@ -1,5 +1,6 @@
 """Demonstrator of ObjectSearch: grasp in one place; if nothing is felt between the fingers, grasp in the other."""
 
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,35 +31,47 @@ class ObjectSearchExpertConfig:
     """Distance from the point over a place at which the hand has arrived before a grasp, in m. Tuned."""
     grasp_tolerance: float = 1.5e-3
     """Distance from the grasp position at which the fingers close, in m. Tuned."""
-    leave_tolerance: float = 5e-3
-    """Distance from the point over a place at which the hand goes on to the other, in m. Tuned."""
-    open_steps: int = 4
-    """Number of steps for which the gripper opens. Tuned."""
+    crossing_height: float = 0.11
+    """Height of the tool over the table on the way from one place to the other, in m: no height of the way to the first one."""
+    crossing_tolerance: float = 0.01
+    """Distance from the middle of that way at which the hand goes on, in m. Tuned."""
+    grip_steps: int = 6
+    """Largest number of steps for which the fingers close. Tuned."""
 
 
 @register_demonstrator("ManiFeel-ObjectSearch-v1")
 class ObjectSearchExpert:
-    """Knows the two places, guesses one, and decides by the force on the pads when it closes the fingers there."""
+    """Knows the two places, searches the one nearer to the robot first, and decides by the force on the pads.
+
+    Where its fingers close on nothing, it goes to the other place by a higher way than it came: in the middle it would else be
+    where it was at the start, and a policy without memory would begin anew.
+    """
 
     config = ObjectSearchExpertConfig()
 
-    def __init__(self, env: ObjectSearchEnv, seed: int):
-        rng = np.random.default_rng([seed, 11])
+    def __init__(self, env: ObjectSearchEnv, _seed: int):
         self.skills = Skills(env)
         self.skills.gripper = 1.0
-        self.guess = int(rng.integers(2))
 
     def actions(self) -> Actions:
         """Actions of one episode, without end: at last the demonstrator holds the battery up."""
         skills, config = self.skills, self.config
         grasp_height = CONTAINER_FLOOR + BATTERY_SIZE / 2 + config.grasp_above_centre
-        for place in (self.guess, 1 - self.guess, self.guess, 1 - self.guess):
+        middle = np.array([*CONTAINER_XY, config.crossing_height])
+        for place in (0, 1, 0, 1):
             over = np.array([CONTAINER_XY[0] + PLACES_X[place], CONTAINER_XY[1], config.hover_height])
             yield from skills.reach(over, DOWNWARD, config.free_tolerance)
             yield from skills.reach(np.array([*over[:2], grasp_height]), DOWNWARD, config.grasp_tolerance)
-            yield from skills.set_gripper(-1.0)
-            if skills.squeeze.min() > config.felt_force:
+            if (yield from self._feel()):
                 break
-            yield from skills.set_gripper(1.0, config.open_steps)
-            yield from skills.reach(over, DOWNWARD, config.leave_tolerance)
+            skills.gripper = 1.0  # while the hand leaves: if it stood there with open fingers, it would be as before the grasp
+            yield from skills.reach(middle, DOWNWARD, config.crossing_tolerance)
         yield from skills.lift_and_hold(config.lift_height, DOWNWARD)
+
+    def _feel(self) -> Generator[np.ndarray, None, bool]:
+        """Close the fingers, and return whether they have something between them."""
+        for _ in range(self.config.grip_steps):
+            yield from self.skills.set_gripper(-1.0, steps=1)
+            if self.skills.squeeze.min() > self.config.felt_force:
+                return True
+        return False

@@ -20,8 +20,22 @@ class UprightConfig(InsertionExpertConfig):
     """
 
     keeps_hand: bool = True
+    hover_height: float = 0.015
+    """Height over the rim, in m, from which the plug is lowered. Tuned."""
+    aim_error: float = 0.006
+    """Largest distance from the hole's axis, in m, to which the plug comes at that height. Tuned."""
+    centring: float = 0.3
+    """Share of its distance from the axis by which the plug is moved in one step while it is lowered. Tuned."""
+    slope: float = 1.5
+    """Smallest ratio of the plug's height over the rim to its distance from the axis: it is lowered within a cone. Tuned."""
+    near: float = 0.001
+    """Distance from the axis, in m, within which the plug is lowered all the way. Tuned."""
+    lowering_speed: float = 0.002
+    """Largest step of the plug downwards, in m. Tuned."""
+    touch: float = 2.0
+    """Upward force, in N, at which lowering ends. Tuned."""
     lowering: float = 0.003
-    """Depth below the rim, in m, down to which the plug is lowered at a steady pace where nothing stops it. Tuned."""
+    """Depth below the rim, in m, down to which the plug is lowered where nothing stops it. Tuned."""
     slide: float = 3e-4
     """Motion of the plug away from what it stands on, in m per step. Tuned."""
     sure_force: float = 1.5
@@ -37,19 +51,33 @@ class UprightConfig(InsertionExpertConfig):
 class UprightInsertionExpert(InsertionExpert):
     """Does what a person does with half a millimetre of play.
 
-    It comes over the hole upright, lowers the plug, and presses. Where the plug stands on an edge, the force comes from the
-    side on which it overlaps; it slides away from there. In the hole it gives way to the walls. Each action depends on what is
-    seen and felt at that moment, so that a policy without memory can do the same.
+    It comes roughly over the hole, brings the plug to its axis while it lowers it, and presses. Where the plug stands on an
+    edge, the force comes from the side on which it overlaps; it slides away from there. In the hole it gives way to the walls.
+    Each action depends on what is seen and felt at that moment, so that a policy without memory can do the same.
     """
 
     config = UprightConfig()
 
     def _enter(self) -> Actions:
-        over = np.array([*self.socket[:2], self._rim])
-        start, facing = self._tool_for(self._end, above(over, self.config.hover_height), STRAIGHT)
-        yield from self.skills.reach(start, facing, tolerance=self.config.approach_tolerance)
-        lowest = start[2] - self.config.hover_height - self.config.lowering
-        yield from self.skills.lower_until_contact(facing, lowest=lowest)
+        config, skills = self.config, self.skills
+        hole = np.array([*self.socket[:2], self._rim])
+        aim = above(hole, config.hover_height) + np.array([*self._aim_error(), 0.0])
+        start, facing = self._tool_for(self._end, aim, STRAIGHT)
+        yield from skills.reach(start, facing, tolerance=config.approach_tolerance)
+        while skills.load[2] <= config.touch:
+            off = hole - self._place(self._end)
+            if off[2] > config.lowering:
+                return
+            distance = np.linalg.norm(off[:2])
+            aside = distance > max(config.near, -off[2] / config.slope)
+            down = 0.0 if aside else config.lowering_speed
+            command, _ = skills.commanded
+            yield skills.command(command + np.array([*config.centring * off[:2], -down]), facing)
+
+    def _aim_error(self) -> np.ndarray:
+        """A random point (2,), in m, of the disc of radius `aim_error`."""
+        angle, share = self._rng.uniform(0, 2 * np.pi), np.sqrt(self._rng.uniform())
+        return self.config.aim_error * share * np.array([np.cos(angle), np.sin(angle)])
 
     def _aside(self, load: np.ndarray) -> np.ndarray:
         config, lead = self.config, self.fit.lead_at(self._rim - self._place(self._end)[2])

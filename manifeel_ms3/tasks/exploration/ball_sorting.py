@@ -63,8 +63,8 @@ class BallSortingRewardConfig:
     category="exploration",
     paper_demos=80,
     paper_tables=("II", "III"),
-    demo_steps=83,
-    revision=3,
+    demo_steps=71,
+    revision=4,
     force_limit=12.0,
 )
 class BallSortingEnv(VisuotactileEnv):
@@ -188,8 +188,8 @@ class BallSortingEnv(VisuotactileEnv):
     category="exploration",
     paper_demos=80,
     paper_tables=("I", "II", "III"),
-    demo_steps=83,
-    revision=3,
+    demo_steps=71,
+    revision=4,
     force_limit=12.0,
 )
 class BallSortingDimEnv(BallSortingEnv):

@@ -59,8 +59,8 @@ class ObjectSearchRewardConfig:
     category="exploration",
     paper_demos=50,
     paper_tables=("I", "II", "III"),
-    demo_steps=77,
-    revision=3,
+    demo_steps=71,
+    revision=4,
     force_limit=8.0,
 )
 class ObjectSearchEnv(VisuotactileEnv):

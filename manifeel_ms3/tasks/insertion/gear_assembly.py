@@ -36,7 +36,7 @@ class GearRandomization(InsertionRandomization):
     paper_demos=100,
     paper_tables=("I", "II", "III"),
     demo_steps=131,
-    revision=3,
+    revision=4,
     force_limit=27.0,
 )
 class GearAssemblyEnv(InsertionEnv):

@@ -13,8 +13,8 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=60,
-    revision=3,
+    demo_steps=57,
+    revision=4,
     force_limit=31.0,
 )
 class USBInsertionEnv(InsertionEnv):
