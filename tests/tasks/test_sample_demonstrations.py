@@ -13,7 +13,9 @@ from manifeel_ms3.tasks.registry import all_tasks
 from tests.sample import states_sample
 
 TASKS = sorted(name for name in all_tasks() if name.startswith("ManiFeel-"))
-SAMPLE_REVISIONS = dict.fromkeys(TASKS, 3)
+SAMPLE_REVISIONS = dict.fromkeys(TASKS, 4) | {
+    f"ManiFeel-{name}-v1": 3 for name in ("NutBoltAssembly", "BulbInstallation", "PegReorientation")
+}
 """Revision of each task with which its sample was recorded."""
 FREE_STEPS = 20
 """Steps before the first contact of any sample; until then a replay repeats the recording on every processor."""
