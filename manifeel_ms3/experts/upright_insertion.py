@@ -44,6 +44,10 @@ class UprightConfig(InsertionExpertConfig):
     """Number of steps between changes of the force on a gear whose teeth stand on others. Tuned."""
     light_press: float = 1.0
     """The smaller of these forces, in N. Tuned."""
+    slipped: float = float(np.deg2rad(3.0))
+    """Lean of a gear, in rad, from which on it has slipped in the hand and is set down anew. Tuned."""
+    shallow: float = 0.012
+    """Depth of the gear's end below the shaft's tip, in m, up to which it is. Tuned."""
     centred: float = 0.0008
     """Distance of the contact from the middle, in m, below which it says no direction. Tuned."""
 
@@ -98,6 +102,13 @@ class UprightGearExpert(UprightInsertionExpert):
     """
 
     config = UprightConfig(twist=0.10, press_force=6.0)  # tuned
+
+    def _is_outside(self, stuck: int) -> bool:
+        _, facing = self.skills.tool
+        _, rotation = self._plug_in_tool()
+        lean = np.arccos(np.clip(-(facing * rotation).apply([0.0, 0.0, 1.0])[2], -1.0, 1.0))
+        shallow = self._place(self._end)[2] > self._rim - self.config.shallow
+        return bool(lean > self.config.slipped and shallow) or super()._is_outside(stuck)
 
     def _press_force(self, stuck: int) -> float:
         unloaded = stuck // self.config.unload_every % 2 == 1
