@@ -159,25 +159,53 @@ def _start_ray(address: str | None) -> None:
 
 
 def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console: Console) -> dict[str, str]:
-    """Give every job to Ray, show the progress until none is left, and return the errors by the jobs' keys."""
+    """Run every job, show the progress until none is left, and return the errors by the jobs' keys.
+
+    A job is given to Ray when its resources are free, so that jobs run in the study's order: Ray itself would do all recordings
+    first, since these wait for nothing.
+    """
     _start_ray(address)
     restore_child_signals()
     try:
         worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform_in)  # a new process for each job
         _require_resources(study)
-        results = {}
-        for job in jobs:
-            needs = study.resources[job.kind]
-            task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
-            results[job.key] = task.remote(Path.cwd(), job, root, needs.workers, *(results[need.key] for need in job.needs))
-        waiting = list(results.values())
+        results: dict[str, Any] = {}
+        waiting, running = list(jobs), dict[Any, Job]()
         with Live(console=console, refresh_per_second=1) as live:
-            while waiting:
-                _, waiting = ray.wait(waiting, num_returns=len(waiting), timeout=POLL_SECONDS, fetch_local=False)
+            while waiting or running:
+                while job := _next_job(study, waiting, running):
+                    waiting.remove(job)
+                    needs = study.resources[job.kind]
+                    task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
+                    needed = [results[need.key] for need in job.needs]
+                    results[job.key] = task.remote(Path.cwd(), job, root, needs.workers, *needed)
+                    running[results[job.key]] = job
+                ended, _ = ray.wait(list(running), timeout=POLL_SECONDS, fetch_local=False)
+                for result in ended:
+                    del running[result]
                 live.update(progress(study, jobs, root))
         return {key: error for key, result in results.items() if (error := _error(result))}
     finally:
         ray.shutdown()
+
+
+def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job | None:
+    """The first waiting job whose needed jobs have ended and whose resources are free; None if there is none."""
+    taken = [study.resources[job.kind] for job in running.values()]
+    free = {name: count - sum(getattr(one, field) for one in taken) for name, field, count in _resources()}
+    unfinished = {job.key for job in (*waiting, *running.values())}
+    for job in waiting:
+        needs = study.resources[job.kind]
+        fits = needs.cpus <= free["CPU"] and needs.gpus <= free["GPU"]
+        if fits and not any(need.key in unfinished for need in job.needs):
+            return job
+    return None
+
+
+def _resources() -> list[tuple[str, str, float]]:
+    """Ray's name of each resource, the field of `Resources` that asks for it, and how much of it the machines have."""
+    available = ray.cluster_resources()
+    return [(name, field, available.get(name, 0.0)) for name, field in (("CPU", "cpus"), ("GPU", "gpus"))]
 
 
 def _error(result: Any) -> str:
@@ -192,12 +220,11 @@ def _error(result: Any) -> str:
 
 
 def _require_resources(study: Study) -> None:
-    available = ray.cluster_resources()
     for kind, needs in study.resources.items():
-        for name, wanted in (("CPU", needs.cpus), ("GPU", needs.gpus)):
-            if wanted > available.get(name, 0):
+        for name, field, available in _resources():
+            if (wanted := getattr(needs, field)) > available:
                 raise MachineError(
-                    f"{study.name}: {kind} needs {wanted:g} {name}s, and {available.get(name, 0):g} are available; change "
+                    f"{study.name}: {kind} needs {wanted:g} {name}s, and {available:g} are available; change "
                     "`resources` in the study's file, or give the --address of a Ray cluster"
                 )
 
