@@ -13,7 +13,7 @@ from manifeel_ms3.evaluation import evaluate, report
 from manifeel_ms3.evaluation.result import ResultError
 from tests.conftest import PEG, needs_renderer
 
-TASK_ARGS = json.dumps(dict(fit="paper", randomization=dict(socket_xy=0.01), max_episode_steps=120))
+TASK_ARGS = json.dumps(dict(fit="paper", randomization=dict(socket_xy=0.01), max_episode_steps=75))
 
 
 @needs_renderer
