@@ -1,6 +1,7 @@
 """How episodes end: counts of what was missing, by the rule of `EpisodeOutcome.ending`, for every condition."""
 
 from collections import Counter
+from dataclasses import dataclass
 from typing import Any
 
 from .condition import Condition, condition_of
@@ -17,6 +18,20 @@ success whose largest contact force was above the task's limit for gentle succes
 Results = list[dict[str, Any]]
 
 
+@dataclass(frozen=True)
+class Endings:
+    """How the episodes of a condition ended."""
+
+    episodes: int
+    """Number of episodes."""
+    succeeded: int
+    """Number of those that succeeded."""
+    missed: list[tuple[str, int]]
+    """What the others ended with, and how many of them, the most frequent first."""
+    pressed_too_hard: int | None
+    """Number of the others with a force above the limit of gentle success; None for a task without one."""
+
+
 def census_table(results: Results, conditions: list[Condition]) -> str:
     """The section of a page that counts how episodes end; "" where no result says it.
 
@@ -24,27 +39,29 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
         results: Contents of result files.
         conditions: Conditions to count, in the order of the rows.
     """
-    told = _last_of_each_seed(results)
-    rows = [_row(condition, list(told[condition].values())) for condition in conditions if condition in told]
+    rows = []
+    for condition in conditions:
+        if told := endings_of(condition, results):
+            missed = ", ".join(f"{count} {name}" for name, count in told.missed)
+            counts = (told.episodes, told.succeeded, missed, told.pressed_too_hard)
+            rows.append((condition.task, condition.sensing, condition.policy, f"`{condition.key}`", *counts))
     names = ("task", "sensing", "policy", "id", "episodes", "success", "how the others end", "pressed too hard")
     return f"{CENSUS}{markdown_table(names, rows)}" if rows else ""
 
 
-def _last_of_each_seed(results: Results) -> dict[Condition, dict[Any, dict[str, Any]]]:
-    """The results of the last checkpoints that say how episodes ended, by condition and training seed."""
-    last: dict[Condition, dict[Any, dict[str, Any]]] = {}
-    for result in sorted(results, key=lambda result: result["config"].get("step", 0)):
-        if all("ending" in episode for episode in result["episodes"]):
-            last.setdefault(condition_of(result), {})[result["training_seed"]] = result
-    return last
-
-
-def _row(condition: Condition, results: Results) -> tuple[Any, ...]:
-    episodes = [episode for result in results for episode in result["episodes"]]
+def endings_of(condition: Condition, results: Results) -> Endings | None:
+    """How the episodes of the last checkpoint of every training seed ended; None where the results do not say it."""
+    told = [result for result in results if all("ending" in episode for episode in result["episodes"])]
+    of_condition = [result for result in told if condition_of(result) == condition]
+    last: dict[Any, dict[str, Any]] = {}
+    for result in sorted(of_condition, key=lambda result: result["config"].get("step", 0)):
+        last[result["training_seed"]] = result
+    if not last:
+        return None
+    episodes = [episode for result in last.values() for episode in result["episodes"]]
     missed = [episode for episode in episodes if not episode["success_once"]]
-    endings = Counter(episode["ending"] for episode in missed).most_common()
-    limit = results[0].get("force_limit")
+    limit = of_condition[0].get("force_limit")
     hard = None if limit is None else sum(episode["peak_contact_force"] > limit for episode in missed)
-    told = ", ".join(f"{count} {name}" for name, count in endings)
-    counts = (len(episodes), len(episodes) - len(missed), told, hard)
-    return (condition.task, condition.sensing, condition.policy, f"`{condition.key}`", *counts)
+    return Endings(
+        len(episodes), len(episodes) - len(missed), Counter(episode["ending"] for episode in missed).most_common(), hard
+    )

@@ -22,6 +22,7 @@ from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import short_name
 
+from .answers import answers
 from .census import census_table
 from .claims import claims_page
 from .condition import Condition, condition_of
@@ -186,6 +187,7 @@ def page(
     if chart:
         yield CHART.format(figure=chart)
     yield from tables_of_the_paper(found, files)
+    yield from answers(found, results)
     yield "\n## What was run\n\n"
     yield _table_of_conditions(collected, results, files)
     if files:

@@ -47,6 +47,16 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     assert page.count("| not run |") == len(answers) - 1
 
 
+def test_the_page_says_what_touch_adds_to_vision(tmp_path):
+    write_run(tmp_path, VISION, 0.2)
+    assert "What touch adds, and how" not in page_of(tmp_path)  # nothing to compare with
+    write_run(tmp_path, TACFF, 0.5)
+    (paragraph,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
+    assert re.search(r"TacFF adds \+30% \[\+\d+%, \+\d+%\] \(the paper's \+26%\)\. ", paragraph)
+    assert "TacRGB" not in paragraph
+    assert re.search(r"With vision alone, of 50 episodes 40 fail: 40 [a-z]", paragraph)
+
+
 def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     for seed, rate in enumerate((0.1, 0.2, 0.3)):
         write_run(tmp_path, VISION, rate, seed, checkpoints=10)

@@ -1,0 +1,67 @@
+"""What touch adds, task by task: a paragraph of numbers for each task that was run with touch and without."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from manifeel_ms3.evaluation.result import ResultError
+
+from .census import endings_of
+from .condition import Condition
+from .estimates import difference
+from .matching import Found, answering
+from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
+from .presets import Setup
+
+TEXT = """
+## What touch adds, and how episodes fail
+
+Gains are over vision alone on the same initial states, with intervals of 95 %; how the other episodes end is counted by a rule
+of the task. What camera and touch could tell at all is in the [audit](audit.md).
+
+"""
+NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
+
+
+def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
+    """Markdown, part by part; nothing where no task was run with touch and without.
+
+    Args:
+        found: The results that enter comparisons.
+        results: Contents of result files.
+    """
+    paragraphs = [text for task in MODALITIES for text in _of_a_task(task, found, results)]
+    if paragraphs:
+        yield TEXT
+        yield "\n".join(paragraphs)
+
+
+def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
+    """A paragraph for each set-up in which a task was run with vision alone and with touch."""
+    by_setup: dict[Setup, dict[str, Condition]] = {}
+    for mode in MODES:
+        for setup, condition in answering(paper_condition(task, mode), found).items():
+            by_setup.setdefault(setup, {})[mode] = condition
+    for setup, conditions in by_setup.items():
+        if VISION in conditions and len(conditions) > 1:
+            gains = "; ".join(_gain(task, mode, conditions, found) for mode in conditions if mode != VISION)
+            ends = " ".join(_endings(mode, condition, results) for mode, condition in conditions.items())
+            yield f"**{task}** ({setup}): {gains}. {ends}\n"
+
+
+def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
+    rates: dict[str, Rate] = dict(zip(MODES, MODALITIES[task], strict=True))
+    papers = f"the paper's {rates[mode].mean - rates[VISION].mean:+.0%}"
+    try:
+        gain, p_value = difference(found[conditions[mode]], found[conditions[VISION]])
+    except ResultError:  # evaluated on other initial states
+        return f"{NAMES[mode]} cannot be compared"
+    verdict = "" if p_value < 0.05 else ", which may be chance"
+    return f"{NAMES[mode]} adds {gain.signed}{verdict} ({papers})"
+
+
+def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> str:
+    told = endings_of(condition, results)
+    if told is None:
+        return ""
+    missed = ", ".join(f"{count} {name}" for name, count in told.missed) or "none"
+    return f"With {NAMES[mode]}, of {told.episodes} episodes {told.episodes - told.succeeded} fail: {missed}."
