@@ -150,7 +150,8 @@ def _measured(spec: TaskSpec) -> str:
             source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
     none = f"No policy has been evaluated on revision {spec.revision} of this task yet.\n"
-    results = [line for line in (DOCS / "results.md").read_text(encoding="utf-8").splitlines() if f"| {spec.name} |" in line]
+    text = (DOCS / "results.md").read_text(encoding="utf-8")
+    results = re.search(rf"^\| {spec.name} \|.*\[\d+%\]\(", text, flags=re.MULTILINE)  # a rate with its file
     parts.append(f"## Results\n\n{'See [the results](../results.md).' if results else none}")
     return "\n".join(parts)
 

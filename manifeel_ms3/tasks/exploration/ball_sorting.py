@@ -63,7 +63,7 @@ class BallSortingRewardConfig:
     category="exploration",
     paper_demos=80,
     paper_tables=("II", "III"),
-    demo_steps=71,
+    demo_steps=70,
     revision=4,
     force_limit=12.0,
 )
@@ -188,7 +188,7 @@ class BallSortingEnv(VisuotactileEnv):
     category="exploration",
     paper_demos=80,
     paper_tables=("I", "II", "III"),
-    demo_steps=71,
+    demo_steps=70,
     revision=4,
     force_limit=12.0,
 )

@@ -13,7 +13,7 @@ from .base import InsertionEnv
     category="insertion",
     paper_demos=50,
     paper_tables=("I",),
-    demo_steps=56,
+    demo_steps=58,
     revision=4,
     force_limit=32.0,
 )
