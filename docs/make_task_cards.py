@@ -150,8 +150,7 @@ def _measured(spec: TaskSpec) -> str:
             source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
     none = f"No policy has been evaluated on revision {spec.revision} of this task yet.\n"
-    text = (DOCS / "results.md").read_text(encoding="utf-8")
-    results = re.search(rf"^\| {spec.name} \|.*\[\d+%\]\(", text, flags=re.MULTILINE)  # a rate with its file
+    results = f"\n| {spec.name} revision {spec.revision} |" in (DOCS / "results.md").read_text(encoding="utf-8")
     parts.append(f"## Results\n\n{'See [the results](../results.md).' if results else none}")
     return "\n".join(parts)
 

@@ -110,6 +110,8 @@ def linked(success: Estimate, file: str | None) -> str:
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
     """Draw the success of Table I as bars: tasks side by side, a bar for each sensing, the paper's rates as black lines.
 
+    A task that was not run has the paper's lines alone.
+
     The set-up is the one in which most conditions were run.
 
     Args:
@@ -132,7 +134,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     with missing_extras_named():
         from matplotlib.figure import Figure
     setup, drawn = max(bars.items(), key=lambda item: len(item[1]))
-    tasks = [task for task in MODALITIES if any((task, mode) in drawn for mode in MODES)]
+    tasks = list(MODALITIES)
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
     for k, mode in enumerate(MODES):
@@ -141,7 +143,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         for k, rate in enumerate(MODALITIES[task]):
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
-            ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=2, label=label)
+            ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=1.5, label=label)
     ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {setup.preset}")
     ax.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
     ax.legend(ncols=4, fontsize=8, loc="upper left")

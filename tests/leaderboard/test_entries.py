@@ -1,0 +1,52 @@
+"""The results in the repository can be run again from the checkpoints beside them."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.entries import find_entry
+from manifeel_ms3.leaderboard.checks import check
+from manifeel_ms3.leaderboard.submission import read_submission
+from manifeel_ms3.provenance import machine
+from tests.conftest import needs_renderer
+
+BOARD = Path(__file__).parents[2] / "leaderboard"
+ENTRY = "cpu/PegInsertion/rgb+tacff"
+SIZE = 80 * 10**6
+"""Largest size of all checkpoints in the repository, in bytes."""
+
+
+def test_every_entry_has_the_checkpoint_that_its_submission_names():
+    results = sorted(BOARD.glob("*/**/seed0/*.json"))
+    assert results
+    for path in results:
+        entry = find_entry(path.parents[1].relative_to(BOARD).as_posix())
+        assert entry.result == json.loads(path.read_text())
+    assert sum(path.stat().st_size for path in BOARD.rglob("*.safetensors")) < SIZE
+
+
+def test_the_submissions_in_the_repository_can_be_shown():
+    for folder in BOARD.iterdir():
+        if folder.is_dir():
+            check(read_submission(folder), to_take=False)
+
+
+@needs_renderer
+def test_an_entry_is_run_again(tmp_path, caplog):
+    caplog.set_level("INFO")
+    out = evaluate.main(evaluate.Args(entry=ENTRY, episodes=1, out=tmp_path / "again.json"))
+    again, published = json.loads(out.read_text()), find_entry(ENTRY).result
+    assert again["config"] == published["config"]
+    assert again["episodes"][0]["seed"] == published["episodes"][0]["seed"]
+    said = re.search(rf"(\d) of 1 episodes agree with those of the entry {re.escape(ENTRY)}", caplog.text)
+    assert said
+    if machine()["cpu"] == published["machine"]["cpu"] and again["versions"] == published["versions"]:
+        assert said[1] == "1"  # other processors round differently
+
+
+def test_an_entry_brings_its_own_checkpoint(tmp_path):
+    with pytest.raises(ValueError, match="--entry brings its checkpoint"):
+        evaluate.main(evaluate.Args(entry=ENTRY, checkpoint=tmp_path))
