@@ -46,7 +46,7 @@ def study(tmp_path) -> Path:
 def test_a04_a_result_counts_only_if_it_is_whole_and_of_this_checkpoint(tmp_path):
     kwargs = json.dumps(dict(render_backend="none", max_episode_steps=3))
     trained = Job("train", "a training", {})
-    settings = dict(episodes=1, checkpoints=1, stop_at_success=False, env_kwargs=kwargs)
+    settings = dict(episodes=1, checkpoints=1, stop_at_success=False, half_precision=False, env_kwargs=kwargs)
     job = Job("evaluate", "an evaluation", settings, (trained,))
     checkpoint = train(tiny_args(trained.folder(tmp_path), steps=2)).resolve()
     out = job.folder(tmp_path) / "00000002.json"
