@@ -120,10 +120,7 @@ class BallSortingExpert:
         """Go to a ball, and close the fingers until they have felt it."""
         skills, config = self.skills, self.config
         yield from skills.reach(self._ball(seat, height=config.grasp_above_centre), DOWNWARD, config.grasp_tolerance)
-        for _ in range(config.grip_steps):
-            yield from skills.set_gripper(config.grip, steps=1)
-            if skills.squeeze.min() > config.touch_force:
-                break
+        yield from skills.close_until_felt(config.grip, config.touch_force, config.grip_steps)
         yield from skills.set_gripper(config.grip, config.feel_steps)
 
     def _go_to_lane(self, seat: int, came_from: int) -> Actions:

@@ -1,6 +1,5 @@
 """Demonstrator of ObjectSearch: grasp in one place; if nothing is felt between the fingers, grasp in the other."""
 
-from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,16 +61,8 @@ class ObjectSearchExpert:
             over = np.array([CONTAINER_XY[0] + PLACES_X[place], CONTAINER_XY[1], config.hover_height])
             yield from skills.reach(over, DOWNWARD, config.free_tolerance)
             yield from skills.reach(np.array([*over[:2], grasp_height]), DOWNWARD, config.grasp_tolerance)
-            if (yield from self._feel()):
+            if (yield from skills.close_until_felt(-1.0, config.felt_force, config.grip_steps)):
                 break
             skills.gripper = 1.0  # while the hand leaves: if it stood there with open fingers, it would be as before the grasp
             yield from skills.reach(middle, DOWNWARD, config.crossing_tolerance)
         yield from skills.lift_and_hold(config.lift_height, DOWNWARD)
-
-    def _feel(self) -> Generator[np.ndarray, None, bool]:
-        """Close the fingers, and return whether they have something between them."""
-        for _ in range(self.config.grip_steps):
-            yield from self.skills.set_gripper(-1.0, steps=1)
-            if self.skills.squeeze.min() > self.config.felt_force:
-                return True
-        return False

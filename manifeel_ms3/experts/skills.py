@@ -6,7 +6,7 @@ same controller as a policy does, within the same limits. The load that it acts 
 
 # pyright: reportAttributeAccessIssue=false
 # (ManiSkill annotates a combined controller by its base class)
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -161,6 +161,18 @@ class Skills:
         self.gripper = opening
         for _ in range(steps):
             yield self.command(*self.commanded)
+
+    def close_until_felt(self, opening: float, force: float, steps: int) -> Generator[np.ndarray, None, bool]:
+        """Stay in place and command the gripper, for at most so many steps.
+
+        Returns:
+            Whether both pads feel a normal force above `force`, in N; the fingers close no further then.
+        """
+        for _ in range(steps):
+            yield from self.set_gripper(opening, steps=1)
+            if self.squeeze.min() > force:
+                return True
+        return False
 
     def move_fingers(self, opening: float, steps: int) -> Actions:
         """Stay in place and move the gripper at a steady pace; then give it two steps to come to rest."""
