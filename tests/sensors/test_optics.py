@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors import Light, LightsConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
@@ -43,9 +44,14 @@ def ball(radius: float, depth: float, x: float = 0.0, y: float = 0.0) -> torch.T
     return ((radius**2 - r2).clamp(min=0).sqrt() - radius + depth).clamp(min=0)[None]
 
 
-def test_flat_gel_is_the_background_exactly(optics):
-    flat = torch.zeros(2, 240, 320)
+def test_flat_gel_is_the_background_exactly():
+    optics, flat = make_optics(2), torch.zeros(2, 240, 320)
     assert (optics.shade(optics.surface(flat)) == optics.background).all()
+
+
+def test_more_surfaces_than_pads_are_refused(optics):
+    with pytest.raises(InvalidArgumentError, match="2 gel surfaces for 1 pads"):
+        optics.shade(torch.zeros(2, 240, 320))
 
 
 def test_untouched_regions_stay_background(optics):

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own usage)
 import warp as wp
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import LightsConfig, TactileSensorConfig
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.warp_device import launch_split, warp_device
@@ -230,7 +231,15 @@ class Optics:
         return surface if self._coat is None else self._coat(surface)
 
     def shade(self, surface: torch.Tensor, bristle: torch.Tensor | None = None) -> torch.Tensor:
-        """TacRGB uint8 (N, H, W, 3) of a gel surface (N, H, W), m, whose skin is sheared by `bristle` (N, C, 2), m."""
+        """TacRGB uint8 (N, H, W, 3) of a gel surface (N, H, W), m, whose skin is sheared by `bristle` (N, C, 2), m.
+
+        Raises:
+            InvalidArgumentError: The number of surfaces is not the number of pads.
+        """
+        if len(surface) != len(self._gain):  # the kernel reads the pads' properties by the surface's number, unchecked
+            raise InvalidArgumentError(
+                f"got {len(surface)} gel surfaces for {len(self._gain)} pads; expected one surface (H, W) for each pad"
+            )
         optics, pixel = self.config.optics, self.config.pixel_size
         image = torch.empty(*surface.shape, 3, dtype=torch.uint8, device=self.device)
         coarse = F.avg_pool2d(surface[:, None], COARSE)[:, 0] if optics.shadow > 0 or optics.markers else surface[:0]
