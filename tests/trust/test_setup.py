@@ -1,8 +1,10 @@
 """scripts/setup.sh: whose address it takes for Debian's mirror, what it takes back, and what it asks the linker."""
 
 import os
+import re
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -166,3 +168,9 @@ def test_b10_the_image_is_named_by_its_content_and_has_git():
     assert len(digest) == 64
     assert int(digest, 16)
     assert any("apt-get install" in line and " git " in line for line in lines)
+
+
+def test_the_code_that_names_the_renderer_runs():
+    code = re.search(r"Renderer: \$\(\.venv/bin/python -c '(.*?)'\)", SETUP.read_text())
+    found = subprocess.run([sys.executable, "-c", code[1]], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() in ("gpu", "cpu", "none")
