@@ -90,15 +90,17 @@ def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, cap
 
 def test_importing_the_package_changes_no_global_hook():
     program = (
-        "import sys, logging, signal, warnings\n"
+        "import os, sys, logging, signal, warnings\n"
         "def state():\n"
         "    return sys.excepthook, sys.displayhook, warnings.showwarning, logging.root.level, logging.root.handlers[:], [\n"
         "        signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGCHLD)]\n"
         "import gymnasium, torch, mani_skill.envs, sapien\n"
-        "before = state()\n"
+        "import warp\n"
+        "before = state(), vars(warp.config).copy()\n"
+        "os.register_at_fork = lambda **hooks: (_ for _ in ()).throw(AssertionError(hooks))\n"
         "import manifeel_ms3, baselines.registry\n"
         "assert sys.excepthook is sys.__excepthook__\n"
-        "assert state() == before, (before, state())"
+        "assert (state(), vars(warp.config)) == before, before"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -33,8 +33,8 @@ class TrainArgs:
     """Environment id of the task that the demonstrations are of."""
     obs_mode: str = "rgb+tacff"
     """Modalities that the policy observes: "rgb", "rgb+tacrgb", "rgb+tacff", "rgb+tacrgb+tacff", "tacff", ..."""
-    cameras: tuple[str, ...] = ("wrist",)
-    """Names of the cameras that the policy observes: "front", "side" or "wrist"."""
+    cameras: tuple[str, ...] | None = None
+    """Names of the cameras that the policy observes: "front", "side" or "wrist"; the task's policy camera if not given."""
     tactile_sensors: tuple[str, ...] = ("right",)
     """Sides of the tactile sensors that the policy observes: "left" or "right"."""
     image_size: int = 256

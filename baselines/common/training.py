@@ -77,7 +77,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     """
     check_run(args)
     processes = Processes(args.device)
-    args = replace(args, env_id=task_spec(args.env_id).env_id)
+    task = task_spec(args.env_id)
+    args = replace(args, env_id=task.env_id, cameras=(task.policy_camera,) if args.cameras is None else args.cameras)
     exp_name = processes.of_first(args.exp_name or default_exp_name(args, policy_class.name))
     run_dir = args.run_dir or Path("runs") / exp_name
     with owned(run_dir) if processes.first else nullcontext():

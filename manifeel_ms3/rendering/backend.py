@@ -24,9 +24,6 @@ FORKED = (
     "obs_mode='state' or 'tacff'."
 )
 _IMPORTED_IN = os.getpid()
-os.register_at_fork(after_in_child=gc.freeze)
-# what a forked process inherits is never collected there: to destroy the parent's Vulkan objects, it would wait for ever for
-# their driver's threads, which a fork loses
 _renders_in: int | None = None
 """Id of the process whose renderer this is; a fork copies this answer, but not the renderer."""
 
@@ -42,7 +39,17 @@ def available_render_backend(asked: str = "auto") -> str:
     backend = _first_that_works() if asked == "auto" else asked
     if backend != "none":
         _renders_in = os.getpid()
+        _keep_inherited_objects_after_fork()
     return backend
+
+
+@functools.cache
+def _keep_inherited_objects_after_fork() -> None:
+    """Let no forked process collect what it inherits.
+
+    To destroy the parent's Vulkan objects, it would wait for ever for their driver's threads, which a fork loses.
+    """
+    os.register_at_fork(after_in_child=gc.freeze)
 
 
 def renderer_lost() -> bool:

@@ -14,16 +14,15 @@ import warp as wp
 STDERR = 2  # file descriptor
 MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since handing them over takes longer (chosen)
 
-setattr(wp.config, "quiet", True)  # noqa: B010 (newer releases of warp no longer declare it)
-if hasattr(wp, "LOG_WARNING"):  # newer releases
-    wp.config.log_level = wp.LOG_ERROR
-
 _threads = 1  # that `launch_split` may use, changed by `use_torch_threads_for_warp`
 
 
 @functools.cache
 def _start_warp() -> None:
-    """Start warp, whose native code writes to stderr if it finds no GPU, whatever its log level."""
+    """Start warp without its messages; its native code writes to stderr if it finds no GPU, whatever its log level."""
+    setattr(wp.config, "quiet", True)  # noqa: B010 (newer releases of warp no longer declare it)
+    if hasattr(wp, "LOG_WARNING"):  # newer releases
+        wp.config.log_level = wp.LOG_ERROR
     if torch.cuda.is_available():
         wp.init()
         return
@@ -88,7 +87,10 @@ def launch_split(kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs:
 
 @functools.cache
 def _pool(workers: int) -> ThreadPoolExecutor:
+    _make_new_pools_after_fork()
     return ThreadPoolExecutor(workers, thread_name_prefix="warp")
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
+@functools.cache
+def _make_new_pools_after_fork() -> None:
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork
