@@ -63,7 +63,7 @@ docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
 
 # for Python 3.10 to 3.12; uv is needed for this alone. --upgrade takes newer versions than those pinned before.
-EXTRAS := train report lerobot zarr audit matrix teleop spacemouse gamepad view docs dev
+EXTRAS := train report lerobot zarr audit study teleop spacemouse gamepad view docs dev
 lock:
 	uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-emit-index-url --no-annotate \
 		--custom-compile-command "make lock" $(EXTRAS:%=--extra %) --quiet --output-file requirements.lock pyproject.toml

@@ -16,9 +16,9 @@ import yaml
 
 from baselines.common.train_args import TrainArgs
 from baselines.registry import all_policies
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.paper import paper_demos
+from manifeel_ms3.analysis.paper import training_demos
 from manifeel_ms3.tasks import scenery
 from manifeel_ms3.tasks import visuotactile_env as env
 from manifeel_ms3.tasks.insertion import base as insertion
@@ -154,7 +154,7 @@ def paper_tasks() -> list[TaskSpec]:
 def task_rows() -> Iterator[Row]:
     """A row on each task: demonstrations, camera and size of the actions."""
     for spec in paper_tasks():
-        trained_on = f"{paper_demos(spec.name)} trained on"
+        trained_on = f"{training_demos(spec.name)} trained on"
         theirs = f"{RECORDED[spec.name]} recorded, {trained_on}; {CAMERAS[spec.category]}; {ACTIONS.get(spec.name, 6)} numbers"
         size = len(ACTION_AXES[spec.env_class.default_control_mode])
         ours = f"{spec.paper_demos} recorded, {trained_on}; {spec.policy_camera}; {size} numbers"
@@ -248,8 +248,8 @@ def read_from_the_code() -> dict[str, Any]:
     return dict(
         control_freq=env.CONTROL_FREQ,
         hold=env.HOLD_SECONDS,
-        image_size=scenery.IMAGE_SIZE,
-        field_of_view=np.rad2deg(scenery.FIELD_OF_VIEW),
+        image_size=IMAGE_SIZE,
+        field_of_view=np.rad2deg(FIELD_OF_VIEW),
         dim=scenery.LIGHTING["dim"],
         save_freq=TrainArgs(demos=()).save_freq,
     )

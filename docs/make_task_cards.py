@@ -19,7 +19,7 @@ import cv2
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.paper import paper_demos
+from manifeel_ms3.analysis.paper import training_demos
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks
 from manifeel_ms3.tasks.scenery import LIGHTING
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, VisuotactileEnv
@@ -89,7 +89,7 @@ def _facts(spec: TaskSpec) -> str:
         "Cameras": f"{spec.policy_camera} for policies; {', '.join(CAMERAS)} can be had",
         "Reward": f"{modes}; the dense one is at most {env.max_reward:g}",
         "Gentle success": f"contact force of at most {gentle}",
-        "Demonstrations": f"{spec.paper_demos} recorded in the paper, {paper_demos(spec.name)} of them trained on",
+        "Demonstrations": f"{spec.paper_demos} recorded in the paper, {training_demos(spec.name)} of them trained on",
         "Revision": spec.revision,
     }
     return f"## At a glance\n\n{markdown_table(('What', 'Value'), rows.items())}"

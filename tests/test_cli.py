@@ -119,7 +119,7 @@ def test_a_library_of_an_extra_is_named_with_the_extra(monkeypatch, capsys):
         with missing_extras_named():
             importlib.import_module(module)
 
-    for module, extra in dict(pyspacemouse="spacemouse", sklearn="audit", rerun="view", ray="matrix", yaml="matrix").items():
+    for module, extra in dict(pyspacemouse="spacemouse", sklearn="audit", rerun="view", ray="study", yaml="study").items():
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(MissingExtraError):
             import_it(module)
@@ -133,7 +133,7 @@ def test_a_command_without_its_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.delitem(sys.modules, "baselines.studies.__main__", raising=False)
     assert cli.main(["study", "configs/smoke.yaml"]) == 1
-    assert "error: ray is not installed: pip install 'manifeel-ms3[matrix]'" in capsys.readouterr().err
+    assert "error: ray is not installed: pip install 'manifeel-ms3[study]'" in capsys.readouterr().err
 
 
 def test_what_a_worker_refuses_is_a_message_too(tmp_path, capsys):

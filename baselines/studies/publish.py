@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.analysis.condition import Condition, condition_of
-from manifeel_ms3.analysis.paper import DP, paper_demos
+from manifeel_ms3.analysis.paper import DP, training_demos
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.entries import ABOUT, CHECKPOINTS
@@ -81,7 +81,7 @@ def _differences(condition: Condition) -> list[str]:
     found = [] if condition.policy == DP else [condition.policy]
     if condition.cameras not in ((), (task_spec(condition.env_id).policy_camera,)):
         found += condition.cameras
-    if condition.num_demos != paper_demos(condition.task):
+    if condition.num_demos != training_demos(condition.task):
         found.append(f"{condition.num_demos}demos")
     if condition.variant:
         found += _words(json.loads(condition.variant))

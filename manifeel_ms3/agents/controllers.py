@@ -156,7 +156,7 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     speed by 5.8 mm (joint time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds
     the force near 16 N."""
     target_lead_limit_rot: float = 0.04
-    """The same for rotation, in rad."""
+    """Largest lead of the target over the tool in rotation, in rad."""
     use_target: bool = True
     controller_cls = LimitedLeadEEPoseController
 

@@ -55,6 +55,10 @@ ABSOLUTE_LEAD_POS, ABSOLUTE_LEAD_ROT = 0.024, 0.127
 step of it, so that an absolute action can do what a delta action can."""
 ABSOLUTE_RANGE_POS, ABSOLUTE_RANGE_ROT = 2.0, 2 * np.pi
 """Largest coordinate, in m, and angle, in rad, of an absolute action (ManiSkill's Panda)."""
+IMAGE_SIZE = 256
+"""Width and height of the policy's cameras' images, in pixels (public code of the paper)."""
+FIELD_OF_VIEW = np.deg2rad(75)
+"""Field of view of the policy's cameras, in rad (public code of the paper)."""
 FIXED_GRIPPER = "_fixed_gripper"
 """End of the names of control modes without an action of the gripper, which keeps its grip."""
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -190,9 +194,9 @@ class PandaGelSight(BaseAgent):
             CameraConfig(
                 "wrist",
                 pose=pose,
-                width=256,
-                height=256,
-                fov=np.deg2rad(75),
+                width=IMAGE_SIZE,
+                height=IMAGE_SIZE,
+                fov=FIELD_OF_VIEW,
                 near=0.005,
                 far=10,
                 mount=self.robot.links_map["panda_hand"],

@@ -60,8 +60,8 @@ def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) 
 
 
 def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> str:
-    told = endings_of(condition, results)
-    if told is None:
+    endings = endings_of(condition, results)
+    if endings is None:
         return ""
-    missed = ", ".join(f"{count} {name}" for name, count in told.missed) or "none"
-    return f"With {NAMES[mode]}, of {told.episodes} episodes {told.episodes - told.succeeded} fail: {missed}."
+    missed = ", ".join(f"{count} {name}" for name, count in endings.missed) or "none"
+    return f"With {NAMES[mode]}, of {endings.episodes} episodes {endings.episodes - endings.succeeded} fail: {missed}."

@@ -25,11 +25,11 @@ class Endings:
     episodes: int
     """Number of episodes."""
     succeeded: int
-    """Number of those that succeeded."""
+    """Number of episodes that succeeded."""
     missed: list[tuple[str, int]]
-    """What the others ended with, and how many of them, the most frequent first."""
+    """What the failed episodes ended with, and how many did so, the most frequent first."""
     pressed_too_hard: int | None
-    """Number of the others with a force above the limit of gentle success; None for a task without one."""
+    """Number of failed episodes with a force above the limit of gentle success; None for a task without one."""
 
 
 def census_table(results: Results, conditions: list[Condition]) -> str:
@@ -41,9 +41,9 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
     """
     rows = []
     for condition in conditions:
-        if told := endings_of(condition, results):
-            missed = ", ".join(f"{count} {name}" for name, count in told.missed)
-            counts = (told.episodes, told.succeeded, missed, told.pressed_too_hard)
+        if endings := endings_of(condition, results):
+            missed = ", ".join(f"{count} {name}" for name, count in endings.missed)
+            counts = (endings.episodes, endings.succeeded, missed, endings.pressed_too_hard)
             rows.append((condition.task, condition.sensing, condition.policy, f"`{condition.key}`", *counts))
     names = ("task", "sensing", "policy", "id", "episodes", "success", "how the others end", "pressed too hard")
     return f"{CENSUS}{markdown_table(names, rows)}" if rows else ""
@@ -51,8 +51,8 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
 
 def endings_of(condition: Condition, results: Results) -> Endings | None:
     """How the episodes of the last checkpoint of every training seed ended; None where the results do not say it."""
-    told = [result for result in results if all("ending" in episode for episode in result["episodes"])]
-    of_condition = [result for result in told if condition_of(result) == condition]
+    with_endings = [result for result in results if all("ending" in episode for episode in result["episodes"])]
+    of_condition = [result for result in with_endings if condition_of(result) == condition]
     last: dict[Any, dict[str, Any]] = {}
     for result in sorted(of_condition, key=lambda result: result["config"].get("step", 0)):
         last[result["training_seed"]] = result

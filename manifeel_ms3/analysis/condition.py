@@ -13,10 +13,9 @@ from functools import cache
 from typing import Any
 
 from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.evaluation.evaluate import SENSING
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
-SENSING = ("obs_mode", "cameras", "tactile_sensors")
-"""Arguments of an environment that have fields of their own in a `Condition`."""
 BACKENDS = ("sim_backend", "render_backend")
 """Arguments of an environment that say what computes it, and make no other condition."""
 NO_SETTINGS = frozenset(

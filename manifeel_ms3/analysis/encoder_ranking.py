@@ -21,7 +21,7 @@ class EncoderRanking:
     encoders: tuple[str, ...]
     """Names of the encoders by their success, the highest first."""
     success: tuple[Estimate, ...]
-    """Success of each."""
+    """Success of each of `encoders`."""
     gaps: dict[tuple[str, str], Estimate]
     """How much more often the first of two encoders succeeds than the second; for every two, the better one first."""
     p_value: float

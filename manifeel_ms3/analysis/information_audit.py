@@ -27,6 +27,7 @@ from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
 
+from .estimates import TAILS
 from .markdown import markdown_table
 from .probes import Episode, Probe
 
@@ -45,8 +46,6 @@ SCALES = (1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the blurs between which an image's detail is measured, in pixels: an octave apart."""
 RESAMPLES = 1000
 """Number of resamples of the bootstrap."""
-TAILS = (0.025, 0.975)
-"""Quantiles at the ends of an interval of 95 %."""
 SVM_PENALTY = 10.0
 """Penalty C of the support vector machine; ten times scikit-learn's default, for a closer fit to few samples."""
 LENGTH_SCALE, NOISE = 10.0, 0.1

@@ -114,7 +114,7 @@ RUNTIME_DEMOS = 103
 """Number of demonstrations of the runtime comparison."""
 
 
-def paper_demos(task: str) -> int:
+def training_demos(task: str) -> int:
     """Number of training episodes of a task in Tables I to III."""
     return DEMOS.get(task, MOST_DEMOS)
 
@@ -147,7 +147,7 @@ def paper_condition(
         encoder if mode == TACRGB else "",
         (camera or spec.policy_camera,),
         () if mode == VISION else ("right",),
-        num_demos or paper_demos(task),
+        num_demos or training_demos(task),
         json.dumps(variant, sort_keys=True) if variant else "",
         spec.revision,
     )

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.experts.skills import CONFIG as SKILLS
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
 from manifeel_ms3.tasks.registry import task_spec
@@ -31,8 +32,8 @@ IN_FREE_MOTION = 0.5
 """Contact force in N below which a held part moves freely; forces between the two are ambiguous and not asked about."""
 CLOSING = 0.5
 """Action of the gripper below which the fingers close; 1 opens, and demonstrators command -0.4 (balls) and -1 to close."""
-CLOSING_STEPS = 6
-"""Control steps that the fingers take to close: the default of `steps` in `manifeel_ms3.experts.skills.Skills.set_gripper`."""
+CLOSING_STEPS = SKILLS.gripper_steps
+"""Control steps that the fingers take to close."""
 EARLY = (1, 4, 7)
 """Observations at the beginning of an episode, 0.3 s apart, before the demonstrator has reached anything."""
 BETWEEN_FINGERS = 0.04

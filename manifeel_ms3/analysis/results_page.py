@@ -1,4 +1,4 @@
-"""A page of all results beside those of the paper: `python -m manifeel_ms3.analysis.results_page --results runs/matrix`.
+"""A page of all results beside those of the paper: `python -m manifeel_ms3.analysis.results_page --results runs/study`.
 
 Figures are static images for the documentation, which matplotlib draws; pages that a reader explores in a browser (the report
 of a run, the leaderboard) have plotly's interactive ones.

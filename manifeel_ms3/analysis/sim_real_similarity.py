@@ -29,7 +29,7 @@ from manifeel_ms3.files import write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .estimates import Estimate
+from .estimates import TAILS, Estimate
 
 log = logging.getLogger(__name__)
 Features = Callable[[np.ndarray], np.ndarray]
@@ -44,8 +44,6 @@ PAIRS, PAIR_SIDE = 8, 160
 """Number of pairs in nearest.png, and the width and height of an image there, in pixels."""
 IN_CONTACT = 0.05
 """Sum of the absolute forces of a recorded field in N above which the pad is in contact."""
-TAILS = (0.025, 0.975)
-"""Quantiles at the ends of an interval of 95 %."""
 INCEPTION_FEATURES = "2048"
 """Name that torch-fidelity gives to the features which FID is defined on: the 2048 after Inception's last pooling."""
 

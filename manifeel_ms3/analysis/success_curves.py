@@ -37,7 +37,7 @@ class Point:
     training_seeds: int
     """Number of training seeds that were evaluated after so many steps."""
     episodes: int
-    """Number of evaluation episodes of each."""
+    """Number of evaluation episodes of each training seed."""
 
 
 def success_curves(results: Sequence[dict[str, Any]]) -> dict[Condition, list[Point]]:

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from manifeel_ms3.agents.panda_gelsight import IMAGE_SIZE
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import read_json, write_json
@@ -33,8 +34,6 @@ SCHEMA = "manifeel-demonstrations-1"
 """Name and version of the manifest's form."""
 MANIFEST_FILE = "manifest.json"
 """Name of the manifest in its folder."""
-IMAGE_SIZE = 256
-"""Width and height of the tasks' camera images in pixels, for which `TaskSpec.demo_megabytes` holds."""
 SMALLEST_SHARE = 0.2
 """Share of a demonstration's size that is counted on at least, because touch and states do not shrink with the images."""
 HASH_BLOCK = 1 << 20

@@ -40,13 +40,13 @@ class Entry:
         submitted = {episode["seed"]: episode for episode in self.result["episodes"]}
         compared = [outcome for outcome in outcomes if outcome.seed in submitted]
         differing = {one.seed: found for one in compared if (found := differences(submitted[one.seed], one))}
-        said = f"{len(compared) - len(differing)} of {len(compared)} episodes agree with those of the entry {self.name}"
+        sentence = f"{len(compared) - len(differing)} of {len(compared)} episodes agree with those of the entry {self.name}"
         if not differing:
-            return said
+            return sentence
         seed, found = next(iter(differing.items()))
         versions, machine = self.result["versions"], self.result["machine"]
         return (
-            f"{said}; in the episode of seed {seed}, {found[0]}. It was evaluated with torch {versions['torch']} on "
+            f"{sentence}; in the episode of seed {seed}, {found[0]}. It was evaluated with torch {versions['torch']} on "
             f"{machine['cpu']}; other versions and processors round differently"
         )
 

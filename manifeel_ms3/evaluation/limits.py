@@ -29,7 +29,7 @@ class Limits:
 
     max_episode_steps: int
     force_limit: float
-    """In N."""
+    """Largest contact force of a gentle success, in N."""
     demo_steps: float
     """Mean number of control steps of a demonstration."""
     longest: int

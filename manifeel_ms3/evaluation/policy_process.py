@@ -57,7 +57,7 @@ class _Caller:
 
     connection: Connection
     knows_policy: bool = False
-    """Whether it was told what the policy is."""
+    """Whether it has been sent the policy's description."""
     question: Question | None = None
     """The question that waits for its answer."""
     asked_at: float = 0.0

@@ -85,7 +85,9 @@ def force_curve(result: dict[str, Any]) -> str:
     curve = go.Scatter(x=forces, y=100 * success_under_force(episodes, forces), mode="lines", line_shape="hv")
     figure = go.Figure(curve)
     if limit:
-        figure.add_vline(x=limit, line_dash="dash", annotation_text=f"limit of the task, {limit:g} N")
+        figure.add_vline(
+            x=limit, line_dash="dash", annotation_text=f"limit of the task, {limit:g} N", annotation_position="bottom left"
+        )
     figure.update_layout(
         xaxis_title="contact force allowed, N",
         yaxis_title="success, %",

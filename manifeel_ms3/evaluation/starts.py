@@ -1,7 +1,7 @@
 """A private list of initial states: seeds of evaluation episodes that are not published.
 
-Everybody can look at the public seeds, and a policy can be fitted to them. Whoever compares policies keeps a list of his own,
-and evaluates on it with `manifeel eval --seeds FILE`.
+Everybody can look at the public seeds, and a policy can be fitted to them. A maintainer who compares policies keeps a private
+list and evaluates on it with `manifeel eval --seeds FILE`.
 """
 
 from pathlib import Path

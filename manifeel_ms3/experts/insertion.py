@@ -26,7 +26,7 @@ class InsertionExpertConfig:
     approach_tolerance: float = 1e-3
     """Distance from a target in free space at which the hand has arrived, in m. Tuned."""
     return_tolerance: float = 2e-3
-    """The same for the way back before a new attempt, in m. Tuned."""
+    """Distance from the point over the rim, in m, at which the hand has returned before a new attempt. Tuned."""
 
     feel_press: float = 4.5
     """Downward force while the plug leans, is led to a corner or slides about on top, in N. Tuned."""

@@ -23,11 +23,11 @@ class LeaningConfig(InsertionExpertConfig):
     search_radius: float = 0.0012
     """Distance of the second and later landing places from the first, in m. Tuned."""
     search_places: int = 6
-    """Number of landing places on the circle of that radius. Tuned."""
+    """Number of landing places on the circle of `search_radius`. Tuned."""
     landing_height: float = 0.003
     """Height over the rim from which the leading corner is lowered, in m. Tuned."""
     landing_depth: float = 0.006
-    """Largest distance by which it is lowered, in m. Tuned."""
+    """Largest distance by which the leading corner is lowered, in m. Tuned."""
     landed_in_hole: float = 0.0004
     """Depth of the leading corner below the rim, in m, beyond which it is in the hole. Tuned."""
 

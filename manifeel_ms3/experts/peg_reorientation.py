@@ -27,11 +27,11 @@ class PegReorientationConfig(LeaningConfig):
     start_gap: float = 0.004
     """Distance of the peg's corner from the rim's outside at which the push begins, in m: beyond the error of sight. Tuned."""
     contact_depth: float = 0.004
-    """Depth of that corner under the rim's top during the push, in m. Tuned."""
+    """Depth of the peg's corner under the rim's top during the push, in m. Tuned."""
     push_step: float = 0.0012
     """Step of the push, in m; half of it once the peg is past upright. Tuned."""
     follow_step: float = 0.001
-    """Largest vertical step with which the hand keeps that depth while the peg turns, in m. Tuned."""
+    """Largest vertical step, in m, with which the hand keeps `contact_depth` while the peg turns. Tuned."""
     push_steps: int = 60
     """Number of steps after which a push ends. Tuned."""
     let_go_force: float = 0.3

@@ -34,7 +34,7 @@ class ScrewingExpertConfig:
     lower_speed: float = 0.001
     """Speed at which the part is lowered to contact, in m per step. Tuned."""
     lower_distance: float = 0.02
-    """Largest distance by which it is lowered, in m. Tuned."""
+    """Largest distance by which the part is lowered to contact, in m. Tuned."""
 
     centre_force: float = 4.0
     """Downward force while the chamfer centres the part, in N. Tuned."""

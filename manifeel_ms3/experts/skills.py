@@ -42,6 +42,18 @@ class SkillConfig:
     """Orientation error, in rad, below which a reach has arrived. Tuned."""
     sight_error: float = 0.0015
     """Largest error of a position that a demonstrator sees, in m: about two pixels of the wrist camera."""
+    reach_tolerance: float = 5e-4
+    """Distance from the target, in m, at which a reach has arrived where the demonstrator names no other. Tuned."""
+    reach_steps: int = 80
+    """Number of steps after which a reach ends although it has not arrived. Tuned."""
+    gripper_steps: int = 6
+    """Number of steps that the fingers get to close or to open. Tuned."""
+    hold_tolerance: float = 2e-3
+    """Distance from the height to which a part is lifted, in m, at which it is held still. Tuned."""
+    contact_force: float = 2.0
+    """Upward load, in N, at which a part that is lowered has met something. Tuned."""
+    lowering_speed: float = 0.002
+    """Speed at which a part is lowered to contact, in m per step. Tuned."""
     settle_steps: int = 2
     """Number of steps that the fingers get to come to rest after a motion at a steady pace. Tuned."""
 
@@ -141,10 +153,10 @@ class Skills:
         sweep = min(CONFIG.move_gain, CONFIG.top_turn / angle) if angle > SMALLEST_NORM else 1.0
         return self.command(here + pace * way, Rotation.from_rotvec(sweep * turn) * facing)
 
-    def reach(self, position: np.ndarray, rotation: Rotation, tolerance: float = 5e-4, steps: int = 80) -> Actions:
-        """Move to a pose through free space, until within `tolerance`, in m, or for so many steps."""
+    def reach(self, position: np.ndarray, rotation: Rotation, tolerance: float = CONFIG.reach_tolerance) -> Actions:
+        """Move to a pose through free space, until within `tolerance`, in m, or for `reach_steps`."""
         self._speed = 0.0
-        for _ in range(steps):
+        for _ in range(CONFIG.reach_steps):
             here, facing = self.tool
             arrived = np.linalg.norm(position - here) < tolerance
             if arrived and (rotation * facing.inv()).magnitude() < CONFIG.angle_tolerance:
@@ -156,7 +168,7 @@ class Skills:
         while True:
             yield self.command(*self.commanded)
 
-    def set_gripper(self, opening: float, steps: int = 6) -> Actions:
+    def set_gripper(self, opening: float, steps: int = CONFIG.gripper_steps) -> Actions:
         """Stay in place and command the gripper, from 1 (open) to -1 (closed)."""
         self.gripper = opening
         for _ in range(steps):
@@ -189,18 +201,18 @@ class Skills:
         """Gripper command that presses each finger with `force`, in N, on an object `width` wide, in m."""
         return self.finger_action(width / 2 - force / self.agent.controller.controllers["gripper"].config.stiffness)
 
-    def lift_and_hold(self, height: float, rotation: Rotation, tolerance: float = 2e-3) -> Actions:
+    def lift_and_hold(self, height: float, rotation: Rotation) -> Actions:
         """Raise the held object by `height`, in m; then hold it there without end."""
         here, _ = self.tool
-        yield from self.reach(above(here, height), rotation, tolerance)
+        yield from self.reach(above(here, height), rotation, CONFIG.hold_tolerance)
         yield from self.hold_still()
 
-    def lower_until_contact(self, rotation: Rotation, lowest: float, threshold: float = 2.0, speed: float = 0.002) -> Actions:
-        """Go straight down by `speed`, in m per step, until the load exceeds `threshold`, in N, or the tool is at `lowest`."""
+    def lower_until_contact(self, rotation: Rotation, lowest: float, speed: float = CONFIG.lowering_speed) -> Actions:
+        """Go straight down by `speed`, in m per step, until the load exceeds `contact_force` or the tool is at `lowest`."""
         while True:
             here, _ = self.commanded
             tool, _ = self.tool
-            if self.load[2] > threshold or tool[2] < lowest:
+            if self.load[2] > CONFIG.contact_force or tool[2] < lowest:
                 return
             yield self.command(above(here, -speed), rotation)
 

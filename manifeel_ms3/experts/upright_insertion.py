@@ -43,11 +43,11 @@ class UprightConfig(InsertionExpertConfig):
     unload_every: int = 10
     """Number of steps between changes of the force on a gear whose teeth stand on others. Tuned."""
     light_press: float = 1.0
-    """The smaller of these forces, in N. Tuned."""
+    """Downward force, in N, that takes turns with `press_force` on a gear whose teeth stand on others. Tuned."""
     slipped: float = float(np.deg2rad(3.0))
     """Lean of a gear, in rad, from which on it has slipped in the hand and is set down anew. Tuned."""
     shallow: float = 0.012
-    """Depth of the gear's end below the shaft's tip, in m, up to which it is. Tuned."""
+    """Depth of the gear's end below the shaft's tip, in m, up to which a gear that slipped is set down anew. Tuned."""
     centred: float = 0.0008
     """Distance of the contact from the middle, in m, below which it says no direction. Tuned."""
 

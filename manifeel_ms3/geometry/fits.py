@@ -14,6 +14,8 @@ FITS = ("paper", "tight")
 """Names of the fits of the insertion tasks: the sizes of the paper's public parts, and a harder one with less play."""
 LEAD = 0.0007
 """Depth, in m, that a leaning plug's corner can reach before its other side meets the hole's. Tuned."""
+ABOVE_RIM = -0.002
+"""Depth, in m, from which on the first pair of faces may meet: the plug's end is seen and held a little wrong. Tuned."""
 LEAD_SPAN = 0.003
 """Depth, in m, over which the contact of a pair that meets tells a direction; beyond it the one is in the other."""
 LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
@@ -22,14 +24,14 @@ LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
 
 @dataclass(frozen=True)
 class Lead:
-    """What of a plug meets what of the socket first, from one depth on."""
+    """A pair of faces, one of the plug and one of the socket, that is the first to meet from a certain depth on."""
 
     depth: float
-    """Depth of the foremost face below the rim, in m, from which on this pair meets."""
+    """Depth of the foremost face below the rim, in m, from which on this pair is the first to meet."""
     middle: tuple[float, float] = (0.0, 0.0)
     """Middle of the pair in the plug's frame, (x, y) in m: a contact beside it tells to which side the plug is off."""
     tells: tuple[float, float] = (1.0, 1.0)
-    """1 for each of x and y along which the contact's place tells this, 0 for one along which it does not."""
+    """For x and for y, 1 if the place of a contact shows to which side the plug is off, 0 if it does not."""
     is_pin_below: bool = False
     """Whether the plug has the hole and the socket the pin."""
 
@@ -58,9 +60,9 @@ class Fit:
     """Point of the foremost face that enters first when the plug leans towards it: (x, y) from the socket's axis when the
     plug is in."""
     aim: tuple[float, float]
-    """Place where that point is set down, (x, y) from the socket's axis: well within the hole."""
+    """Place where `corner` is set down, (x, y) from the socket's axis: well within the hole."""
     lean: tuple[float, float]
-    """Lean of the plug along x and along y, in rad, with which this point goes ahead."""
+    """Lean of the plug along x and along y, in rad, with which `corner` goes ahead."""
     clearance: float = 1e-3
     """Largest distance from the socket's axis of a plug that is in."""
     max_gap: float = 1e-3

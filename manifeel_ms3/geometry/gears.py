@@ -7,7 +7,7 @@ import numpy as np
 
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, DARK_PLASTIC, STEEL, Look
 
-from .fits import Fit, Lead
+from .fits import ABOVE_RIM, Fit, Lead
 from .materials import ABS, ALUMINIUM
 from .part import Box, Cylinder, Hulls, Part, Piece, extruded, lofted, ring_of_wedges
 
@@ -128,7 +128,7 @@ def gear_fit(fit: str = "paper") -> Fit:
         lean=LEAN,
         clearance=5e-4 if fit == "tight" else 1e-3,
         goes_in_upright=fit == "paper",
-        leads=(Lead(-0.002, is_pin_below=True),),
+        leads=(Lead(ABOVE_RIM, is_pin_below=True),),
     )
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, BRASS
 
 from . import materials
-from .fits import Fit, Lead
+from .fits import ABOVE_RIM, Fit, Lead
 from .part import Box, Part, block_with_chamfered_holes, block_with_holes
 
 PEG_SIZE = (0.01196, 0.00791, 0.050)  # m
@@ -54,7 +54,7 @@ def peg_fit(fit: str = "paper") -> Fit:
         rim=floor + socket.depth,
         floor=floor,
         goes_in_upright=fit == "paper",
-        leads=(Lead(-0.002),),
+        leads=(Lead(ABOVE_RIM),),
         **Fit.into_hole((PEG_SIZE[0] / 2, PEG_SIZE[1] / 2), half_hole),
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from manifeel_ms3.rendering import looks
 
 from . import materials
-from .fits import Fit, Lead
+from .fits import ABOVE_RIM, Fit, Lead
 from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
 ARC_POINTS = 8
@@ -111,7 +111,7 @@ def power_fit(fit: str = "paper") -> Fit:
         floor=floor,
         max_gap=0.1 * sizes.blade[2],
         goes_in_upright=fit == "paper",
-        leads=(Lead(-0.002, (sizes.offset / 2, 0.0)),),
+        leads=(Lead(ABOVE_RIM, (sizes.offset / 2, 0.0)),),
         **Fit.into_hole((ground[0] / 2, ground[1] / 2), (hole[0] / 2, hole[1] / 2), (sizes.offset / 2, 0.0)),
     )
 

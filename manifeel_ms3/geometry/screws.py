@@ -34,9 +34,9 @@ class Screw:
     pitch: float
     """Height of one turn of the thread."""
     seated: float
-    """The same height where the held part is far enough in."""
+    """Height of the held part's origin over the underside of the fixed one where it is far enough in."""
     tightening: float
-    """Angle, in rad, by which the held part is turned further there."""
+    """Angle, in rad, by which the held part is turned further once it is at the height `seated`."""
     reach: float
     """Distance below the held part's origin at which its thread begins."""
     symmetry: float

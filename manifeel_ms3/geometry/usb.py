@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from manifeel_ms3.rendering import looks
 
-from .fits import Fit, Lead
+from .fits import ABOVE_RIM, Fit, Lead
 from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
@@ -96,7 +96,7 @@ def usb_fit(fit: str = "paper") -> Fit:
         max_gap=0.1 * sizes.port[2],  # nine tenths of the way in
         goes_in_upright=fit == "paper",
         leads=(
-            Lead(-0.002),
+            Lead(ABOVE_RIM),
             Lead(sizes.recess - 0.0005, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
         ),
         **Fit.into_hole((prong[0] / 2, prong[1] / 2), (hole[0] / 2, hole[1] / 2)),

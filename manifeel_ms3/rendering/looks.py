@@ -17,7 +17,7 @@ class Look:
     """From 0, polished, to 1, matt."""
 
     def material(self) -> RenderMaterial:
-        """The same for SAPIEN; only where there is a renderer."""
+        """The look as a material of SAPIEN, which can be made only where there is a renderer."""
         return RenderMaterial(base_color=[*self.colour, 1.0], metallic=self.metallic, roughness=self.roughness, specular=0.5)
 
 

@@ -183,7 +183,7 @@ class TactileSensorConfig(BaseSensorConfig):
     taxel_pitch: float = positive(1.634e-3)
     """Distance of neighbouring taxels, m (TacSL's grid on the R1.5)."""
     optics: OpticsConfig = field(default_factory=OpticsConfig)
-    """From the gel's surface to the image."""
+    """Optics, which make the image from the gel's surface."""
     housing: HousingConfig = field(default_factory=HousingConfig)
     """Finger that carries the gel on the pack's own robot."""
     backend: Literal["auto", "raycast", "sapien"] = "auto"

@@ -5,8 +5,8 @@ A task registers itself with one decorator, which also makes its id known to `gy
     @register_task("MyTask-v1", category="insertion", max_episode_steps=300, paper_demos=50)
     class MyTaskEnv(VisuotactileEnv): ...
 
-Recording, training, evaluation, studies, the leaderboard and the documentation ask this registry. Whoever stands on a task
-attaches a part of his own: a demonstrator (`register_demonstrator`), a question of the information audit. Another package's
+Recording, training, evaluation, studies, the leaderboard and the documentation ask this registry. Other modules attach parts to
+a task: its demonstrator (`register_demonstrator`), and questions of the information audit (`register_probe`). Another package's
 tasks are found through the entry point group `manifeel.tasks`.
 """
 
@@ -61,7 +61,7 @@ class TaskSpec:
     demonstrator: Callable[[Any, int], Any] | None = None
     """Makes a scripted demonstrator from an environment and a seed; attached by `register_demonstrator`."""
     probes: list[Any] = field(default_factory=list)
-    """Questions that the information audit asks of the task; attached by `manifeel_ms3.analysis.information_audit`."""
+    """Questions that the information audit asks of the task; attached by `manifeel_ms3.analysis.probes.register_probe`."""
 
     @property
     def name(self) -> str:

@@ -10,6 +10,7 @@ import torch
 from mani_skill.sensors.camera import CameraConfig
 from sapien.physx import PhysxMaterial
 
+from manifeel_ms3.agents.panda_gelsight import FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import Box, Part
@@ -28,10 +29,12 @@ LIGHTING = {"normal": 1.0, "dim": 0.05}
 """Share of the normal light; the paper gives no figure for its dim light."""
 QUALITIES = tuple(SHADOWS)
 """Qualities of the policy's images."""
-IMAGE_SIZE = 256
-"""Width and height of the cameras' images, in pixels (public code of the paper)."""
-FIELD_OF_VIEW = np.deg2rad(75)
-"""Field of view of the cameras, in rad (public code of the paper)."""
+FILM_CAMERA_AT, FILM_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
+"""Place of the films' camera and the point that it looks at, base frame, in m. Chosen by eye."""
+FILM_FIELD_OF_VIEW = np.deg2rad(45)
+"""Field of view of the films' camera, in rad. Chosen by eye."""
+NEAREST, FARTHEST = 0.01, 10.0
+"""Distances between which the cameras draw, in m."""
 TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
 TABLE_FRICTION = 0.5
 """Coulomb's coefficient."""
@@ -67,7 +70,7 @@ class SceneryEnv(SensingEnv):
     @property
     def _default_sensor_configs(self):
         views = dict(front=(self.front_camera_at, (-1.0, 0.0)), side=(self.side_camera_at, (0.0, 1.0)))
-        lens: dict[str, Any] = dict(width=IMAGE_SIZE, height=IMAGE_SIZE, fov=FIELD_OF_VIEW, near=0.01, far=10)
+        lens: dict[str, Any] = dict(width=IMAGE_SIZE, height=IMAGE_SIZE, fov=FIELD_OF_VIEW, near=NEAREST, far=FARTHEST)
         return [
             CameraConfig(name, looking_down(*views[name]), **lens, shader_config=camera_shader())
             for name in self._camera_names
@@ -76,9 +79,18 @@ class SceneryEnv(SensingEnv):
 
     @property
     def _default_human_render_camera_configs(self):
-        pose = looking_at(np.array([0.85, -0.40, 0.32]), np.array([0.48, 0.0, 0.08]))
-        drawn, view = SIZE * SUPERSAMPLING, np.deg2rad(45)
-        return CameraConfig("render_camera", pose, drawn, drawn, view, near=0.01, far=10, shader_config=presentation_shader())
+        pose = looking_at(np.array(FILM_CAMERA_AT), np.array(FILM_CAMERA_LOOKS_AT))
+        drawn = SIZE * SUPERSAMPLING
+        return CameraConfig(
+            "render_camera",
+            pose,
+            drawn,
+            drawn,
+            FILM_FIELD_OF_VIEW,
+            near=NEAREST,
+            far=FARTHEST,
+            shader_config=presentation_shader(),
+        )
 
     def render_rgb_array(self, camera_name: str | None = None):
         with fine_shadow(self._lamps, SHADOWS[self._quality]):

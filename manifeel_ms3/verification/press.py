@@ -21,7 +21,7 @@ RAMP_SECONDS = 0.4
 DRAG = 20.0
 """Drag of the pressed object, in N s/m. At rest it does nothing; PhysX's own damping takes its share of a steady force."""
 TWIST_DRAG = 0.01
-"""The same for its rotation, in N m s."""
+"""Drag of the pressed object's rotation, in N m s."""
 FRICTION = 0.8
 """Coulomb's coefficient of an indenter: with the gel's 0.5 a contact has 0.65."""
 MASS, INERTIA = 0.1, 1e-4

@@ -1,5 +1,6 @@
 """The shipped sample demonstrations, replayed from their seeds: the tasks' outcomes and their rewards."""
 
+import json
 from dataclasses import dataclass
 from functools import cache
 
@@ -8,15 +9,15 @@ import h5py
 import numpy as np
 import pytest
 
+from manifeel_ms3.demonstrations.dataset import MANIFEST_FILE
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations.recording import STATES_FILE
+from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.sample import states_sample
 
 TASKS = sorted(name for name in all_tasks() if name.startswith("ManiFeel-"))
-SAMPLE_REVISIONS = dict.fromkeys(TASKS, 4) | {
-    f"ManiFeel-{name}-v1": 3 for name in ("NutBoltAssembly", "BulbInstallation", "PegReorientation")
-}
-"""Revision of each task with which its sample was recorded."""
+MANIFEST = json.loads((data_dir() / "sample" / MANIFEST_FILE).read_text())
 FREE_STEPS = 20
 """Steps before the first contact of any sample; until then a replay repeats the recording on every processor."""
 SAME_MOTION = 1e-5
@@ -69,7 +70,8 @@ def replayed(task: str) -> Replay:
 @pytest.mark.parametrize("task", TASKS)
 def test_outcome_of_the_sample_has_not_changed(task):
     replay, complaint = replayed(task), HOW_TO_MEND.format(task=task)
-    assert all_tasks()[task].revision == SAMPLE_REVISIONS[task], f"record the sample of {task} with its new revision"
+    recorded = MANIFEST["files"][f"{task}/{STATES_FILE}"]["revision"]
+    assert all_tasks()[task].revision == recorded, f"record the sample of {task} with its new revision"
     assert replay.success == replay.episode["success"], complaint
     assert replay.deviation[:FREE_STEPS].max() <= SAME_MOTION, complaint
     assert replay.deviation[-1] <= SAME_PLACE, complaint
