@@ -1,7 +1,7 @@
 """The settings of a training run."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,7 +10,7 @@ import torch
 from tyro.conf import arg
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.registry import short_name
+from manifeel_ms3.tasks.registry import short_name, task_spec
 
 from .observation import CameraView, PoseForm
 from .policy import PolicyConfig
@@ -116,6 +116,15 @@ class TrainArgs:
     def public_code_lr(self) -> float:
         """The learning rate of the paper's public code for these settings."""
         return PUBLIC_CODE_LR
+
+    def with_task_defaults(self) -> "TrainArgs":
+        """These settings with the full id of their task, and with its policy camera if they name no cameras.
+
+        Raises:
+            UnknownNameError: The task is not registered.
+        """
+        task = task_spec(self.env_id)
+        return replace(self, env_id=task.env_id, cameras=(task.policy_camera,) if self.cameras is None else self.cameras)
 
 
 FREE_ON_RESUME = {

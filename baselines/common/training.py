@@ -21,7 +21,6 @@ from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
-from manifeel_ms3.tasks.registry import task_spec
 
 from .agent import spec_of
 from .background_evaluation import SUCCESS, BackgroundEvaluation
@@ -77,8 +76,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     """
     check_run(args)
     processes = Processes(args.device)
-    task = task_spec(args.env_id)
-    args = replace(args, env_id=task.env_id, cameras=(task.policy_camera,) if args.cameras is None else args.cameras)
+    args = args.with_task_defaults()
     exp_name = processes.of_first(args.exp_name or default_exp_name(args, policy_class.name))
     run_dir = args.run_dir or Path("runs") / exp_name
     with owned(run_dir) if processes.first else nullcontext():

@@ -220,7 +220,7 @@ def inference(policy: str, *flags: str) -> float:
 def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:
     """An untrained policy, its training arguments, and a batch of random observations and actions."""
     preset, *rest = flags
-    args = preset_cli(policy_spec(policy), [preset, "--demos", "-", *rest])
+    args = preset_cli(policy_spec(policy), [preset, "--demos", "-", *rest]).with_task_defaults()
     spec, horizon, batch = spec_of(vars(args)), args.policy.obs_horizon, args.batch_size
     network = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE).to(args.device)
     lay_out_channels_last(network)  # as in training

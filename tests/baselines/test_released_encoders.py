@@ -20,7 +20,7 @@ from baselines.tactile_representations.t3 import T3
 from baselines.tactile_representations.unit import UniT
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from tests.sensors.test_optics import make_optics
+from tests.sensors.optics import make_optics
 
 from .released_encoders import stand_ins
 from .released_encoders.formulae import EXPECTED, UNTOUCHED_COLOUR, probes

@@ -38,7 +38,7 @@ from tests.evaluation.batch_policies import (
     Single,
     source_of,
 )
-from tests.trust.test_evaluation import alive, wait_for_episodes
+from tests.trust.running_evaluations import alive, wait_for_episodes
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 BARE = dict(obs_mode="tacff", render_backend="none", max_episode_steps=6, sim_backend="physx_cpu")

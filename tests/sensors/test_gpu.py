@@ -6,7 +6,7 @@ import torch
 from manifeel_ms3.sensors import with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel, pixel_grid
-from tests.sensors.test_touch_model import CONFIG, EVERYTHING, LOADS, meshes
+from tests.sensors.pads import CONFIG, EVERYTHING, LOADS, meshes
 
 pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")]
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.sensors import Light, LightsConfig, gelsight_r15, sensor_config, with_options
+from manifeel_ms3.sensors import Light, LightsConfig, sensor_config
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
 from manifeel_ms3.sensors.optics.lights import lamp_shader
@@ -17,18 +17,9 @@ from manifeel_ms3.sensors.optics.tacrgb import Optics, shader_of
 from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
 from manifeel_ms3.verification.published_colours import change_images, published_table, ssim
 from tests.sensors.make_calibration import write_table
+from tests.sensors.optics import CONFIG, CPU, GRID, make_optics
 from tests.sensors.readers import photometric_stereo
 from tests.sensors.shapes import dimples
-
-CONFIG = gelsight_r15("touch", "gel_right")
-
-
-CPU = torch.device("cpu")
-GRID = ContactGrid.covering(CONFIG.gel.size, 3.5e-4, CPU)
-
-
-def make_optics(num_pads: int = 1, **fields) -> Optics:
-    return Optics(with_options(CONFIG, fields), GRID, num_pads, CPU)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_extending import install
+from tests.third_party import install
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs/sensor.md").read_text()

@@ -10,7 +10,7 @@ import torch
 
 from manifeel_ms3.sensors import with_options
 from manifeel_ms3.sensors.touch_model import TouchModel
-from tests.sensors.test_touch_model import CONFIG, CPU, LOADS, meshes, pressed
+from tests.sensors.pads import CONFIG, CPU, LOADS, meshes, pressed
 
 PINNED = Path(__file__).with_name("r15_touch.npz")
 OPTIONS = {"plain": {}, "all": {"optics.shadow": 0.5, "optics.markers": True, "optics.noise": 2.0}}

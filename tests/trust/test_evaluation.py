@@ -13,7 +13,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-import psutil
 import pytest
 
 from manifeel_ms3 import provenance
@@ -31,11 +30,11 @@ from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.conftest import PEG
 from tests.evaluation.policies import STUCK
 from tests.outcomes import made_up
+from tests.trust.running_evaluations import PATIENCE, alive, wait_for_episodes
 
 REPOSITORY = Path(__file__).parents[2]
 TASK = json.dumps(dict(render_backend="none", max_episode_steps=3))
 IDENTITY = dict(env_id=PEG, versions=dict(torch="2"), git_commit=None)
-PATIENCE = 120  # s
 NOBODY = 65534
 
 
@@ -61,23 +60,6 @@ def result(**config) -> dict:
 
 def journal_of(out: Path) -> Path:
     return out.with_name(f"{out.stem}.episodes.jsonl")
-
-
-def wait_for_episodes(journal: Path, number: int) -> None:
-    deadline = time.monotonic() + PATIENCE
-    while not journal.is_file() or len(journal.read_text().splitlines()) < 1 + number:
-        assert time.monotonic() < deadline, "no episode was finished"
-        time.sleep(0.1)
-
-
-def alive(group: int) -> list[int]:
-    """The processes of a group that have not ended."""
-    found = []
-    for process in psutil.process_iter():
-        with suppress(psutil.NoSuchProcess, ProcessLookupError):
-            if os.getpgid(process.pid) == group and process.status() != psutil.STATUS_ZOMBIE:
-                found.append(process.pid)
-    return found
 
 
 # ------------------------------------------------------------------------------- interruptions
