@@ -4,7 +4,8 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
@@ -48,10 +49,11 @@ def atomic_write(path: Path) -> Iterator[Path]:
         FileWriteError: The file cannot be written; the message has the path and the reason.
     """
     path = Path(path)
-    partial = path.with_name(path.name + PARTIAL)
+    partial = _temporary(path)
     try:
         with _failures_named(path):
             path.parent.mkdir(parents=True, exist_ok=True)
+            _delete_abandoned(path)
             yield partial
             _flush(partial)
             partial.replace(path)
@@ -62,33 +64,38 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     """Make a folder that appears as a whole once the context has filled the temporary folder that it is given.
 
     Args:
-        path: Path of the folder, which must not exist, or be empty. Its parent folder is made where it does not exist.
+        path: Path of the folder. Its parent folder is made where it does not exist.
+        replace: Let the new folder take the place of an old one, which is deleted afterwards. Without it, the folder must not
+            exist, or be empty.
 
     Raises:
         FileWriteError: The folder cannot be written; the message has the path and the reason.
     """
     path = Path(path)
-    partial = _hidden(path)
+    partial, old = _temporary(path), _temporary(path)
     try:
         with _failures_named(path):
-            shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
+            _delete_abandoned(path)
             yield partial
             for entry in (*partial.rglob("*"), partial):
                 _flush(entry)
+            if replace and path.exists():
+                path.rename(old)
             partial.rename(path)
             _flush(path.parent)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
-def _hidden(path: Path) -> Path:
-    """Path of a folder while it is written."""
-    return path.with_name(f".{path.name}{PARTIAL}")
+def _temporary(path: Path) -> Path:
+    """Path of a file or folder while it is written or deleted, which no other process uses."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{uuid4().hex}{PARTIAL}")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -131,6 +138,29 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
     return content
 
 
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """The objects in a file that has one in each line, such as a log.
+
+    Lines that are no objects are left out, such as one that a process was killed in.
+
+    Args:
+        path: Path of the file, which need not exist.
+
+    Raises:
+        InvalidFileError: The file cannot be read.
+    """
+    found = []
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
+    except OSError as error:
+        raise InvalidFileError(_not(path, "a log", str(error))) from error
+    for line in lines:
+        with suppress(ValueError, RecursionError):
+            if isinstance(entry := json.loads(line), dict):
+                found.append(entry)
+    return found
+
+
 def move(source: Path, target: Path) -> None:
     """Rename a file or a folder, and let the new name reach the disk.
 
@@ -155,7 +185,7 @@ def remove_folder(folder: Path) -> None:
         FileWriteError: The folder cannot be renamed.
     """
     if folder.exists():
-        move(folder, folder.with_name(f".{folder.name}.{uuid4().hex}{PARTIAL}"))
+        move(folder, _temporary(folder))
     _delete_all(folder.parent, f".{folder.name}.*{PARTIAL}")
 
 
@@ -167,6 +197,25 @@ def remove_leftovers(folder: Path) -> None:
 def _delete_all(folder: Path, pattern: str) -> None:
     for path in folder.glob(pattern):
         shutil.rmtree(path, ignore_errors=True)  # what cannot be deleted now is deleted by a later call
+
+
+def _delete_abandoned(path: Path) -> None:
+    """Delete what earlier writers of a file or folder left when they were killed."""
+    for old in path.parent.glob(f".{escape(path.name)}.*-*{PARTIAL}"):
+        writer = old.name.removeprefix(f".{path.name}.").partition("-")[0]
+        if writer.isdigit() and not _is_running(int(writer)):
+            with suppress(OSError):
+                old.unlink() if old.is_file() else shutil.rmtree(old)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        pass
+    return True
 
 
 def _not(path: Path, kind: str, reason: str) -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 import platformdirs
 
 from .errors import MachineError
+from .files import write_text
 
 CACHE_DIR = "MANIFEEL_CACHE_DIR"
 """Environment variable that names the folder of derived assets."""
@@ -64,8 +65,6 @@ def writable_cache() -> Iterator[Path]:
 def derived_file(name: str, make: Callable[[], str]) -> Path:
     """Path of a text file among the derived assets, which is made where it is missing.
 
-    Processes that make it at the same time do not disturb each other.
-
     Args:
         name: Path of the file in the folder of derived assets.
         make: Function that returns the text.
@@ -76,8 +75,5 @@ def derived_file(name: str, make: Callable[[], str]) -> Path:
     path = cache_dir() / name
     if not path.is_file():
         with writable_cache():
-            path.parent.mkdir(exist_ok=True)
-            draft = path.with_suffix(f".{os.getpid()}{path.suffix}")
-            draft.write_text(make(), encoding="utf-8")
-            draft.replace(path)
+            write_text(path, make())
     return path

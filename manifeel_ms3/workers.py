@@ -13,9 +13,11 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from multiprocessing import active_children
+from multiprocessing import active_children, resource_tracker
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -26,6 +28,46 @@ from .errors import InvalidArgumentError, WorkFailedError
 
 State = TypeVar("State")
 Task = TypeVar("Task")
+
+
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Environment variable of Python 3.11 and later: a new interpreter does not look for modules in the current folder."""
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Interpreters that start now do not look for modules in the current folder, where anybody's pickle.py may lie."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SAFE_PATH]
+        else:
+            os.environ[SAFE_PATH] = before
+
+
+class SafeProcess(SpawnProcess):
+    """A spawned process, which finds modules where this process finds them, and nowhere else, also while it starts."""
+
+    @staticmethod
+    def _Popen(process_obj: Any) -> Any:  # noqa: N802 (the name is that of multiprocessing)
+        with _safe_path():
+            return SpawnProcess._Popen(process_obj)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class SafeSpawnContext(SpawnContext):
+    """The context "spawn" of multiprocessing with processes that are `SafeProcess`es."""
+
+    Process = SafeProcess
+
+    def __init__(self) -> None:
+        super().__init__()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+        with _safe_path():
+            resource_tracker.ensure_running()  # which locks would start, and which lets Ctrl-C through again as it starts
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 class WorkerDiedError(WorkFailedError):
@@ -92,7 +134,7 @@ class WorkerPool(Generic[State, Task]):
         if workers < 1:
             raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
         worker = _Worker(make_state)
-        self._pool = ProcessPool(workers, context=multiprocessing.get_context("spawn"), initializer=_start, initargs=(worker,))
+        self._pool = ProcessPool(workers, context=SafeSpawnContext(), initializer=_start, initargs=(worker,))
         self._running: dict[Future[Any], Task] = {}
 
     def __enter__(self) -> "WorkerPool[State, Task]":

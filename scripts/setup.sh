@@ -131,7 +131,7 @@ install_python_packages() {
   [ -x .venv/bin/python ] || python3 -m venv .venv
   # nothing is compiled ahead: a module is compiled when it is first imported, and most of them never are
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
-  if ! .venv/bin/python -c 'import torch' 2>/dev/null; then
+  if [ "$(.venv/bin/python -c 'import torch; print(torch.__version__.partition("+")[0])' 2>/dev/null)" != "$TORCH_VERSION" ]; then
     say "Installing torch"
     if has_gpu; then
       "${pip[@]}" "torch==$TORCH_VERSION"

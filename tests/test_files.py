@@ -1,11 +1,13 @@
 """A file appears whole or not at all, and errors name the path."""
 
 import json
+import os
+import signal
 
 import pytest
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
-from manifeel_ms3.files import atomic_write, read_json, write_json, write_text
+from manifeel_ms3.files import atomic_folder, atomic_write, read_json, read_json_lines, write_json, write_text
 
 SCHEMA = {"type": "object", "required": ["count"], "properties": {"count": {"type": "integer"}}}
 
@@ -48,3 +50,42 @@ def test_what_is_no_such_json_is_refused(tmp_path, text, reason):
         read_json(tmp_path / "file.json", SCHEMA, "a count")
     with pytest.raises(InvalidFileError, match=r"none.json is not a count \(.*No such file"):
         read_json(tmp_path / "none.json", SCHEMA, "a count")
+
+
+def test_two_processes_that_write_the_same_file_do_not_mix_their_texts(tmp_path):
+    path = tmp_path / "page.html"
+    with atomic_write(path) as first, atomic_write(path) as second:
+        first.write_text("first")
+        second.write_text("second, and longer")
+    assert path.read_text() == "first"  # the last to finish
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("make", [atomic_write, atomic_folder])
+def test_what_a_killed_writer_left_is_deleted_by_the_next(tmp_path, make):
+    child = os.fork()
+    if child == 0:
+        with make(tmp_path / "x") as partial:
+            (partial / "half" if partial.is_dir() else partial).write_text("half")
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 1
+    with make(tmp_path / "x") as partial:
+        (partial / "whole" if partial.is_dir() else partial).write_text("whole")
+    assert list(tmp_path.iterdir()) == [tmp_path / "x"]
+
+
+def test_a_folder_takes_the_place_of_another_only_where_it_may(tmp_path):
+    for replace, text in ((False, "old"), (True, "new")):
+        with atomic_folder(tmp_path / "x", replace=replace) as partial:
+            (partial / text).write_text(text)
+    with pytest.raises(ManifeelError, match="x cannot be written"), atomic_folder(tmp_path / "x"):
+        pass
+    assert [path.name for path in tmp_path.rglob("*")] == ["x", "new"]
+
+
+def test_lines_of_a_log_that_broke_off_are_left_out(tmp_path):
+    log = tmp_path / "log.jsonl"
+    assert read_json_lines(log) == []
+    log.write_bytes(b'{"step": 1}\n[2]\n\xff\n' + b"[" * 10**5 + b'\n{"step": 3}\n{"st')
+    assert read_json_lines(log) == [dict(step=1), dict(step=3)]

@@ -11,7 +11,7 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage] (torch does not list it)
 
 from manifeel_ms3.errors import ServerError
-from manifeel_ms3.files import write_text
+from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import short_name
 
 from .train_args import TrainArgs
@@ -131,15 +131,7 @@ def entries_until(log: Path, step: int) -> list[dict[str, float]]:
         log: Path of the log, which need not exist.
         step: Last step whose entries are wanted.
     """
-    entries = []
-    for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if step and log.is_file() else []:
-        try:
-            entry = json.loads(line)
-        except ValueError:
-            continue
-        if isinstance(entry, dict) and entry.get("step", math.inf) <= step:
-            entries.append(entry)
-    return entries
+    return [entry for entry in read_json_lines(log) if entry.get("step", math.inf) <= step] if step else []
 
 
 def _line(entry: Mapping[str, float]) -> str:

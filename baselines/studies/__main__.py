@@ -107,7 +107,14 @@ def main(args: Args) -> None:
         return
     errors = {}
     if not all(is_done(job, args.root) for job in jobs):
-        errors = _run(study, jobs, args.root.absolute(), args.address, console)
+        try:
+            errors = _run(study, jobs, args.root.absolute(), args.address, console)
+        except KeyboardInterrupt:
+            done = sum(is_done(job, args.root) for job in jobs)
+            log.info(
+                "%d of %d jobs are done and kept in %s; the same command goes on with the others", done, len(jobs), args.root
+            )
+            raise
     failed = [job for job in jobs if not is_done(job, args.root)]
     console.print(f"{len(jobs) - len(failed)} of {len(jobs)} jobs of {args.study} are done, in {args.root}")
     if not failed:

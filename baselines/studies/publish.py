@@ -12,7 +12,8 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.entries import ABOUT, CHECKPOINTS
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.files import atomic_folder, remove_folder, write_json
+from manifeel_ms3.files import atomic_folder, write_json
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import task_spec
 
 from .jobs import is_done
@@ -45,7 +46,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
     if folder.is_dir() and not (folder / ABOUT).is_file():
         raise FileExistsAlreadyError(f"{folder} exists and is no submission: it has no {ABOUT}; give another folder")
     hashes: dict[str, str] = {}
-    with atomic_folder(folder) as partial:
+    with owned(folder), atomic_folder(folder, replace=True) as partial:
         for job in done:
             for path in sorted(job.folder(root).glob("*.json")):
                 if path.stem.isdigit():
@@ -53,8 +54,6 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
                     copied = _publish_result(path, checkpoint, partial)
                     hashes[copied.relative_to(partial).as_posix()] = checkpoint_sha256(checkpoint)
         write_json(partial / ABOUT, dict(name=name, authors=authors, checkpoints=hashes))
-        if folder.is_dir():
-            remove_folder(folder)
     return len(hashes)
 
 

@@ -27,6 +27,7 @@ from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.files import atomic_write
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 
 from .anytouch import AnyTouch
@@ -91,7 +92,13 @@ def main(args: Args) -> list[float]:
         InvalidArgumentError: The representation does not take images of this size.
         DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
         FileWriteError: The weights cannot be written.
+        InUseError: Another process trains into the same file.
     """
+    with owned(args.out):
+        return _pretrain(args)
+
+
+def _pretrain(args: Args) -> list[float]:
     torch.manual_seed(args.seed)
     representation = REPRESENTATIONS[args.representation]().to(args.device)
     size = args.image_size or representation.size

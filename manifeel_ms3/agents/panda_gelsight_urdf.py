@@ -12,8 +12,9 @@ the untouched face, x along image rows (across the finger), y along image column
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
 # (trimesh's annotations do not tell scenes and visuals of different kinds apart)
 import hashlib
-import tempfile
 import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import fast_simplification
@@ -23,6 +24,7 @@ from mani_skill import PACKAGE_ASSET_DIR
 from scipy.spatial import KDTree
 from trimesh.exchange.gltf import export_glb
 
+from manifeel_ms3.files import FileWriteError, atomic_folder
 from manifeel_ms3.paths import cache_dir, writable_cache
 
 from . import fingers
@@ -60,10 +62,8 @@ def panda_gelsight_urdf(visuals: bool = True, finger: Finger | None = None) -> s
 
 
 def _build_into(folder: Path, finger: Finger) -> None:
-    """Build in a temporary folder and move it in place, so that processes that start together do not disturb each other."""
-    with writable_cache(), tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
-        work = Path(scratch) / "new"
-        work.mkdir()
+    """Build a folder that appears as a whole; where processes start together, the first that is done provides it for all."""
+    with writable_cache(), _unless_made_meanwhile(folder), atomic_folder(folder) as work:
         tree = ET.parse(_SOURCE / "panda_v2.urdf")
         _derive(tree.getroot(), work, finger)
         tree.write(work / "panda.urdf")
@@ -73,11 +73,16 @@ def _build_into(folder: Path, finger: Finger) -> None:
         tree.write(work / "panda_bare.urdf")
         for name in ("panda.srdf", "panda_bare.srdf"):
             (work / name).write_bytes((_SOURCE / "panda_v2.srdf").read_bytes())
-        try:
-            work.replace(folder)
-        except OSError:
-            if not (folder / "panda.urdf").is_file():  # not another process's finished copy: a real error
-                raise
+
+
+@contextmanager
+def _unless_made_meanwhile(folder: Path) -> Iterator[None]:
+    """Do without the folder that is built in the context where another process has made it in the meantime."""
+    try:
+        yield
+    except FileWriteError:
+        if not (folder / "panda.urdf").is_file():
+            raise
 
 
 def _derive(robot: ET.Element, work: Path, finger: Finger) -> None:

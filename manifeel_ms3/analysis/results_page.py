@@ -4,7 +4,6 @@ Figures are static images for the documentation, which matplotlib draws; pages t
 of a run, the leaderboard) have plotly's interactive ones.
 """
 
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +18,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import results_by_file
-from manifeel_ms3.files import write_text
+from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import short_name
 
 from .answers import answers
@@ -145,7 +144,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
         if not (path.parent / "checkpoints/last").exists():  # the run has no checkpoint yet
             continue
         config = checkpoint_config(path.parent / "checkpoints/last")
-        entries = [entry for line in path.read_text().splitlines() if TRAINING_LOSS in (entry := json.loads(line))]
+        entries = [entry for entry in read_json_lines(path) if TRAINING_LOSS in entry]
         name = f"{config['policy_name']}, {config['obs_mode']}, seed {config['seed']}"
         runs.setdefault(config["env_id"], []).append((name, entries))
     if not runs:

@@ -1,6 +1,5 @@
 """Export demonstrations: `python -m manifeel_ms3.demonstrations.export trajectory.h5 --to lerobot --out folder`."""
 
-import shutil
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +12,8 @@ import tyro
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.files import atomic_folder
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 
 from .formats import FORMATS
@@ -64,14 +65,13 @@ def main(args: Args) -> Path:
     """
     if args.videos and args.to != "lerobot":
         raise InvalidArgumentError(f"--videos is for --to lerobot, not for --to {args.to}; leave it out")
-    if args.out.exists():
-        raise DemonstrationError(f"{args.out} exists already; give another --out, or delete it")
-    draft = args.out.with_name(args.out.name + ".partial")
-    shutil.rmtree(draft, ignore_errors=True)
     write = partial(write_lerobot, videos=True) if args.videos else WRITERS[args.to]
-    with progress_bar() as bar:
-        write(args.file, draft, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
-    draft.replace(args.out)
+    with owned(args.out):
+        if args.out.exists():
+            raise DemonstrationError(f"{args.out} exists already; give another --out, or delete it")
+        with atomic_folder(args.out) as folder, progress_bar() as bar:
+            folder.rmdir()  # writers make their folder themselves
+            write(args.file, folder, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
     return args.out
 
 

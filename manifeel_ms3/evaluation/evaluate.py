@@ -222,7 +222,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
         raise InvalidArgumentError(f"{_flags(unused)} are for a --checkpoint; tell a --policy of your own by --policy-kwargs")
     env_id = task_spec(args.env_id).env_id
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
-    source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs)
+    source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs, answer_timeout=args.step_timeout)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
     env_kwargs = {n: v for n, v in sensing.items() if v is not None} | BACKEND | given
     return Evaluation(source, env_id, env_kwargs, config, args.stop_at_success, args.step_timeout)

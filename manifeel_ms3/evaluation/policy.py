@@ -96,6 +96,8 @@ class PolicySource:
     """Device that computes a checkpoint's policy, such as "cpu" or "cuda"."""
     batch_size: int | None = None
     """Number of episodes that a checkpoint's policy answers together."""
+    answer_timeout: float = 60.0
+    """Longest time in s that a server may take for an answer."""
 
     @property
     def is_shared(self) -> bool:
@@ -117,7 +119,7 @@ class PolicySource:
             if self.is_server:
                 from .remote_policy import RemotePolicy
 
-                return RemotePolicy(name, **kwargs)
+                return RemotePolicy(name, **dict(timeout=self.answer_timeout) | kwargs)
             return import_name(name)(**kwargs)
         except ManifeelError:
             raise

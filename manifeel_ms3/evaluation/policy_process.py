@@ -18,7 +18,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.errors import WorkFailedError
-from manifeel_ms3.workers import end_with_parent
+from manifeel_ms3.workers import SafeSpawnContext, end_with_parent
 
 from .policy import Policy, PolicySource, PolicyUnavailableError, Question
 from .rollout import PolicyFault, begin_episode
@@ -107,10 +106,9 @@ class PolicyProcess:
 
     def _start(self) -> None:
         self._ready, self._answered = None, 0
-        context = multiprocessing.get_context("spawn")
+        context = SafeSpawnContext()
         self._policy, theirs = context.Pipe()
         self._process = context.Process(target=answer_batches, args=(self._source, theirs), daemon=True)
-        resource_tracker.ensure_running()  # started together with the process, it would let Ctrl-C through again
         with _without_ctrl_c():
             self._process.start()
         theirs.close()

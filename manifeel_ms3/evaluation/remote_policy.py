@@ -17,11 +17,19 @@ import ipaddress
 import math
 import zipfile
 from collections.abc import Iterator
-from http.client import HTTPException
+from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import SplitResult, unquote, urlsplit
-from urllib.request import HTTPRedirectHandler, OpenerDirector, ProxyHandler, Request, build_opener
+from urllib.request import (
+    HTTPHandler,
+    HTTPRedirectHandler,
+    HTTPSHandler,
+    OpenerDirector,
+    ProxyHandler,
+    Request,
+    build_opener,
+)
 from uuid import uuid4
 
 import numpy as np
@@ -38,6 +46,9 @@ UNAVAILABLE = (*range(300, 400), 401, 403, 407, 410, 502, 503, 504)
 proxy misses it."""
 LONGEST_MESSAGE = 500
 """Characters of a server's error message that are shown; the rest, often a page of HTML, is cut off."""
+CONNECT_TIMEOUT = 10.0
+"""Longest time in s to wait for a connection; at most half of the time for an answer. It is short, so that a server that cannot
+be reached is told from a policy that takes too long, whose time an evaluation limits itself."""
 MAX_ANSWER = 2**20
 """Largest number of bytes of an answer that are read; an npz with one action has some hundreds."""
 MAX_HEADER = 256
@@ -178,7 +189,33 @@ def _opener_for(host: str) -> OpenerDirector:
         loopback = ipaddress.ip_address(host).is_loopback
     except ValueError:
         loopback = host == "localhost" or host.endswith(".localhost")
-    return build_opener(_NoRedirects, ProxyHandler({})) if loopback else build_opener(_NoRedirects)
+    handlers = (_NoRedirects, _Http, _Https)
+    return build_opener(*handlers, ProxyHandler({})) if loopback else build_opener(*handlers)
+
+
+class _Connects(HTTPConnection):
+    """A connection whose establishment has a time limit of its own."""
+
+    def connect(self) -> None:
+        answer = self.timeout
+        self.timeout = min(CONNECT_TIMEOUT, answer / 2)
+        super().connect()
+        self.timeout = answer
+        self.sock.settimeout(answer)
+
+
+class _ConnectsSafely(_Connects, HTTPSConnection):
+    """The same with TLS."""
+
+
+class _Http(HTTPHandler):
+    def http_open(self, req: Request) -> HTTPResponse:
+        return self.do_open(_Connects, req)
+
+
+class _Https(HTTPSHandler):
+    def https_open(self, req: Request) -> HTTPResponse:
+        return self.do_open(_ConnectsSafely, req)
 
 
 class _NoRedirects(HTTPRedirectHandler):

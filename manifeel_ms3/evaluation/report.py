@@ -6,7 +6,6 @@ figures of the documentation are static images, which matplotlib draws (`manifee
 """
 
 import base64
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.files import write_text
+from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import make_env
 
 from .checkpoint_config import TRAINING_LOSS
@@ -100,7 +99,7 @@ def force_curve(result: dict[str, Any]) -> str:
 
 def training_curve(log_file: Path) -> str:
     """HTML of a plotly figure with the loss over gradient steps; plotly itself must be on the page already."""
-    entries = [entry for line in log_file.read_text().splitlines() if TRAINING_LOSS in (entry := json.loads(line))]
+    entries = [entry for entry in read_json_lines(log_file) if TRAINING_LOSS in entry]
     figure = go.Figure(go.Scatter(x=[e["step"] for e in entries], y=[e[TRAINING_LOSS] for e in entries], mode="lines"))
     figure.update_layout(
         xaxis_title="gradient step",

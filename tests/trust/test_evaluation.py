@@ -303,6 +303,32 @@ def test_b05_a_read_only_folder_is_named_before_the_first_episode():
         assert not list(Path(folder).iterdir())
 
 
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can be two users")
+def test_two_users_of_one_machine_take_turns_with_a_file():
+    """The second finds the lock and the name of the holder that the first left, which are the first user's."""
+    with tempfile.TemporaryDirectory() as shared:
+        Path(shared).chmod(0o1777)  # as /tmp: nobody may delete what is another's
+        out = Path(shared) / "evaluation.json"
+        for user in (NOBODY, NOBODY - 1):
+            child = os.fork()
+            if child == 0:
+                try:
+                    os.setuid(user)
+                    with owned(out):
+                        evaluate_without_simulator(
+                            out.with_name(f"{user}.json"), evaluation_seeds(3), os.open(os.devnull, os.O_WRONLY)
+                        )
+                        try:
+                            with owned(out):
+                                os._exit(3)
+                        except InUseError as error:
+                            os._exit(0 if f"process {os.getpid()}" in str(error) else 4)
+                finally:
+                    os._exit(1)
+            assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+            assert len(read_result(out.with_name(f"{user}.json"))["episodes"]) == 3
+
+
 def test_a_bare_environment_gives_a_result(tmp_path):
     """No git (A5), no HOME, an ASCII locale (A30), and a path with spaces and umlauts."""
     folder = tmp_path / "Prüfung von Größen"

@@ -30,11 +30,14 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import each_demonstration,
 from manifeel_ms3.demonstrations.summary import summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.demonstrations.view import read_streams
-from manifeel_ms3.errors import ManifeelError
+from manifeel_ms3.errors import InvalidFileError, ManifeelError, ServerError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.journal import Journal
 from manifeel_ms3.evaluation.policy import load_policy
+from manifeel_ms3.evaluation.remote_policy import read_action
 from manifeel_ms3.evaluation.result import read_result
 from tests.conftest import PEG
+from tests.outcomes import made_up
 from tests.sample import observed_sample
 
 from .tiny_checkpoint import save_tiny_checkpoint
@@ -206,7 +209,36 @@ def read_lerobot(path: Path) -> None:
     lerobot.read_lerobot(path, KEYS)
 
 
+def made_answer(folder: Path) -> Path:
+    np.savez_compressed(folder / "answer.npz", action=np.linspace(-1, 1, 6))
+    return folder / "answer.npz"
+
+
+def read_answer(path: Path) -> None:
+    try:
+        read_action(path.read_bytes())
+    except ServerError as error:  # it cannot name a file
+        raise InvalidFileError(f"{path}: {error}") from error
+
+
+IDENTITY = dict(env_id=PEG)
+SEEDS = [100_000, 100_001]
+
+
+def made_journal(folder: Path) -> Path:
+    journal = Journal(folder / "evaluation.json", IDENTITY, SEEDS)
+    for seed in SEEDS:
+        journal.add(made_up(seed, True, force=1.5))
+    return journal.path
+
+
+def read_journal(path: Path) -> None:
+    Journal(path.with_name("evaluation.json"), IDENTITY, SEEDS)
+
+
 READERS = {
+    "server's answer": Reader(made_answer, read_answer),
+    "journal": Reader(made_journal, read_journal),
     "trajectory": Reader(made_trajectory, read_trajectory, (damage_bytes, damage_h5)),
     "trajectory's json": Reader(
         lambda folder: made_trajectory(folder).with_suffix(".json"),
@@ -230,7 +262,7 @@ READERS = {
 }
 CASES = {"lerobot, videos": 30, "checkpoint": 50}
 """Number of cases in the default run, of readers that are slow; the others have `DEFAULT_CASES`."""
-DEFAULT_CASES = 92
+DEFAULT_CASES = 77
 
 
 def refused_or_read(read: Callable[[], Any], path: Path | None = None) -> None:

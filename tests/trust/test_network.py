@@ -9,6 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import closing
+from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
@@ -18,6 +19,7 @@ from tests.browser import wait_until
 from tests.conftest import PEG
 from tests.sample import states_sample
 
+REPOSITORY = Path(__file__).parents[2]
 SAMPLE = states_sample(PEG)
 LOOPBACK = {"127.0.0.1", "::1"}
 
@@ -121,6 +123,22 @@ def connect(page, path: str | None = None, host: str | None = None, origin: str 
         proxy=None,
         max_size=None,
     )
+
+
+def test_a21_the_page_listens_on_loopback_only(page):
+    from manifeel_ms3.teleop.__main__ import Args
+
+    port = urlsplit(page.address).port
+    assert port is not None
+    assert {listening(psutil.Process())[port]} <= LOOPBACK
+    assert Args.host == "localhost"  # unless it is told otherwise
+
+
+def test_the_example_of_a_policys_server_listens_on_loopback_only(started):
+    port = free_port()
+    process = started([sys.executable, str(REPOSITORY / "examples/policy_server.py"), "--port", str(port)])
+    wait_until(lambda: port in listening(process), 60)
+    assert set(listening(process).values()) <= LOOPBACK
 
 
 def test_a21_the_page_takes_who_has_its_address(page):
@@ -229,6 +247,33 @@ def test_a13_the_doctor_imports_nothing_from_the_current_folder(monkeypatch, tmp
     ran = doctor._run("import json, torch, gymnasium; print(torch.__version__)")
     assert ran.worked, ran.reason
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="PYTHONSAFEPATH is of Python 3.11")
+def test_a13_worker_processes_import_nothing_from_the_current_folder(tmp_path):
+    """Not even while they start, before they know where their modules are."""
+    for name in ("pickle", "socket", "multiprocessing/__init__"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / f"{name}.py").write_text(f"import pathlib; pathlib.Path({str(tmp_path / 'ran')!r}).write_text('{name}')")
+    (tmp_path / "elsewhere").mkdir()
+    script = tmp_path / "elsewhere/script.py"
+    script.write_text(
+        "import operator\n"
+        "from manifeel_ms3.evaluation.policy import PolicySource\n"
+        "from manifeel_ms3.evaluation.policy_process import PolicyProcess, SharedPolicy\n"
+        "from manifeel_ms3.workers import WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    with WorkerPool(1, int) as pool:\n"
+        "        pool.submit(operator.add, 3)\n"
+        "        print([finished.result() for finished in pool.as_finished()])\n"
+        "    source = PolicySource(policy='tests.evaluation.policies:StandStill')\n"
+        "    with PolicyProcess(source, 60.0) as process:\n"
+        "        SharedPolicy(process.address, source.make).reset()\n"
+    )
+    environment = os.environ | dict(PYTHONPATH=str(REPOSITORY))
+    done = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert not (tmp_path / "ran").exists(), (tmp_path / "ran").read_text()
+    assert (done.returncode, done.stdout) == (0, "[3]\n"), done.stderr
 
 
 CALLS = {

@@ -123,6 +123,23 @@ def test_b04_a_server_that_cannot_be_reached_ends_the_evaluation(tmp_path):
     assert list(tmp_path.glob("evaluation*")) == [out]
 
 
+def test_b04_a_server_that_drops_packets_ends_the_evaluation(tmp_path):
+    """A full queue of connections that nobody accepts: a further connection is never answered."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen(0)
+        waiting = [socket.socket() for _ in range(4)]
+        for one in waiting:
+            one.setblocking(False)
+            one.connect_ex(server.getsockname())
+        address = f"http://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(PolicyUnavailableError, match=r"cannot be reached \(timed out\)"):
+            main(args_of(address, tmp_path / "evaluation.json", step_timeout=4.0))
+        for one in waiting:
+            one.close()
+    assert not list(tmp_path.glob("evaluation*"))
+
+
 def test_b04_an_evaluation_goes_on_when_its_server_is_back(tmp_path):
     whole = example().Handler
 

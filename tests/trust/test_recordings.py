@@ -29,7 +29,8 @@ from tests.trust.kills import PATIENCE, forked, recorded, start_recording
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
 KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="paper")
-few_and_hundred = pytest.mark.parametrize("count", [1, pytest.param(100, marks=pytest.mark.slow)])
+ten_and_hundred = pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
+two_and_hundred = pytest.mark.parametrize("count", [2, pytest.param(100, marks=pytest.mark.slow)])
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -118,8 +119,8 @@ def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.
     return kills
 
 
-@few_and_hundred
-def test_a01_recording_is_killed_at_random_file_events(tmp_path, count):
+@ten_and_hundred
+def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 6)
     chance, kills, rounds = random.Random(0), 0, 0
     while kills < count:
@@ -131,10 +132,11 @@ def test_a01_recording_is_killed_at_random_file_events(tmp_path, count):
             assert len(seeds(path)) == num
         assert_same(path, tmp_path / "undisturbed/t.h5")
         rounds += 1
+    figure("kills of a recording without a simulator", kills, at_least=count)
 
 
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
-def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step):
+def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 9)
 
     def prepare(path: Path) -> None:
@@ -151,6 +153,7 @@ def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step):
 
     prepare(tmp_path / "counted/t.h5")
     events = forked(lambda _: consolidate(tmp_path / "counted/t.h5"))[1]
+    figure("file events of a consolidation", events, at_least=100)
     for moment in range(0, events, step):
         path = tmp_path / f"killed{moment}/t.h5"
         prepare(path)
@@ -184,8 +187,8 @@ class Silent:
     def set_message(self, text): ...
 
 
-@few_and_hundred
-def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count):
+@ten_and_hundred
+def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
     env = make_env(**KWARGS)
 
     def save(path: Path, say=lambda word: None) -> None:
@@ -203,6 +206,7 @@ def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, t
         save(path)
         assert_same(path, tmp_path / "undisturbed/t.h5")
         rounds += 1
+    figure("kills of teleoperation's save", kills, at_least=count)
 
 
 # -------------------------------------------------------------------- real recordings
@@ -287,8 +291,8 @@ def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_p
     assert not episode_folder(tmp_path / "t.h5").exists()
 
 
-@few_and_hundred
-def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count):
+@two_and_hundred
+def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
     """Real processes, killed at random times; every second time the workers are left to themselves."""
     span, chance, kills, rounds = 6.0, random.Random(2), 0, 0
     while kills < count:
@@ -310,6 +314,7 @@ def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count):
         assert recorded(path, 3)[0] == 0
         assert_same(path, undisturbed)
         rounds += 1
+    figure("kills of `record` with the simulator", kills, at_least=count)
 
 
 # -------------------------------------------------------------------- other misfortunes

@@ -170,6 +170,29 @@ def test_b10_the_image_is_named_by_its_content_and_has_git():
     assert any("apt-get install" in line and " git " in line for line in lines)
 
 
+def test_b10_every_package_is_installed_by_its_hash():
+    lock = (SETUP.parents[1] / "requirements.lock").read_text()
+    pins = re.split(r"^(?=[a-z])", lock, flags=re.MULTILINE)[1:]
+    assert len(pins) > 100
+    assert all(re.match(r"[\w.-]+==", pin) and "--hash=sha256:" in pin for pin in pins)
+    for file in (SETUP, SETUP.parents[1] / "Dockerfile"):
+        installs = [line for line in file.read_text().splitlines() if "-r requirements.lock" in line]
+        assert installs
+        assert all("--no-deps --require-hashes" in line for line in installs)
+
+
+def test_b02_an_older_torch_is_replaced_by_the_pinned_one(tmp_path):
+    """A `.venv` of an earlier version, with torch 2.9 and a pip that writes down what it is asked for."""
+    python = tmp_path / ".venv/bin/python"
+    python.parent.mkdir(parents=True)
+    python.write_text('#!/bin/bash\ncase "$*" in *torch.__version__*) echo 2.9.0 ;; *) echo "$*" >>calls ;; esac\n')
+    python.chmod(0o755)
+    program = f'source "{SETUP}"\ncd "{tmp_path}"\ninstall_python_packages >/dev/null\necho "$TORCH_VERSION"'
+    version = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True).stdout.strip()
+    assert tuple(map(int, version.split(".")[:2])) >= (2, 10)
+    assert f"torch=={version}" in (tmp_path / "calls").read_text()
+
+
 def test_the_code_that_names_the_renderer_runs():
     code = re.search(r"Renderer: \$\(\.venv/bin/python -c '(.*?)'\)", SETUP.read_text())
     found = subprocess.run([sys.executable, "-c", code[1]], capture_output=True, text=True, check=True)

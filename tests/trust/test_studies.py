@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
 import zipfile
+from contextlib import suppress
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from packaging.requirements import Requirement
 from baselines.studies import __main__ as study_command
 from baselines.studies.jobs import DONE, FAILED, STARTED, is_done, perform
 from baselines.studies.study import Job, StudyError, jobs_of, read_study
-from manifeel_ms3.command_line import PACKAGE
+from manifeel_ms3.command_line import INTERRUPTED, PACKAGE
 from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.ownership import owned
@@ -159,6 +161,36 @@ def test_b03_and_a13_ray_is_reached_from_here_alone_and_imports_nothing_from_the
     assert {address for address, _ in seen} <= LOOPBACK, seen
     assert refused.returncode != 0
     assert "uthentication" in refused.stderr, refused.stderr
+
+
+@pytest.mark.slow  # a whole Ray: a minute
+def test_a06_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, figure):
+    root = tmp_path / "root"
+    record, *_ = jobs_of(read_study(study))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "baselines.studies", study, "--root", root],
+        cwd=REPOSITORY,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite in the background ignores Ctrl-C
+    )
+    try:
+        until = time.monotonic() + PATIENCE
+        while not (record.folder(root) / STARTED).is_file():
+            assert process.poll() is None
+            assert time.monotonic() < until
+            time.sleep(0.2)
+        begin = time.monotonic()
+        os.killpg(process.pid, signal.SIGINT)
+        errors = process.communicate(timeout=PATIENCE)[1]
+        figure("seconds from Ctrl-C to the end of a study", time.monotonic() - begin, at_most=2.0)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert process.returncode == INTERRUPTED
+    assert re.search(r"0 of \d+ jobs are done and kept in .*root; the same command goes on", errors)
+    assert "Traceback" not in errors
 
 
 def test_b03_only_versions_of_ray_with_authentication_are_allowed():

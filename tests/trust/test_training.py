@@ -64,7 +64,7 @@ def require_equal(run_dir: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.slow)])
-def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, record_property):
+def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, figure):
     whole, seconds = undisturbed
     moments = random.Random(kills)
     killed, resumed, runs = 0, 0, 0
@@ -89,7 +89,8 @@ def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path
         process.join(PATIENCE)
         assert process.exitcode == 0
         require_equal(run_dir, whole)
-    record_property("counts", dict(killed=killed, resumed=resumed, runs=runs))
+    figure("kills of training", killed, at_least=kills)
+    figure("resumptions of training after a kill", resumed, at_least=1)
 
 
 @pytest.mark.parametrize("linked", [None, "00000038"])
