@@ -7,7 +7,7 @@ program and keeps its traceback. Each kind is also the built-in exception that a
 
 
 class ManifeelError(Exception):
-    """Something that was given cannot be used. The message says what was given, what was expected, and how to mend it."""
+    """Something that was given cannot be used. The message says what was given, what was expected, and how to fix it."""
 
 
 class InvalidArgumentError(ManifeelError, ValueError):

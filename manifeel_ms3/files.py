@@ -141,7 +141,7 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
     """The objects in a file that has one in each line, such as a log.
 
-    Lines that are no objects are left out, such as one that a process was killed in.
+    Lines that are no objects are left out, such as an incomplete one, left by a killed process.
 
     Args:
         path: Path of the file, which need not exist.
@@ -203,12 +203,17 @@ def _delete_abandoned(path: Path) -> None:
     """Delete what earlier writers of a file or folder left when they were killed."""
     for old in path.parent.glob(f".{escape(path.name)}.*-*{PARTIAL}"):
         writer = old.name.removeprefix(f".{path.name}.").partition("-")[0]
-        if writer.isdigit() and not _is_running(int(writer)):
+        if writer.isdigit() and not is_running(int(writer)):
             with suppress(OSError):
                 old.unlink() if old.is_file() else shutil.rmtree(old)
 
 
-def _is_running(process: int) -> bool:
+def is_running(process: int) -> bool:
+    """Whether this machine has a process of a number.
+
+    Args:
+        process: Number of the process.
+    """
     try:
         os.kill(process, 0)
     except ProcessLookupError:

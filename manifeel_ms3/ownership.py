@@ -16,6 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from .errors import InUseError, MachineError
+from .files import is_running
 
 
 @contextmanager
@@ -58,6 +59,8 @@ def _write_holder(path: Path) -> None:
 def _described(path: Path) -> str:
     try:
         holder = json.loads(path.read_text(encoding="utf-8"))
-        return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
-    except (OSError, ValueError, KeyError, TypeError):  # it has just begun, or has just ended
-        return "another process"
+        if holder["host"] != socket.gethostname() or is_running(holder["pid"]):
+            return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):  # it has just begun, or has just ended
+        pass
+    return "another process"

@@ -40,7 +40,7 @@ def cache_dir() -> Path:
         MachineError: The user has no home folder, and the variable is not set.
     """
     folder = Path(os.environ.get(CACHE_DIR) or platformdirs.user_cache_dir("manifeel_ms3"))
-    if folder.parts[0] == "~":  # what is left of a home folder that nobody knows
+    if folder.parts[0] == "~":  # it was not expanded: the user has no home folder
         raise MachineError(f"there is no home folder to keep derived files in; set {CACHE_DIR} to a folder that can be written")
     return folder
 

@@ -93,10 +93,10 @@ class Finished(Generic[Task]):
     task: Task
     """The task, as it was submitted."""
     future: "Future[Any]"
-    """What holds its result."""
+    """Future of the task's result."""
 
     def result(self) -> Any:
-        """What the function returned; what it raised is raised here.
+        """Return the function's result, or raise its exception.
 
         Raises:
             WorkerDiedError: The process ended before the function returned.

@@ -36,9 +36,9 @@ def test_the_order_of_the_packages_is_kept(copy):
 @pytest.mark.parametrize(
     ("file", "line", "contract"),
     [
-        ("manifeel_ms3/tasks/registry.py", "import baselines.registry", "The pack never imports the baselines"),
-        ("manifeel_ms3/sensors/config.py", "import manifeel_ms3.tasks.registry", "The rooms of the pack"),
-        ("baselines/common/policy.py", "import baselines.flow_matching.policy", "The rooms of the baselines"),
+        ("manifeel_ms3/tasks/registry.py", "import baselines.registry", "manifeel_ms3 never imports the baselines"),
+        ("manifeel_ms3/sensors/config.py", "import manifeel_ms3.tasks.registry", "Layers of manifeel_ms3"),
+        ("baselines/common/policy.py", "import baselines.flow_matching.policy", "Layers of the baselines"),
     ],
 )
 def test_a_forbidden_import_is_found(copy, file, line, contract):

@@ -125,7 +125,7 @@ class RunLog:
 
 
 def entries_until(log: Path, step: int) -> list[dict[str, float]]:
-    """The entries of a log up to a step; a line that a process was killed in is left out.
+    """The entries of a log up to a step; an incomplete line, left by a killed process, is left out.
 
     Args:
         log: Path of the log, which need not exist.

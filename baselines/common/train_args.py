@@ -16,7 +16,7 @@ from .observation import CameraView, PoseForm
 from .policy import PolicyConfig
 
 PUBLIC_CODE_LR = 1e-4
-"""Learning rate in the paper's public code, but for its Diffusion Policy; the paper's table has 8e-5 for all policies."""
+"""Learning rate in the paper's public code, except for Diffusion Policy; the paper's table has 8e-5 for all policies."""
 PAPER_EPOCHS = 50_000
 """Training epochs of the paper, summed over all demonstrations: with n demonstrations a policy trains 50,000 / n epochs."""
 ON_GPU = torch.cuda.is_available()

@@ -1,4 +1,4 @@
-"""What jobs cost on this machine, from jobs like them that were done here, or else from short trials."""
+"""Cost of jobs on this machine, estimated from similar jobs that were done here, or else from short trials."""
 
 import hashlib
 import json

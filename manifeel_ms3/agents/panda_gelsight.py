@@ -57,6 +57,10 @@ ABSOLUTE_RANGE_POS, ABSOLUTE_RANGE_ROT = 2.0, 2 * np.pi
 """Largest coordinate, in m, and angle, in rad, of an absolute action (ManiSkill's Panda)."""
 IMAGE_SIZE = 256
 """Width and height of the policy's cameras' images, in pixels (public code of the paper)."""
+FARTHEST = 10.0
+"""Largest distance that the cameras draw, in m."""
+WRIST_NEAREST = 0.005
+"""Smallest distance that the wrist camera draws, in m; the fingers are near it."""
 FIELD_OF_VIEW = np.deg2rad(75)
 """Field of view of the policy's cameras, in rad (public code of the paper)."""
 FIXED_GRIPPER = "_fixed_gripper"
@@ -197,8 +201,8 @@ class PandaGelSight(BaseAgent):
                 width=IMAGE_SIZE,
                 height=IMAGE_SIZE,
                 fov=FIELD_OF_VIEW,
-                near=0.005,
-                far=10,
+                near=WRIST_NEAREST,
+                far=FARTHEST,
                 mount=self.robot.links_map["panda_hand"],
                 shader_config=camera_shader(),
             )

@@ -12,6 +12,9 @@ from .matching import Found, answering
 from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
 from .presets import Setup
 
+SIGNIFICANCE = 0.05
+"""Value of p below which a gain is not called a matter of chance; the field's convention, as the intervals of 95 %."""
+
 TEXT = """
 ## What touch adds, and how episodes fail
 
@@ -55,7 +58,7 @@ def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) 
         gain, p_value = difference(found[conditions[mode]], found[conditions[VISION]])
     except ResultError:  # evaluated on other initial states
         return f"{NAMES[mode]} cannot be compared"
-    verdict = "" if p_value < 0.05 else ", which may be chance"
+    verdict = "" if p_value < SIGNIFICANCE else ", which may be chance"
     return f"{NAMES[mode]} adds {gain.signed}{verdict} ({papers})"
 
 

@@ -16,7 +16,7 @@ from .presets import PAPER, Setup
 TEXT = """
 ## The paper's tables
 
-A cell has our success with its interval of 95 %, and the paper's after the stroke; a number of ours links to its result file,
+A cell has our success with its interval of 95 %, and the paper's after the slash; a number of ours links to its result file,
 and what stands after ± is the standard deviation over training seeds, where there are several.
 Only conditions with the paper's number of demonstrations appear; each set-up has tables of its own. The paper contradicts
 itself on ball sorting: its list of set-ups has dim light alone, but Tables I and II report different rates for the same

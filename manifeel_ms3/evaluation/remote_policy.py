@@ -48,7 +48,7 @@ LONGEST_MESSAGE = 500
 """Characters of a server's error message that are shown; the rest, often a page of HTML, is cut off."""
 CONNECT_TIMEOUT = 10.0
 """Longest time in s to wait for a connection; at most half of the time for an answer. It is short, so that a server that cannot
-be reached is told from a policy that takes too long, whose time an evaluation limits itself."""
+be reached can be distinguished from a slow policy, which has a time limit of its own."""
 MAX_ANSWER = 2**20
 """Largest number of bytes of an answer that are read; an npz with one action has some hundreds."""
 MAX_HEADER = 256
@@ -198,7 +198,7 @@ class _Connects(HTTPConnection):
 
     def connect(self) -> None:
         answer = self.timeout
-        self.timeout = min(CONNECT_TIMEOUT, answer / 2)
+        self.timeout = CONNECT_TIMEOUT if answer is None else min(CONNECT_TIMEOUT, answer / 2)
         super().connect()
         self.timeout = answer
         self.sock.settimeout(answer)

@@ -243,7 +243,7 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 @contextmanager
 def _time_limit(seconds: float | None) -> Iterator[None]:
-    """Raise a PolicyFault after so many seconds; code that cannot be interrupted ends the process a little later."""
+    """Raise a PolicyFault after a number of seconds; code that cannot be interrupted ends the process a little later."""
     if seconds is None:
         yield
         return

@@ -16,7 +16,7 @@ STRAIGHT = Rotation.identity()
 class InsertionExpertConfig:
     """Constants of the demonstrator of the insertion tasks.
 
-    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
+    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over the seeds that it names.
     """
 
     grasp_error: float = float(np.deg2rad(0.5))

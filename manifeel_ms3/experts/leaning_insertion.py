@@ -15,7 +15,7 @@ from .skills import Actions, above
 class LeaningConfig(InsertionExpertConfig):
     """Constants of the demonstrator that leans the plug.
 
-    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
+    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over the seeds that it names.
     """
 
     feel_press: float = 2.0

@@ -31,7 +31,8 @@ class ObjectSearchExpertConfig:
     grasp_tolerance: float = 1.5e-3
     """Distance from the grasp position at which the fingers close, in m. Tuned."""
     crossing_height: float = 0.11
-    """Height of the tool over the table on the way from one place to the other, in m: no height of the way to the first one."""
+    """Height of the tool over the table on the way from one place to the other, in m; different from every
+    height on the way to the first place, so that a policy without memory can tell the two ways apart."""
     crossing_tolerance: float = 0.01
     """Distance from the middle of that way at which the hand goes on, in m. Tuned."""
     grip_steps: int = 6

@@ -16,7 +16,7 @@ from .skills import DOWNWARD, Actions, Skills, above, perceived_position, positi
 class ScrewingExpertConfig:
     """Constants of the demonstrators of the screwing tasks.
 
-    Values without another origin were tuned by hand; docs/tasks.md has the success of both tasks over seeds 0 to 99.
+    Values without another origin were tuned by hand; docs/tasks.md has the success of both tasks over the seeds that it names.
     """
 
     hover_height: float = 0.010

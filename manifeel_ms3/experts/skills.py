@@ -27,7 +27,7 @@ SMALLEST_NORM = 1e-9
 class SkillConfig:
     """Constants of the shared skills.
 
-    Values without another origin were tuned by hand; docs/tasks.md has the success of every demonstrator over seeds 0 to 99.
+    Values without another origin were tuned by hand; docs/tasks.md has the success of each demonstrator and its seeds.
     """
 
     move_gain: float = 0.4

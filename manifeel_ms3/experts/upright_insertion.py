@@ -16,7 +16,7 @@ from .skills import Actions, above
 class UprightConfig(InsertionExpertConfig):
     """Constants of the demonstrator that lowers the plug upright.
 
-    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over seeds 0 to 99.
+    Values without another origin were tuned by hand; docs/tasks.md has the success of every task over the seeds that it names.
     """
 
     keeps_hand: bool = True

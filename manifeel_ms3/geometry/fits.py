@@ -22,6 +22,11 @@ LEANS = (np.deg2rad(5.0), np.deg2rad(12.0))
 """Smallest and largest lean, in rad. Tuned."""
 
 
+UNSEATED_SHARE = 0.1
+"""Share of the depth that may be left for a plug to count as inserted: nine tenths of the way in. Our choice; the public code
+judges by key points instead."""
+
+
 @dataclass(frozen=True)
 class Lead:
     """A pair of faces, one of the plug and one of the socket, that is the first to meet from a certain depth on."""
@@ -31,7 +36,7 @@ class Lead:
     middle: tuple[float, float] = (0.0, 0.0)
     """Middle of the pair in the plug's frame, (x, y) in m: a contact beside it tells to which side the plug is off."""
     tells: tuple[float, float] = (1.0, 1.0)
-    """For x and for y, 1 if the place of a contact shows to which side the plug is off, 0 if it does not."""
+    """For x and for y, 1 if the place of a contact shows the direction of the plug's offset along that axis, else 0."""
     is_pin_below: bool = False
     """Whether the plug has the hole and the socket the pin."""
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, BRASS
 
 from . import materials
-from .fits import ABOVE_RIM, Fit, Lead
+from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .part import Box, Part, block_with_chamfered_holes, block_with_holes
 
 PEG_SIZE = (0.01196, 0.00791, 0.050)  # m
@@ -77,6 +77,6 @@ def reorientation_fit() -> Fit:
         grip_width=y,
         rim=RIM_BOTTOM + RIM_DEPTH,
         floor=RIM_BOTTOM,
-        max_gap=0.1 * RIM_DEPTH,
+        max_gap=UNSEATED_SHARE * RIM_DEPTH,
         **Fit.into_hole((x / 2, y / 2), (hole[0] / 2, hole[1] / 2)),
     )

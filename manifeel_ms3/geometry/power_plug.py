@@ -7,7 +7,7 @@ import numpy as np
 from manifeel_ms3.rendering import looks
 
 from . import materials
-from .fits import ABOVE_RIM, Fit, Lead
+from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
 ARC_POINTS = 8
@@ -41,7 +41,7 @@ class PowerPlugSizes:
     block: tuple[float, float, float]
     """The socket's block."""
     handle: tuple[float, float, float]
-    """What is held."""
+    """Size of the handle, which the fingers hold, in m."""
     head: tuple[float, float, float] | None = None
     """Broad body at the handle's end, within its length, from which the prongs come."""
 
@@ -109,7 +109,7 @@ def power_fit(fit: str = "paper") -> Fit:
         grip_width=sizes.handle[1],
         rim=rim,
         floor=floor,
-        max_gap=0.1 * sizes.blade[2],
+        max_gap=UNSEATED_SHARE * sizes.blade[2],
         goes_in_upright=fit == "paper",
         leads=(Lead(ABOVE_RIM, (sizes.offset / 2, 0.0)),),
         **Fit.into_hole((ground[0] / 2, ground[1] / 2), (hole[0] / 2, hole[1] / 2), (sizes.offset / 2, 0.0)),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from manifeel_ms3.rendering import looks
 
-from .fits import ABOVE_RIM, Fit, Lead
+from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
@@ -93,7 +93,7 @@ def usb_fit(fit: str = "paper") -> Fit:
         grip_width=HANDLE[1],
         rim=RIM,
         floor=floor,
-        max_gap=0.1 * sizes.port[2],  # nine tenths of the way in
+        max_gap=UNSEATED_SHARE * sizes.port[2],
         goes_in_upright=fit == "paper",
         leads=(
             Lead(ABOVE_RIM),

@@ -185,7 +185,7 @@ class TactileSensorConfig(BaseSensorConfig):
     optics: OpticsConfig = field(default_factory=OpticsConfig)
     """Optics, which make the image from the gel's surface."""
     housing: HousingConfig = field(default_factory=HousingConfig)
-    """Finger that carries the gel on the pack's own robot."""
+    """Finger that carries the gel on this package's robot."""
     backend: Literal["auto", "raycast", "sapien"] = "auto"
     """Source of depth: rays against the meshes, which need no renderer ("raycast", "auto"), or a SAPIEN camera in the pad."""
     units: Literal["newton", "tacsl"] = "newton"

@@ -1,4 +1,4 @@
-"""Every task, and all that the pack says of it: one `TaskSpec` a task.
+"""Every task, and all that this package says of it: one `TaskSpec` per task.
 
 A task registers itself with one decorator, which also makes its id known to `gym.make`:
 
@@ -32,7 +32,7 @@ PREFIX, SUFFIX = "ManiFeel-", "-v1"
 
 @dataclass
 class TaskSpec:
-    """All that the pack says of one task."""
+    """All that this package says of one task."""
 
     env_id: str
     """Id for `gym.make`, such as "ManiFeel-PegInsertion-v1"."""
@@ -57,7 +57,7 @@ class TaskSpec:
     """Largest contact force of a gentle success, in N: twice the median over demonstrations of their largest force. None if not
     known."""
     demo_steps: float | None = None
-    """Mean number of control steps of a demonstration, measured over seeds 0 to 99 (docs/tasks.md); None if not known."""
+    """Mean number of control steps of a demonstration, over the seeds that docs/tasks.md names; None if not known."""
     demonstrator: Callable[[Any, int], Any] | None = None
     """Makes a scripted demonstrator from an environment and a seed; attached by `register_demonstrator`."""
     probes: list[Any] = field(default_factory=list)
@@ -165,7 +165,7 @@ def make_env(env_id: str, **kwargs: Any) -> gym.Env:
 
 
 def all_tasks() -> dict[str, TaskSpec]:
-    """The specifications of all registered tasks by their ids: the pack's own in the paper's order, then those of plug-ins."""
+    """The specifications of all registered tasks by their ids: this package's in the paper's order, then those of plug-ins."""
     _load_plugins()
     return dict(_SPECS)
 
@@ -206,7 +206,7 @@ def short_name(env_id: str) -> str:
 
 
 def full_id(name: str) -> str:
-    """Id of one of the pack's own tasks: "ManiFeel-PegInsertion-v1" for "PegInsertion"."""
+    """Id of one of this package's tasks: "ManiFeel-PegInsertion-v1" for "PegInsertion"."""
     return f"{PREFIX}{name}{SUFFIX}"
 
 

@@ -10,7 +10,7 @@ import torch
 from mani_skill.sensors.camera import CameraConfig
 from sapien.physx import PhysxMaterial
 
-from manifeel_ms3.agents.panda_gelsight import FIELD_OF_VIEW, IMAGE_SIZE
+from manifeel_ms3.agents.panda_gelsight import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import Box, Part
@@ -33,8 +33,8 @@ FILM_CAMERA_AT, FILM_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
 """Place of the films' camera and the point that it looks at, base frame, in m. Chosen by eye."""
 FILM_FIELD_OF_VIEW = np.deg2rad(45)
 """Field of view of the films' camera, in rad. Chosen by eye."""
-NEAREST, FARTHEST = 0.01, 10.0
-"""Distances between which the cameras draw, in m."""
+NEAREST = 0.01
+"""Smallest distance that the cameras draw, in m."""
 TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
 TABLE_FRICTION = 0.5
 """Coulomb's coefficient."""

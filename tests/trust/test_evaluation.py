@@ -305,7 +305,7 @@ def test_b05_a_read_only_folder_is_named_before_the_first_episode():
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can be two users")
 def test_two_users_of_one_machine_take_turns_with_a_file():
-    """The second finds the lock and the name of the holder that the first left, which are the first user's."""
+    """The second finds the lock and the name of the holder that the first, killed, has left, and may not delete them."""
     with tempfile.TemporaryDirectory() as shared:
         Path(shared).chmod(0o1777)  # as /tmp: nobody may delete what is another's
         out = Path(shared) / "evaluation.json"
@@ -322,7 +322,8 @@ def test_two_users_of_one_machine_take_turns_with_a_file():
                             with owned(out):
                                 os._exit(3)
                         except InUseError as error:
-                            os._exit(0 if f"process {os.getpid()}" in str(error) else 4)
+                            named = f"process {os.getpid()}" if user == NOBODY else "another process"
+                            os._exit(0 if f"in use by {named}" in str(error) else 4)
                 finally:
                     os._exit(1)
             assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -1,4 +1,4 @@
-"""What the pack needs of a format in which demonstrations are stored."""
+"""What this package needs of a format in which demonstrations are stored."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

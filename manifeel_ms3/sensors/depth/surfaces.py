@@ -76,7 +76,7 @@ def entity_mesh(entity: sapien.Entity) -> trimesh.Trimesh | None:
         return None
     mesh = _joined(parts)
     if len(mesh.faces) == 0:
-        raise InvalidFileError(f"body {entity.name!r} has a mesh without triangles, which a pad cannot feel; mend its file")
+        raise InvalidFileError(f"body {entity.name!r} has a mesh without triangles, which a pad cannot feel; correct its file")
     return mesh
 
 

@@ -100,7 +100,7 @@ def fit_presses(
         )
     if (circles[:, 2] * pixel_size >= ball_radius).any():
         raise InvalidArgumentError(
-            f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball; mend ball_radius or pixel_size"
+            f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball; correct ball_radius or pixel_size"
         )
     row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
     place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
