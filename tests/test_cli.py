@@ -38,6 +38,10 @@ def test_a_command_runs(capsys):
     assert all(task in said for task in ("PegInsertion", "NutBoltAssembly", "BallSortingDim"))
     assert cli.main(["tasks", "PegInsertion"]) == 0
     assert "Success Conditions" in capsys.readouterr().out
+    assert cli.main(["tasks", "BallSortingDim"]) == 0
+    said = capsys.readouterr().out
+    assert "5 % of the light" in said
+    assert "Success Conditions" in said
     assert cli.main(["tasks", "Knitting"]) == 1
     said = capsys.readouterr().err
     assert "error: the task 'Knitting' is not registered; registered are" in said

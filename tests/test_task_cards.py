@@ -1,12 +1,14 @@
 """Each task has a page that is what its script makes, and a film that ManiSkill's tools can find."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import pytest
 
 from docs import make_task_cards
 from manifeel_ms3.tasks.insertion.base import InsertionRandomization
+from tests.links import missing_targets
 
 SPECS = make_task_cards.own_tasks()
 REPOSITORY = Path(__file__).parents[1]
@@ -38,6 +40,36 @@ def test_a_page_follows_the_code():
     assert "| `fit` | `'paper'` | `'paper'`, `'tight'` |" in card
     assert "Successes | Mean steps" in card
     assert "peg touches or not" in card
+
+
+def card_of(name: str) -> str:
+    return make_task_cards.card(next(spec for spec in SPECS if spec.name == name))
+
+
+def test_a_variant_of_a_task_is_described_as_fully_as_the_task():
+    card = card_of("BallSortingDim")
+    assert "BallSorting at 5 % of the light.\n\n" in card
+    assert all(f"**{what}" in card for what in ("Task Description:**", "Randomizations:**", "Success Conditions:**"))
+    lighting = [line for line in card.splitlines() if line.startswith("| `lighting` |")]
+    assert lighting == ["| `lighting` | `'dim'` | `'normal'`, `'dim'` |"]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_a_page_lists_the_results_of_its_task(spec):
+    """Each result of the page of results is in the page of its task, with a link that leads to the same file."""
+    results = (REPOSITORY / "docs/results.md").read_text()
+    rows = re.findall(rf"^\| {spec.name} revision {spec.revision} \|.*\]\((\S+)\)", results, flags=re.MULTILINE)
+    page = make_task_cards.card_path(spec)
+    after = page.read_text().partition("\n## Results\n\n")[2]
+    linked = [(page.parent / link).resolve() for link in re.findall(r"\]\((\S+\.json)\)", after)]
+    assert linked == [(REPOSITORY / "docs" / link).resolve() for link in rows]
+    assert ("No policy has been evaluated" in after) == (not rows)
+    assert not missing_targets(page)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_an_empty_line_precedes_each_heading(spec):
+    assert not re.search(r"[^\n]\n#", make_task_cards.card(spec))
 
 
 def test_each_field_has_its_documentation():
