@@ -13,7 +13,9 @@ from tests.conftest import needs_renderer
 
 @needs_renderer
 def test_a_machine_that_is_in_order():
-    findings = doctor.examine()
+    said = []
+    findings = doctor.examine(said.append)
+    assert said == [finding.what for finding in findings]  # each check was announced
     assert {finding.what for finding in findings} >= {
         "Python",
         "packages",
