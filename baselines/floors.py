@@ -128,5 +128,10 @@ def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
     return dict(policy="baselines.references:Untrained", policy_kwargs=kwargs, **observed)
 
 
+def next_step(_args: Args, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    return f"{made} has the floors; `manifeel results` shows them beside the results of trained policies"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

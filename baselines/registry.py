@@ -99,6 +99,11 @@ def policy_spec(name: str) -> PolicySpec:
     return known[name]
 
 
+def next_step(_args: TrainArgs, made: Path) -> str:
+    """What training made, and what one can do with it."""
+    return f"{made} is the trained policy; `manifeel eval --checkpoint {made}` evaluates it"
+
+
 def preset_cli(spec: PolicySpec, args: list[str] | None = None) -> Any:
     """Training arguments of a policy from the command line, which begins with a preset's name.
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from baselines.common.train_args import TrainArgs
-from baselines.registry import PolicySpec, all_policies
+from baselines.registry import PolicySpec, all_policies, next_step
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
 
@@ -47,11 +47,6 @@ def main(args: TrainArgs) -> Path:
     """Train the policy to which the arguments belong, and return the last checkpoint."""
     (spec,) = [spec for spec in all_policies().values() if type(args) is spec.args_class]
     return spec.train(args)
-
-
-def next_step(_args: TrainArgs, made: Path) -> str:
-    """What the command made, and what one can do with it."""
-    return f"{made} is the trained policy; `manifeel eval --checkpoint {made}` evaluates it"
 
 
 if __name__ == "__main__":

@@ -20,12 +20,14 @@ import cv2
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import training_demos
-from manifeel_ms3.tasks.registry import TaskSpec, all_tasks
+from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, description_of
 from manifeel_ms3.tasks.scenery import LIGHTING
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, VisuotactileEnv
 
 DOCS = Path(__file__).parent
 CARDS, FILMS, PICTURES = DOCS / "tasks", DOCS / "films", DOCS / "images" / "tasks"
+RESULT_COLUMNS = 14
+"""Number of columns of the table of docs/results.md that says what was run."""
 CAPTION = "The scene, front, side and wrist camera, left and right pad, at four fifths of a demonstration."
 
 
@@ -68,8 +70,8 @@ def _head(spec: TaskSpec) -> str:
 
 
 def _description(spec: TaskSpec) -> str:
-    """The documentation of the class, with an empty line before each of its lists, as Markdown wants it."""
-    lines = (inspect.getdoc(spec.env_class) or "").splitlines()
+    """The description of the task, with an empty line before each of its lists, as Markdown wants it."""
+    lines = description_of(spec.env_class).splitlines()
     spaced = [f"\n{line}" if line.startswith("- ") and lines[k - 1].startswith("**") else line for k, line in enumerate(lines)]
     return "\n".join(spaced) + "\n"
 
@@ -124,21 +126,21 @@ def field_documentation(config: type) -> dict[str, str]:
 def _arguments(spec: TaskSpec) -> str:
     """The arguments that make variants of a task: its own ones, and those of all tasks."""
     env: Any = spec.env_class
-    own = {}
-    for base in env.__mro__[: env.__mro__.index(VisuotactileEnv)]:
+    own: dict[str, Any] = {}
+    for base in reversed(env.__mro__[: env.__mro__.index(VisuotactileEnv)]):
         if "__init__" in vars(base):
             own |= {p.name: p.default for p in inspect.signature(base).parameters.values() if p.default is not p.empty}
-    rows = [(f"`{name}`", f"`{default!r}`", _values(env, name)) for name, default in own.items()]
-    rows.append(("`lighting`", "`'normal'`", ", ".join(f"`{name!r}`" for name in LIGHTING)))
-    if env.has_occluder:
-        rows.append(("`occlusion`", "`True`", "`True`, `False`"))
+    of_all_tasks = {"lighting": "normal"} | ({"occlusion": True} if env.has_occluder else {})
+    given = own | of_all_tasks | own  # a task's own default is the one that holds
+    rows = [(f"`{name}`", f"`{default!r}`", _values(env, name)) for name, default in given.items()]
     return f"## Variants\n\n{markdown_table(('Argument', 'Default', 'Values'), rows)}"
 
 
 def _values(env: Any, name: str) -> str:
-    """The allowed values of an argument, which are a class attribute or a constant of the task's module."""
+    """The allowed values of an argument: those of all tasks, a class attribute, or a constant of the task's module."""
     module: Any = inspect.getmodule(env)
-    values = getattr(env, f"{name}s", None) or getattr(module, f"{name.upper()}S", ())
+    of_all_tasks = {"lighting": tuple(LIGHTING), "occlusion": (True, False)}
+    values = of_all_tasks.get(name) or getattr(env, f"{name}s", None) or getattr(module, f"{name.upper()}S", ())
     return ", ".join(f"`{value!r}`" for value in values)
 
 
@@ -149,10 +151,19 @@ def _measured(spec: TaskSpec) -> str:
             names, rows = found
             source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
-    none = f"No policy has been evaluated on revision {spec.revision} of this task yet.\n"
-    results = f"\n| {spec.name} revision {spec.revision} |" in (DOCS / "results.md").read_text(encoding="utf-8")
-    parts.append(f"## Results\n\n{'See [the results](../results.md).' if results else none}")
-    return "\n".join(parts)
+    return "\n".join([*parts, _results(spec)])
+
+
+def _results(spec: TaskSpec) -> str:
+    """What was run on this revision of the task, without the columns that are empty."""
+    found = rows_of(DOCS / "results.md", f"{spec.name} revision {spec.revision}", RESULT_COLUMNS)
+    if not found:
+        return f"## Results\n\nNo policy has been evaluated on revision {spec.revision} of this task yet.\n"
+    names, rows = found
+    filled = [k for k in range(1, len(names)) if any(row[k] for row in rows)]
+    table = markdown_table([names[k] for k in filled], ([row[k].replace("](../", "](../../") for k in filled] for row in rows))
+    source = "From [results](../results.md), which says what the columns mean and how episodes fail.\n"
+    return f"## Results\n\n{source}\n{table}"
 
 
 def rows_of(page: Path, task: str, columns: int) -> tuple[list[str], list[list[str]]] | None:

@@ -8,6 +8,7 @@ import platform
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
@@ -54,9 +55,33 @@ class Finding:
     """What to do about it; empty if nothing is wrong."""
 
 
-def examine() -> list[Finding]:
-    """The findings of all checks."""
-    return [_python(), *_packages(), _gpu(), _simulation(), _images(), _disk(), _cache(), _threads()]
+def examine(on_check: Callable[[str], None] | None = None) -> list[Finding]:
+    """The findings of all checks.
+
+    Args:
+        on_check: Called before each check with what is checked; some take ten seconds.
+    """
+    findings = []
+    for what, check in _checks().items():
+        if on_check is not None:
+            on_check(what)
+        found = check()
+        findings += found if isinstance(found, list) else [found]
+    return findings
+
+
+def _checks() -> dict[str, Callable[[], Finding | list[Finding]]]:
+    """The checks, by what they check."""
+    return {
+        "Python": _python,
+        "packages": _packages,
+        "GPU": _gpu,
+        "a step with touch": _simulation,
+        "a step with images": _images,
+        "disk, here": _disk,
+        "cache": _cache,
+        "cores": _threads,
+    }
 
 
 def _python() -> Finding:
@@ -168,8 +193,10 @@ class Args:
 
 def main(_args: Args) -> int:
     """Print all findings, and return the number of those that are wrong."""
-    findings = examine()
-    Console().print(table(findings))
+    console = Console()
+    with console.status("") as status:
+        findings = examine(lambda what: status.update(f"checking: {what}"))
+    console.print(table(findings))
     return sum(finding.ok is False for finding in findings)
 
 

@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+import shutil
 import subprocess
 import sys
 from functools import partial
@@ -19,7 +20,7 @@ from manifeel_ms3.demonstrations.recording import next_step
 from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.conftest import PEG
-from tests.sample import observed_sample
+from tests.sample import observed_sample, states_sample
 
 
 def test_all_commands_are_listed(capsys):
@@ -38,6 +39,10 @@ def test_a_command_runs(capsys):
     assert all(task in said for task in ("PegInsertion", "NutBoltAssembly", "BallSortingDim"))
     assert cli.main(["tasks", "PegInsertion"]) == 0
     assert "Success Conditions" in capsys.readouterr().out
+    assert cli.main(["tasks", "BallSortingDim"]) == 0
+    said = capsys.readouterr().out
+    assert "5 % of the light" in said
+    assert "Success Conditions" in said
     assert cli.main(["tasks", "Knitting"]) == 1
     said = capsys.readouterr().err
     assert "error: the task 'Knitting' is not registered; registered are" in said
@@ -54,6 +59,45 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
     assert next_step(None, observed_sample(PEG)).endswith(
         f"--env-id {PEG} --obs-mode rgb+tacff --cameras wrist` trains a policy"
     )
+
+
+SAYS_IT_ALL = {"tasks", "doctor", "view", "teleop"}
+"""Commands that make nothing, or whose page or window says what they make."""
+
+
+@pytest.mark.parametrize("name", sorted(cli.all_commands()))
+def test_every_command_says_what_comes_next(name):
+    assert hasattr(cli.command_module(name), "next_step") == (name not in SAYS_IT_ALL)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["validate", str(states_sample(PEG))],
+        ["replay", str(states_sample(PEG)), "-n", "1"],
+        ["summary", str(states_sample(PEG))],
+        ["claims", "--results", "leaderboard/cpu"],
+        ["leaderboard", "build", "--board", "BOARD"],
+        ["study", "configs/smoke.yaml", "--print-commands"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_the_last_line_names_commands_that_exist(arguments, tmp_path, caplog):
+    shutil.copytree("leaderboard/cpu", tmp_path / "cpu", ignore=shutil.ignore_patterns("checkpoints"))
+    with caplog.at_level("INFO"):
+        assert cli.main([word.replace("BOARD", str(tmp_path)) for word in arguments]) == 0
+    last = caplog.messages[-1]
+    assert "`" in last or "browser" in last
+    for command, flags in re.findall(r"`manifeel (\S+)([^`]*)`", last):
+        assert command in cli.all_commands()
+        taken = tyro.extras.get_parser(cli.command_module(command).Args).format_help()
+        assert all(flag in taken for flag in re.findall(r"--[a-z-]+", flags)), last
+
+
+@pytest.mark.parametrize("policy", ["diffusion_policy", "flow_matching", "equivariant_diffusion_policy"])
+def test_training_by_script_ends_as_the_command_does(policy):
+    module = importlib.import_module(f"baselines.{policy}.train")
+    assert module.next_step is cli.command_module("train").next_step
 
 
 def test_training_without_a_preset_says_which_there_are(capsys):

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +14,9 @@ from tests.conftest import needs_renderer
 
 @needs_renderer
 def test_a_machine_that_is_in_order():
-    findings = doctor.examine()
+    said = []
+    findings = doctor.examine(said.append)
+    assert said == [finding.what for finding in findings]  # each check was announced
     assert {finding.what for finding in findings} >= {
         "Python",
         "packages",
@@ -58,6 +61,15 @@ def test_a_full_disk_and_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
     monkeypatch.setenv("MANIFEEL_CACHE_DIR", str(tmp_path / "file"))
     assert doctor._cache().ok is False
     assert "MANIFEEL_CACHE_DIR" in doctor._cache().remedy
+
+
+def test_the_page_about_trouble_shows_the_columns_and_the_checks_of_the_program():
+    page = (Path(__file__).parents[1] / "docs/troubleshooting.md").read_text()
+    heads = [cell.strip() for cell in next(line for line in page.splitlines() if line.startswith("┃")).split("┃")[1:-1]]
+    assert heads == [column.header for column in doctor.table([]).columns]
+    rows = ([cell.strip() for cell in line.split("│")[1:-1]] for line in page.splitlines() if line.startswith("│"))
+    shown = {row[1] for row in rows} - {""}
+    assert shown == set(doctor._checks())
 
 
 @pytest.mark.parametrize("here", [(3, 9), (3, 13)])

@@ -1,12 +1,15 @@
 """Each task has a page that is what its script makes, and a film that ManiSkill's tools can find."""
 
 import dataclasses
+import json
+import re
 from pathlib import Path
 
 import pytest
 
-from docs import make_task_cards
+from docs import make_task_cards, make_task_films
 from manifeel_ms3.tasks.insertion.base import InsertionRandomization
+from tests.links import missing_targets
 
 SPECS = make_task_cards.own_tasks()
 REPOSITORY = Path(__file__).parents[1]
@@ -30,6 +33,17 @@ def test_each_task_has_its_film(spec):
     assert (REPOSITORY / spec.env_class._sample_video_link).is_file()
 
 
+def test_the_films_show_the_samples_of_today():
+    shown = json.loads(make_task_films.SAMPLES.read_text())
+    assert set(shown) == {"film.webp"} | {f"{spec.name}.mp4" for spec in SPECS}
+    older = [film for film, hashes in shown.items() if hashes != make_task_films.hashes_of(tuple(hashes))]
+    assert older == [], "run `python -m docs.make_task_films`"
+
+
+def test_the_film_of_the_readme_is_small():
+    assert (REPOSITORY / "docs/images/film.webp").stat().st_size < 3e6
+
+
 def test_a_page_follows_the_code():
     spec = dataclasses.replace(SPECS[0], max_episode_steps=123, revision=77)
     card = make_task_cards.card(spec)
@@ -38,6 +52,36 @@ def test_a_page_follows_the_code():
     assert "| `fit` | `'paper'` | `'paper'`, `'tight'` |" in card
     assert "Successes | Mean steps" in card
     assert "peg touches or not" in card
+
+
+def card_of(name: str) -> str:
+    return make_task_cards.card(next(spec for spec in SPECS if spec.name == name))
+
+
+def test_a_variant_of_a_task_is_described_as_fully_as_the_task():
+    card = card_of("BallSortingDim")
+    assert "BallSorting at 5 % of the light.\n\n" in card
+    assert all(f"**{what}" in card for what in ("Task Description:**", "Randomizations:**", "Success Conditions:**"))
+    lighting = [line for line in card.splitlines() if line.startswith("| `lighting` |")]
+    assert lighting == ["| `lighting` | `'dim'` | `'normal'`, `'dim'` |"]
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_a_page_lists_the_results_of_its_task(spec):
+    """Each result of the page of results is in the page of its task, with a link that leads to the same file."""
+    results = (REPOSITORY / "docs/results.md").read_text()
+    rows = re.findall(rf"^\| {spec.name} revision {spec.revision} \|.*\]\((\S+)\)", results, flags=re.MULTILINE)
+    page = make_task_cards.card_path(spec)
+    after = page.read_text().partition("\n## Results\n\n")[2]
+    linked = [(page.parent / link).resolve() for link in re.findall(r"\]\((\S+\.json)\)", after)]
+    assert linked == [(REPOSITORY / "docs" / link).resolve() for link in rows]
+    assert ("No policy has been evaluated" in after) == (not rows)
+    assert not missing_targets(page)
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+def test_an_empty_line_precedes_each_heading(spec):
+    assert not re.search(r"[^\n]\n#", make_task_cards.card(spec))
 
 
 def test_each_field_has_its_documentation():

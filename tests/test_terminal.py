@@ -6,6 +6,15 @@ import sys
 import pytest
 import torch
 
+from tests.conftest import PEG, needs_renderer
+
+STEP_WITH_IMAGES = f"""
+import gymnasium as gym, manifeel_ms3
+env = gym.make("{PEG}", obs_mode="rgb+tacrgb+tacff")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+env.close()
+"""
 START_WARP = "import torch; from manifeel_ms3.sensors.warp_device import warp_device; print(warp_device(torch.device('cpu')))"
 
 
@@ -14,3 +23,13 @@ def test_touch_starts_without_a_complaint_about_a_missing_gpu():
     done = subprocess.run([sys.executable, "-c", START_WARP], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "cpu"
     assert done.stderr == ""
+
+
+@needs_renderer
+def test_a_step_with_images_says_only_why_the_first_one_takes_long():
+    """With the warnings that Python hides by default, too."""
+    command = [sys.executable, "-W", "default", "-c", STEP_WITH_IMAGES]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    others = [line for line in done.stderr.splitlines() if not line.startswith("Preparing the renderer on the CPU")]
+    assert others == []
+    assert done.stdout == ""

@@ -14,7 +14,7 @@ from baselines.common.encoders import IMAGE_ENCODERS
 from baselines.common.presets import for_cpu
 from baselines.common.train_args import PUBLIC_CODE_LR, TrainArgs
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
-from baselines.registry import PolicySpec, Preset, preset_cli
+from baselines.registry import PolicySpec, Preset, next_step, preset_cli
 from manifeel_ms3.command_line import run
 
 LR = 8e-5
@@ -51,4 +51,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, preset_cli(SPEC)))
+    sys.exit(run(main, preset_cli(SPEC), next_step))

@@ -14,7 +14,7 @@ from baselines.common.observation import PoseForm
 from baselines.common.presets import FINE, for_cpu
 from baselines.common.train_args import TrainArgs
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
-from baselines.registry import PolicySpec, Preset, preset_cli
+from baselines.registry import PolicySpec, Preset, next_step, preset_cli
 from manifeel_ms3.command_line import run
 
 
@@ -48,4 +48,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, preset_cli(SPEC)))
+    sys.exit(run(main, preset_cli(SPEC), next_step))

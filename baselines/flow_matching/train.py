@@ -15,7 +15,7 @@ from pathlib import Path
 from baselines.common.presets import for_cpu
 from baselines.common.train_args import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
-from baselines.registry import PolicySpec, Preset, preset_cli
+from baselines.registry import PolicySpec, Preset, next_step, preset_cli
 from manifeel_ms3.command_line import run
 
 
@@ -49,4 +49,4 @@ def main(args: Args) -> Path:
 
 
 if __name__ == "__main__":
-    sys.exit(run(main, preset_cli(SPEC)))
+    sys.exit(run(main, preset_cli(SPEC), next_step))

@@ -99,7 +99,7 @@ def main(args: Args) -> None:
         return
     if args.publish:
         count = publish(jobs, args.root, args.publish, args.name or study.name, args.authors)
-        console.print(f"{args.publish} has {count} results; `manifeel leaderboard build` makes the page of the leaderboard")
+        console.print(f"{args.publish} has {count} results")
         return
     _require_writable(args.root)
     if args.dry_run:
@@ -117,8 +117,6 @@ def main(args: Args) -> None:
             raise
     failed = [job for job in jobs if not is_done(job, args.root)]
     console.print(f"{len(jobs) - len(failed)} of {len(jobs)} jobs of {args.study} are done, in {args.root}")
-    if not failed:
-        console.print(f"`manifeel results --results {args.root} --out results.md` sets them beside the paper's", soft_wrap=True)
     if failed:
         reasons = "\n".join(f"  {job.kind}: {job.title}: {_reason(job, args.root, errors)}" for job in failed)
         raise StudyFailed(f"{len(failed)} jobs are not done; give the same command to try them again:\n{reasons}")
@@ -298,5 +296,18 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
     return table
 
 
+def next_step(args: Args, _answer: None) -> str:
+    """What the command made, and what one can do with it."""
+    if args.print_commands:
+        return f"these commands do by hand what `manifeel study {args.study} --root {args.root}` does"
+    if args.dry_run:
+        return f"nothing was run; `manifeel study {args.study} --root {args.root}` runs what is left"
+    if args.publish:
+        return f"{args.publish} is a submission; `manifeel leaderboard build` makes the page of the leaderboard"
+    return (
+        f"{args.root} has all results; `manifeel results --results {args.root} --out results.md` sets them beside the paper's"
+    )
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -126,6 +126,16 @@ class PandaGelSight(BaseAgent):
     def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return panda_gelsight_urdf(self.scene.can_render(), self.finger)
 
+    def set_action(self, action: torch.Tensor) -> None:
+        """Pass an action on to the controller, as ManiSkill does, which warns of NumPy 2 where it looks for NaN in a tensor.
+
+        Raises:
+            ValueError: The action has a NaN, in a simulation on the CPU.
+        """
+        if not self.scene.gpu_sim_enabled and torch.isnan(torch.as_tensor(action)).any():
+            raise ValueError("Action cannot be NaN. Environment received:", action)
+        self.controller.set_action(action)
+
     @property
     def _controller_configs(self):
         drive = dict(

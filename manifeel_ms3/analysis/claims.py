@@ -129,5 +129,12 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
     return results_of_claims(found)
 
 
+def next_step(args: Args, _answers: dict[Comparison, list[ClaimResult]]) -> str:
+    """What the command made, and what one can do with it."""
+    results = " ".join(map(str, args.results))
+    made = f"{args.out} has this table" if args.out else "--out FILE.md writes this table to a file"
+    return f"{made}; `manifeel results --results {results} --out results.md` makes the page with it and all other results"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

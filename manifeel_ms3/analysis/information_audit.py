@@ -341,5 +341,11 @@ def _recorded_tasks(demos: Path) -> Iterator[tuple[Path, TaskSpec]]:
             log.warning("%s is left out: %s holds no recording with observations", spec.env_id, folder)
 
 
+def next_step(args: Args, _results: list[ProbeResult]) -> str:
+    """What the command made, and what one can do with it."""
+    trained = "`manifeel train` shows what a policy makes of it"
+    return f"{args.out} has the table in audit.md, its numbers in audit.json and the figure in audit.png; {trained}"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -23,7 +23,7 @@ itself on ball sorting: its list of set-ups has dim light alone, but Tables I an
 policies; here, Tables II and III are run in both lights.
 """
 NEEDS_GPU = """
-Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` foretells their hours on yours.
+Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` estimates their hours on yours.
 """
 HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
 PANEL = (11.0, 4.2)

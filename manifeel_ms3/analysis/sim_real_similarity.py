@@ -331,5 +331,11 @@ def _resnet(name: str) -> Features:
     return extract
 
 
+def next_step(args: Args, _result: Similarity) -> str:
+    """What the command made, and what one can do with it."""
+    beside = f"`manifeel results --results {args.out} FOLDER --out results.md` sets them beside the paper's"
+    return f"{args.out} has the distances in similarity.json and the nearest images in nearest.png; {beside}"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

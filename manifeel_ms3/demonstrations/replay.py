@@ -113,5 +113,12 @@ def main(args: Args) -> int:
     return int(bool(failures))
 
 
+def next_step(args: Args, failed: int) -> str:
+    """What the command found, and what one can do next."""
+    if failed:
+        return f"{args.path} does not repeat on this machine; `manifeel validate {args.path}` checks whether the file is sound"
+    return f"{args.path} repeats on this machine; `manifeel film {args.path} --out FILE.mp4` shows an episode"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -131,5 +131,10 @@ def _size_table(sizes: dict[str, int], episodes: int) -> Table:
     return table
 
 
+def next_step(args: Args, _answer: None) -> str:
+    """What one can do with the file."""
+    return f"`manifeel validate {args.file}` checks the file, `manifeel film {args.file} --out FILE.mp4` shows an episode"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -117,5 +117,12 @@ def main(args: Args) -> int:
     return int(bool(problems))
 
 
+def next_step(args: Args, wrong: int) -> str:
+    """What the command found, and what one can do next."""
+    if wrong:
+        return f"{args.path} is not in order; get it again from its source, or record it again with `manifeel record`"
+    return f"{args.path} is in order; `manifeel summary FILE` describes a file, `manifeel train` trains a policy on it"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -128,5 +128,17 @@ def _sources(submission: Submission, args: Submit) -> dict[Path, PolicySource]:
     )
 
 
+def next_step(args: Hash | Submit | Build, made: Path) -> str:
+    """What the command made, and what one can do with it."""
+    if isinstance(args, Hash):
+        checkpoints = " ".join(map(str, args.checkpoint))
+        return f"{made} names them; `manifeel leaderboard submit {args.folder} --checkpoint {checkpoints}` checks and takes it"
+    if isinstance(args, Build):
+        return f"{made} is a page to open in a browser"
+    if args.check_only:
+        return f"{made} is not taken yet; the same command without --check-only takes it"
+    return f"{made} is on the leaderboard; `manifeel leaderboard build --board {args.board}` makes its page anew"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

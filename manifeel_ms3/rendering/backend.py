@@ -71,6 +71,18 @@ def announce_first_image(backend: str) -> None:
 
 
 @functools.cache
+def announce_first_images_of_workers(asked: str = "auto") -> None:
+    """Say the same once of worker processes that are about to render, without starting a renderer in this process.
+
+    Args:
+        asked: The `render_backend` of their environments.
+    """
+    on_cpu = asked == "cpu" or (asked == "auto" and not torch.cuda.is_available())
+    if on_cpu and multiprocessing.parent_process() is None:
+        log.warning("Preparing the renderer on the CPU, once in each worker process; this takes about 10 seconds.")
+
+
+@functools.cache
 def _first_that_works() -> str:
     candidates = ["gpu"] * torch.cuda.is_available() + ["cpu"]
     for backend in candidates:

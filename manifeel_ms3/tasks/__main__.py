@@ -12,7 +12,7 @@ from rich.table import Table
 
 from manifeel_ms3.command_line import run
 
-from .registry import PREFIX, SUFFIX, all_tasks, task_spec
+from .registry import PREFIX, SUFFIX, all_tasks, description_of, task_spec
 
 
 @dataclass
@@ -37,7 +37,7 @@ def main(args: Args) -> None:
         Console().print(table)
         return
     spec = task_spec(args.task)
-    Console().print(Markdown(f"# {spec.env_id}\n\n{inspect.getdoc(spec.env_class)}"))
+    Console().print(Markdown(f"# {spec.env_id}\n\n{description_of(spec.env_class)}"))
 
 
 def _summary(env_class: type) -> str:

@@ -1,8 +1,11 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
+from typing import Any
+
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.rendering.backend import announce_first_images_of_workers
 
 PAD = "tactile_"
 """Start of the names of tactile pads among the sensors of an observation."""
@@ -10,6 +13,22 @@ TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 STATE_TOKENS = ("state", "state_dict")
 WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")
 """ManiSkill's names of whole modes; "rgbd" and "pointcloud" may be joined with touch."""
+
+
+def has_images(own_mode: str) -> bool:
+    """Whether ManiSkill's own part of an `obs_mode` holds images of cameras."""
+    return own_mode not in ("none", "state", "state_dict")
+
+
+def announce_images_of_workers(env_kwargs: dict[str, Any]) -> None:
+    """Say, before worker processes make environments with these arguments, why their first image takes long, if it does.
+
+    Raises:
+        InvalidArgumentError: The `obs_mode` is not allowed.
+    """
+    own_mode, _ = split_obs_mode(env_kwargs.get("obs_mode") or "state")
+    if has_images(own_mode):
+        announce_first_images_of_workers(env_kwargs.get("render_backend", "auto"))
 
 
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:

@@ -10,6 +10,7 @@ a task: its demonstrator (`register_demonstrator`), and questions of the informa
 tasks are found through the entry point group `manifeel.tasks`.
 """
 
+import inspect
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -27,6 +28,8 @@ Class = TypeVar("Class", bound=type)
 Demonstrator = TypeVar("Demonstrator", bound=Callable[..., Any])
 FIRST_EVALUATION_SEED = 100_000
 """Episodes from this seed on are for evaluation, as in the paper's public code; demonstrations use the seeds below it."""
+DESCRIPTION = "**Task Description:**"
+"""What introduces the description in the docstring of a task's class."""
 PREFIX, SUFFIX = "ManiFeel-", "-v1"
 
 
@@ -149,6 +152,13 @@ def instruction_of(env_class: type) -> str:
     """The instruction of the task that a class, or the nearest of its base classes, was registered for; "" if none was."""
     sentences = {spec.env_class: spec.instruction for spec in _SPECS.values()}
     return next((sentences[one] for one in env_class.__mro__ if one in sentences), "")
+
+
+def description_of(env_class: type) -> str:
+    """The documentation of a task's class; if it only says how it differs from its base class, that of the base class, too."""
+    documented = [inspect.cleandoc(base.__doc__ or "") for base in env_class.__mro__]
+    described = (k for k, said in enumerate(documented) if DESCRIPTION in said)
+    return "\n\n".join(documented[: next(described, 0) + 1])
 
 
 def make_env(env_id: str, **kwargs: Any) -> gym.Env:

@@ -28,7 +28,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
-from .obs_modes import PAD, split_obs_mode
+from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
 from .states import is_part_of, unflattened
@@ -178,12 +178,12 @@ class VisuotactileEnv(SceneryEnv):
     def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
         if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):
             raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
-        if self._wanted_images(own_mode, None):
+        if has_images(own_mode):
             announce_first_image(backend)
 
     @staticmethod
     def _wanted_images(own_mode: str, render_mode: str | None) -> str:
-        if own_mode not in ("none", "state", "state_dict"):
+        if has_images(own_mode):
             return f"obs_mode={own_mode!r}"
         return f"render_mode={render_mode!r}" if render_mode else ""
 

@@ -87,7 +87,6 @@ def main(args: Args) -> int:
         sign = "at least" if check.at_least else "at most"
         state = "ok    " if check.holds else "BROKEN"
         log.info("%s %s: %.3g %s (%s %g)", state, check.claim, check.worst, check.unit, sign, check.bound)
-    log.info("%s", args.report)
     return sum(not check.holds for check in checks)
 
 
@@ -169,5 +168,12 @@ def _draw_forces(axis: Any, found: Measurements) -> None:
     axis.legend(fontsize=7)
 
 
+def next_step(args: Args, broken: int) -> str:
+    """What the command made, and what one can do with it."""
+    tasks = f"`manifeel record TASK --sensor {args.sensor}` records with this sensor"
+    outcome = "its broken bounds say what to change in the sensor" if broken else f"every bound holds, and {tasks}"
+    return f"{args.report} is a page to open in a browser; {outcome}"
+
+
 if __name__ == "__main__":
-    sys.exit(run(main, tyro.cli(Args)))
+    sys.exit(run(main, tyro.cli(Args), next_step))

@@ -280,6 +280,7 @@ def test_two_processes_train_one_policy(run, tmp_path):
         [*command, "baselines/diffusion_policy/train.py", *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
+    assert "`manifeel eval --checkpoint " in done.stderr  # the end says what comes next
     losses = [entry["losses/total_loss"] for entry in log_of(tmp_path)]
     assert len(losses) == 3
     assert losses[-1] < 0.8 * losses[0]

@@ -1,0 +1,23 @@
+"""A hook of mkdocs: the site gets files from outside of docs, to which its pages link: the leaderboard and the notebook."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[1]
+PUBLISHED = (".html", ".json")
+NOTEBOOK = "examples/quickstart.ipynb"
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """The first page lies one folder deeper in the repository than on the site; its link to the notebook fits both."""
+    return markdown.replace(f"](../{NOTEBOOK})", f"]({NOTEBOOK})") if page.is_homepage else markdown
+
+
+def on_post_build(config: Any) -> None:
+    """Copy the leaderboard and the notebook beside the pages of the built site."""
+    board = (path for path in (REPOSITORY / "leaderboard").rglob("*") if "checkpoints" not in path.parts)
+    for path in (REPOSITORY / NOTEBOOK, *(path for path in board if path.suffix in PUBLISHED)):
+        copy = Path(config["site_dir"]) / path.relative_to(REPOSITORY)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
