@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import OpticsConfig, TactileSensorConfig
 
 from .loads import Measurements
@@ -12,7 +13,7 @@ from .published_colours import worst_similarity
 FORCE_BOUND = 0.01
 """Largest relative error of the force field's sums."""
 CENTRE_BOUND = 0.5e-3
-"""Largest distance of the centre of pressure from the load's, in m."""
+"""Largest distance of the centre of pressure from the load's, and of the moment over the load, in m."""
 LOOP_BOUND = 0.01
 """Largest area between loading and unloading, as a share of the area under the loading curve."""
 DEPTH_BOUND = 2e-5
@@ -40,12 +41,19 @@ class Check:
 
 
 def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
-    """The checks of a sensor."""
+    """The checks of a sensor; a claim of which nothing was measured is left out.
+
+    Raises:
+        InvalidArgumentError: The gel carries none of the loads.
+    """
+    if not found.readings:
+        raise InvalidArgumentError(f"nothing was measured: {'; '.join(found.left_out)}; choose other --loads")
     normal = [abs(r.reported[0] / r.applied[0] - 1) for r in found.readings]
     shear = [np.abs(r.reported[1:3] - r.applied[1:3]).max() / r.applied[0] for r in found.readings]
     pad = [np.abs(r.reported[:3] - r.on_pad[:3]).max() / r.applied[0] for r in found.readings]
-    twist = [abs(r.reported[3] - r.on_pad[3]) / r.applied[0] for r in found.readings]
-    centre = [r.centre_error for r in found.readings]
+    moment = [abs(r.reported[3] - r.applied[3]) / r.applied[0] for r in found.readings]
+    balls = [r.centre_error for r in found.readings if r.is_ball]
+    others = [r.centre_error for r in found.readings if not r.is_ball]
     depth = np.abs(found.depths[:, 1] - found.depths[:, 2])
     checks = [
         Check("normal force: sum of the field against the load applied", 100 * max(normal), 100 * FORCE_BOUND, "%"),
@@ -55,8 +63,9 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
         Check(
             "force: sums of the field against the force on the pad, of the normal load", 100 * max(pad), 100 * FORCE_BOUND, "%"
         ),
-        Check("moment about the normal: error over the normal load", 1e3 * max(twist), 1e3 * CENTRE_BOUND, "mm"),
-        Check("centre of pressure", 1e3 * max(centre), 1e3 * CENTRE_BOUND, "mm"),
+        Check("moment about the normal against the moment applied, over the load", 1e3 * max(moment), 1e3 * CENTRE_BOUND, "mm"),
+        *_centre("centre of pressure of balls against the ball's middle", balls),
+        *_centre("centre of pressure of box, plate and rod against the force on the pad", others),
         Check("loading and unloading: area of the loop", 100 * loop_area(found.loop), 100 * LOOP_BOUND, "%"),
         Check("depth of a ball against the law of the gel layer", 1e3 * float(depth.max()), 1e3 * DEPTH_BOUND, "mm"),
     ]
@@ -66,6 +75,11 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
         )
         checks.append(similarity)
     return checks
+
+
+def _centre(claim: str, errors: list[float]) -> list[Check]:
+    """The check of distances, m, of the centre of pressure, if there are any."""
+    return [Check(claim, 1e3 * max(errors), 1e3 * CENTRE_BOUND, "mm")] if errors else []
 
 
 def loop_area(loop: np.ndarray) -> float:

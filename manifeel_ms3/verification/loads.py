@@ -48,15 +48,21 @@ class Reading:
 
     shape: str
     applied: np.ndarray
-    """The load that pushes the object, (4,)."""
+    """The load that pushes the object, (4,); its moment is about the pad's origin."""
     on_pad: np.ndarray
     """The load that the engine carries through the pad's joint, (4,)."""
     reported: np.ndarray
     """The sums over the force field, (4,)."""
     centre_error: float
-    """Distance of the field's centre of pressure from the load's, m."""
+    """Distance of the field's centre of pressure, m: for a ball from its middle, for others from that of the force on the
+    pad, since their tilt is locked, so that only the engine knows where its force acts."""
     penalty_sum: float
     """Sum of the normal components of the field with units="tacsl", m."""
+
+    @property
+    def is_ball(self) -> bool:
+        """Whether the shape is a ball."""
+        return _is_ball(self.shape)
 
 
 @dataclass(frozen=True)
@@ -119,9 +125,13 @@ def measure(
     return found
 
 
+def _is_ball(name: str) -> bool:
+    return name.startswith("ball")
+
+
 def largest_load(press: Press, name: str) -> float:
     """Largest load, N, that the engine's gel carries: a ball has one contact point, and would reach the housing."""
-    stiffness = GEL_STIFFNESS / 2 * (1 if name.startswith("ball") else 4)  # PhysX averages it with the other body's 0
+    stiffness = GEL_STIFFNESS / 2 * (1 if _is_ball(name) else 4)  # PhysX averages it with the other body's 0
     return 0.9 * stiffness * press.sensor.config.housing.protrusion
 
 
@@ -132,17 +142,17 @@ def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]
         if load > largest_load(press, name):
             left_out.append(f"{name} at {load:g} N: it would reach the housing")
             continue
-        twist = 0.0 if name.startswith("ball") else TWIST_ARM * load  # a ball on a point contact would spin
-        applied = np.array([load, *(share * load for share in SHEAR_SHARES), twist])
+        twist = 0.0 if _is_ball(name) else TWIST_ARM * load  # a ball on a point contact would spin
         press.place(touching + CLEARANCE, *PLACE)
-        press.push(*applied)
+        press.push(load, *(share * load for share in SHEAR_SHARES), twist)
         if press.slid > MOST_SLIDING:
             left_out.append(f"{name} at {load:g} N: it slid by {1e3 * press.slid:.0f} mm in the engine")
             continue
         penalty.reset(torch.arange(1))
         penalty.capture()
         indented = penalty.get_obs()["force_field"][..., 0].sum().item()
-        yield Reading(name, applied, press.wrench, press.sums, press.centre_error, indented)
+        centre_error = press.ball_error if _is_ball(name) else press.centre_error
+        yield Reading(name, press.applied, press.wrench, press.sums, centre_error, indented)
 
 
 def _picture(press: Press, name: str, touching: float) -> Picture:
