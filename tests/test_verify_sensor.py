@@ -12,7 +12,7 @@ from manifeel_ms3.sensors import GelConfig
 from manifeel_ms3.sensors.registry import task_sensor
 from manifeel_ms3.verification.__main__ import Args, main
 from manifeel_ms3.verification.checks import Check, checks_of, loop_area
-from manifeel_ms3.verification.loads import SHAPES, ball_depth, measure
+from manifeel_ms3.verification.loads import KNOWN_LIMITS, SHAPES, ball_depth, measure
 
 pytest.importorskip("jinja2")
 
@@ -22,6 +22,7 @@ def two_shapes(monkeypatch):
     """A box and a ball, so that it takes seconds."""
     for name in [name for name in SHAPES if name not in ("ball, 10 mm", "box, 8 x 10 mm")]:
         monkeypatch.delitem(SHAPES, name)
+    monkeypatch.delitem(KNOWN_LIMITS, "edge of a box")
     monkeypatch.setattr("manifeel_ms3.verification.loads.LOOP_LOADS", (5.0, 10.0))
     monkeypatch.setattr("manifeel_ms3.verification.loads.DEPTH_LOADS", (3.0,))
     monkeypatch.setattr("manifeel_ms3.verification.__main__.COLOURS", ("red", "blue"))
@@ -35,6 +36,8 @@ def test_a_sound_sensor_has_a_page_and_exit_code_0(two_shapes, tmp_path):
         assert wanted in text
     assert text.count(">holds<") == 8  # no published colours of a DIGIT
     assert ">broken<" not in text
+    row = text[text.index("<td>centre of pressure, post, 4 mm at 10 N") :]
+    assert ">known limit<" in row[: row.index("</tr>")]  # shown without a bound
     assert not re.search(r'(src|href)="http', text)  # needs nothing else
 
 
@@ -87,6 +90,7 @@ def test_value_that_is_no_number_breaks_a_bound():
     assert not Check("", float("nan"), 1.0, "").holds
     assert not Check("", float("nan"), 1.0, "", at_least=True).holds
     assert Check("", 0.95, 0.9, "", at_least=True).holds
+    assert Check("", 1e9, None, "mm").holds  # a known limit is not judged
 
 
 def test_area_of_a_loop():

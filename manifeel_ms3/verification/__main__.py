@@ -84,11 +84,17 @@ def main(args: Args) -> int:
     checks = checks_of(found, config)
     write_text(args.report, page(args.sensor, tactile | imperfections, found, checks))
     for check in checks:
-        sign = "at least" if check.at_least else "at most"
-        state = "ok    " if check.holds else "BROKEN"
-        log.info("%s %s: %.3g %s (%s %g)", state, check.claim, check.worst, check.unit, sign, check.bound)
+        log.info("%s", _line(check))
     log.info("%s", args.report)
     return sum(not check.holds for check in checks)
+
+
+def _line(check: Check) -> str:
+    """A check as one line of text."""
+    measured = f"{check.claim}: {check.worst:.3g} {check.unit}"
+    if check.bound is None:
+        return measured
+    return f"{'ok    ' if check.holds else 'BROKEN'} {measured} ({'at least' if check.at_least else 'at most'} {check.bound:g})"
 
 
 def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list[Check]) -> str:
@@ -107,7 +113,7 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
         figure=Markup(figure(found)),
         strip=_strip(found),
         names=[picture.shape for picture in found.pictures],
-        readings=found.readings,
+        readings=found.readings + found.limits,
         left_out=found.left_out,
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import OpticsConfig, TactileSensorConfig
 
-from .loads import Measurements
+from .loads import Measurements, Reading
 from .published_colours import worst_similarity
 
 FORCE_BOUND = 0.01
@@ -29,7 +29,8 @@ class Check:
     claim: str
     worst: float
     """Worst value that was measured."""
-    bound: float
+    bound: float | None
+    """Bound that the worst value must keep; none for a known limit, which is shown and not judged."""
     unit: str
     at_least: bool = False
     """Whether the value must be at least the bound; otherwise at most."""
@@ -37,6 +38,8 @@ class Check:
     @property
     def holds(self) -> bool:
         """Whether the bound is kept; a value that is no number breaks it."""
+        if self.bound is None:
+            return True
         return bool(self.worst >= self.bound if self.at_least else self.worst <= self.bound)
 
 
@@ -74,7 +77,15 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
             "colours against the published calibration, SSIM", worst_similarity(config), SIMILARITY_BOUND, "", True
         )
         checks.append(similarity)
-    return checks
+    return checks + _known_limits(found.limits)
+
+
+def _known_limits(readings: list[Reading]) -> list[Check]:
+    """The errors of the centre of pressure that no bound holds."""
+    return [
+        Check(f"known limit: centre of pressure, {r.shape} at {r.applied[0]:g} N", 1e3 * r.centre_error, None, "mm")
+        for r in readings
+    ]
 
 
 def _centre(claim: str, errors: list[float]) -> list[Check]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.optimize import brentq
+from trimesh.transformations import rotation_matrix
 
 from manifeel_ms3.agents.panda_gelsight import GEL_STIFFNESS
 from manifeel_ms3.sensors import TactileSensor, with_options
@@ -40,6 +41,21 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "plate, 12 x 16 mm": (dict(half_size=[0.006, 0.008, 0.004]), 0.004),
 }
 """Indenters: arguments of `indenter`, and the height of the body's origin over the face when it touches, in m."""
+KNOWN_LIMITS: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
+    "edge of a box": (
+        dict(half_size=[0.006, 0.004, 0.004], rotation=rotation_matrix(np.pi / 4, [1, 0, 0])),
+        0.004 * np.sqrt(2),
+        (0.1, 0.3),
+    ),
+    "post, 4 mm": (
+        dict(radius=0.004, half_length=0.004, rotation=rotation_matrix(np.pi / 2, [0, 1, 0])),
+        0.004,
+        (10.0,),
+    ),
+}
+"""Shapes whose centre of pressure is read less exactly, as in `SHAPES`, and the loads, in N, under which it is.
+
+The engine's moment there is more than the shape can carry on the gel within the sensor's largest tilt, 5 degrees."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +102,8 @@ class Measurements:
     """Loading and unloading (n, 2): applied and reported normal force, N."""
     depths: np.ndarray
     """A ball in the middle of the pad (n, 3): load in N, depth, and depth by the law of the layer, m."""
+    limits: list[Reading] = field(default_factory=list)
+    """Readings of `KNOWN_LIMITS`."""
     left_out: list[str] = field(default_factory=list)
     """Loads that were left out, and why."""
 
@@ -121,6 +139,10 @@ def measure(
             found.loop = _loop(press, touching)
         if name == "ball, 10 mm":
             found.depths = _depths(press, touching)
+        press.close()
+    for name, (shape, touching, few) in KNOWN_LIMITS.items():
+        press = Press(indenter(name, **shape), **arguments)
+        found.limits += _readings(press, name, touching, few, found.left_out)
         press.close()
     return found
 
