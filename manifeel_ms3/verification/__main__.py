@@ -142,9 +142,7 @@ def figure(found: Measurements) -> str:
         for k, mark in ((1, "o"), (2, "s")):
             axes[0, 2].plot([r.applied[k] for r in rows], [r.reported[k] for r in rows], mark, color=colour, ms=4)
         axes[1, 0].plot([1e3 * r.applied[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=4)
-    axes[0, 1].set(
-        title="centre of pressure", xlabel="normal load, N", ylabel="off: balls, their middle; others, force on the pad, mm"
-    )
+    axes[0, 1].set(title="centre of pressure", xlabel="normal load, N", ylabel="distance, mm")
     axes[0, 2].set(title="shear: rows (dots), columns (squares)", xlabel="applied, N", ylabel="reported, N")
     axes[1, 0].set(title="moment about the normal", xlabel="applied, N mm", ylabel="reported, N mm")
     for axis in (axes[0, 2], axes[1, 0]):

@@ -1,17 +1,15 @@
 """The package with one sensor that docs/sensor.md shows, installed as a third party's."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.third_party import install
+from tests.third_party import install, own_sensor
 
 REPOSITORY = Path(__file__).parents[2]
-PAGE = (REPOSITORY / "docs/sensor.md").read_text()
 TOUCH = """
 import gymnasium, manifeel_ms3
 from manifeel_ms3.sensors import sensor_names
@@ -33,9 +31,7 @@ def python(site: Path, code: str) -> subprocess.CompletedProcess:
 @pytest.fixture
 def page() -> tuple[str, str]:
     """Entry points and module of the page."""
-    (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", PAGE, flags=re.DOTALL)
-    (module,) = re.findall(r"```python\n# my_sensors.py\n(.*?)```", PAGE, flags=re.DOTALL)
-    return re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', ""), module
+    return own_sensor()
 
 
 def test_a_sensor_of_another_package_is_on_the_robot(tmp_path, page):
