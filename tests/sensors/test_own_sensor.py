@@ -56,3 +56,13 @@ def test_a_name_of_the_packs_own_and_what_is_no_sensor_are_refused(tmp_path, pag
     other = tmp_path / "other"
     install(other, files={"my_sensors.py": "def my_sensor(uid, link):\n    return uid"}, entry_points=entry_points)
     assert "it must return a TactileSensorConfig" in python(other, code.format("my_sensor")).stderr
+
+
+@pytest.mark.slow
+def test_a_sensor_of_another_package_is_verified(tmp_path, page):
+    entry_points, module = page
+    install(tmp_path, files={"my_sensors.py": module}, entry_points=entry_points)
+    code = "from manifeel_ms3.verification.__main__ import *; print(main(Args('my_sensor', report=Path('my_sensor.html'))))"
+    done = python(tmp_path, code)
+    assert done.stdout.split()[-1:] == ["0"], done.stderr
+    assert "<h1>my_sensor</h1>" in (tmp_path / "my_sensor.html").read_text()
