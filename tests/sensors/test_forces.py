@@ -7,6 +7,7 @@ import torch
 import trimesh
 
 from manifeel_ms3.sensors.mechanics.contact import depth_below_face, solve_indentation
+from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.verification.press import PadBench, Press, indenter
 from tests.conftest import needs_renderer
 from tests.sensors.shapes import thread_mesh
@@ -21,15 +22,18 @@ INDENTERS = {  # builder, height of the body's origin over the face when it touc
 }
 
 
-LOADS = {"gelsight_r15": (1.0, 3.0, 10.0, 30.0), "gelsight_mini": (1.0, 30.0), "digit": (1.0, 30.0)}  # N
+LOADS = (1.0, 3.0, 10.0, 30.0)  # N
+# the rod's centre on the dome was 1.16 mm off between these, where the engine's moment is more than it can carry: a known limit
+FEWER_LOADS = {("digit", "cylinder"): (1.0, 30.0)}
 
 
-@pytest.fixture(scope="module", params=[(sensor, shape) for sensor in LOADS for shape in INDENTERS], ids="-".join)
+@pytest.fixture(scope="module", params=[(sensor, shape) for sensor in SENSORS for shape in INDENTERS], ids="-".join)
 def press(request):
     sensor, name = request.param
     shape, height = INDENTERS[name]
     press = Press(indenter(name, **shape), sensor=sensor)
     press.touching = height
+    press.loads = FEWER_LOADS.get((sensor, name), LOADS)
     yield press
     press.close()
 
@@ -51,7 +55,7 @@ def assert_carries(figure, press: Press, normal: float, rows: float, cols: float
 
 
 def test_sums_are_the_load_and_the_engines_wrench(press, figure):
-    for force in LOADS[press.env.sensor]:
+    for force in press.loads:
         press.place(press.touching + 2e-4, 1e-3, -2e-3)
         twist = 0.0 if press.touching == BALL else 4e-4 * force  # a ball on a point contact would spin
         press.push(force, 0.25 * force, -0.15 * force, twist)
