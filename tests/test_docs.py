@@ -23,6 +23,7 @@ from manifeel_ms3.demonstrations import render_observations
 from tests.conftest import PEG, needs_renderer
 from tests.links import dead_links, missing_targets
 from tests.sample import states_sample
+from tests.third_party import install, own_sensor
 from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[1]
@@ -92,6 +93,7 @@ SMALLER = {  # what follows a command, by its name or module: of a flag the last
     "--policy.down-dims 16 32 --device cpu --precision fp32 --no-compile",
     "eval": "--episodes 2 --workers 1 --env-kwargs '{\"max_episode_steps\": 5}'",
     "study": "--address local",
+    "verify-sensor": "--loads 1 10",
     "similarity": "--features tests.analysis.test_sim_real_similarity:brightness --resamples 5",
     "baselines.tactile_representations.pretrain": "--steps 1 --batch-size 2 --image-size 64",
     "mani_skill.trajectory.replay_trajectory": "--count 1",
@@ -101,7 +103,7 @@ ENDLESS = ("teleop",)  # runs until it is interrupted
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory) -> Path:
-    """What pages take for granted: recordings, weights, pictures of a real sensor, a policy of one's own."""
+    """What pages take for granted: recordings, weights, pictures of a real sensor, a policy and a sensor of one's own."""
     shelf = tmp_path_factory.mktemp("shelf")
     for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
         states = states_sample(task)
@@ -122,6 +124,8 @@ def shelf(tmp_path_factory) -> Path:
     diffusion.main(
         tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
     )
+    entry_points, sensor = own_sensor()
+    install(shelf / "packages", files={"my_sensors.py": sensor}, entry_points=entry_points)
     network = T3()
     (shelf / "t3_medium/encoders").mkdir(parents=True)
     torch.save(network.encoder.state_dict(), shelf / "t3_medium/encoders/mini.pth")
@@ -169,9 +173,9 @@ def _run(command: str, place: Path) -> None:
     if name in ENDLESS:
         shown = f"env --default-signal=INT timeout --preserve-status --signal INT 90 {shown}"
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    done = subprocess.run(
-        ["bash", "-c", shown], cwd=place, env=os.environ | dict(PATH=path), capture_output=True, text=True, check=False
-    )
+    packages = os.pathsep.join(filter(None, [os.environ.get("PYTHONPATH"), str(place / "packages")]))
+    environment = os.environ | dict(PATH=path, PYTHONPATH=packages)
+    done = subprocess.run(["bash", "-c", shown], cwd=place, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{shown}\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
 
 

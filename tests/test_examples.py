@@ -10,6 +10,7 @@ import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from manifeel_ms3.sensors import pad_pose
+from manifeel_ms3.sensors.registry import SENSORS
 from tests.conftest import PEG, needs_renderer
 from tests.sample import observed_sample
 
@@ -33,12 +34,14 @@ def squeeze(env):
     return obs
 
 
-def test_touch_in_a_stock_maniskill_task():
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_touch_in_a_stock_maniskill_task(sensor):
     """The Panda squeezes PickCube's cube: the field is what its finger feels."""
     load("touch_in_stock_task")
     code = [line for line in (EXAMPLES / "touch_in_stock_task.py").read_text().splitlines() if line.strip()]
     assert len(code) < 32
-    env = gym.make("TouchPickCube-v1", obs_mode="state_dict", render_backend="none", control_mode="pd_joint_pos").unwrapped
+    options = dict(render_backend="none", control_mode="pd_joint_pos", sensor=sensor)
+    env = gym.make("TouchPickCube-v1", obs_mode="state_dict", **options).unwrapped
     obs = squeeze(env)
     field = obs["extra"]["force_field"]
     contact = env.agent.robot.get_net_contact_forces(["panda_leftfinger"])[0, 0].norm().item()
@@ -46,7 +49,7 @@ def test_touch_in_a_stock_maniskill_task():
     assert contact > 5.0
     assert obs["extra"]["rgb"].shape == (1, 240, 320, 3)
     env.close()
-    vector, _ = gym.make("TouchPickCube-v1", obs_mode="state", render_backend="none").reset(seed=0)
+    vector, _ = gym.make("TouchPickCube-v1", obs_mode="state", **options).reset(seed=0)
     assert vector.shape[1] > 3 * 12 * 12
 
 

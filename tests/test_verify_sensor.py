@@ -4,13 +4,15 @@ import re
 
 import numpy as np
 import pytest
+import sapien
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.sensors import GelConfig
+from manifeel_ms3.sensors.registry import task_sensor
 from manifeel_ms3.verification.__main__ import Args, main
-from manifeel_ms3.verification.checks import Check, loop_area
-from manifeel_ms3.verification.loads import SHAPES, ball_depth
+from manifeel_ms3.verification.checks import Check, checks_of, loop_area
+from manifeel_ms3.verification.loads import KNOWN_LIMITS, SHAPES, ball_depth, measure
 
 pytest.importorskip("jinja2")
 
@@ -20,6 +22,7 @@ def two_shapes(monkeypatch):
     """A box and a ball, so that it takes seconds."""
     for name in [name for name in SHAPES if name not in ("ball, 10 mm", "box, 8 x 10 mm")]:
         monkeypatch.delitem(SHAPES, name)
+    monkeypatch.delitem(KNOWN_LIMITS, "edge of a box")
     monkeypatch.setattr("manifeel_ms3.verification.loads.LOOP_LOADS", (5.0, 10.0))
     monkeypatch.setattr("manifeel_ms3.verification.loads.DEPTH_LOADS", (3.0,))
     monkeypatch.setattr("manifeel_ms3.verification.__main__.COLOURS", ("red", "blue"))
@@ -31,8 +34,10 @@ def test_a_sound_sensor_has_a_page_and_exit_code_0(two_shapes, tmp_path):
     text = page.read_text()
     for wanted in ("digit", "manifeel-ms3", "commit", "centre of pressure", "<svg", "ball, 10 mm", "data:image/png;base64,"):
         assert wanted in text
-    assert text.count(">holds<") == 7  # no published colours of a DIGIT
+    assert text.count(">holds<") == 8  # no published colours of a DIGIT
     assert ">broken<" not in text
+    row = text[text.index("<td>centre of pressure, post, 4 mm at 10 N") :]
+    assert ">known limit<" in row[: row.index("</tr>")]  # shown without a bound
     assert not re.search(r'(src|href)="http', text)  # needs nothing else
 
 
@@ -45,6 +50,29 @@ def test_a_broken_bound_is_shown_and_the_exit_code_is_not_0(two_shapes, tmp_path
         row = text[text.index(f"<td>{broken}") :]
         assert row[: row.index("</tr>")].count("broken") == 2, broken  # the class and the word
     assert "gel.friction" in text
+
+
+def test_a_pad_that_is_not_where_its_configuration_says_breaks_bounds(two_shapes):
+    """Its field still fits the force that it measures itself, so that only what was applied can tell."""
+    off = dict(pad_pose=sapien.Pose([1e-3, 0, 0]))
+    found = measure("gelsight_r15", (3.0,), off)
+    worst = {check.claim: check for check in checks_of(found, task_sensor("gelsight_r15", "a", "b", off, {}))}
+    ball = worst["centre of pressure of balls against the ball's middle"]
+    assert ball.worst == pytest.approx(1.0, rel=0.01)  # mm
+    assert not ball.holds
+    assert worst["centre of pressure of box, plate and rod against the force on the pad"].holds
+    moment = worst["moment about the normal against the moment applied, over the load"]
+    assert moment.worst > 10 * 0.0141  # mm; of a pad that is in its place, at most this much
+
+
+def test_loads_that_the_gel_cannot_carry_are_named(two_shapes):
+    heavy = measure("digit", (1000.0,))
+    with pytest.raises(InvalidArgumentError, match="1000 N: it would reach the housing"):
+        checks_of(heavy, task_sensor("digit", "a", "b", {}, {}))
+    without_ball = measure("gelsight_r15", (30.0,))
+    claims = [check.claim for check in checks_of(without_ball, task_sensor("gelsight_r15", "a", "b", {}, {}))]
+    assert any("box, plate and rod" in claim for claim in claims)
+    assert not any("balls" in claim for claim in claims)
 
 
 def test_what_cannot_be_verified_is_named(tmp_path):
@@ -62,6 +90,7 @@ def test_value_that_is_no_number_breaks_a_bound():
     assert not Check("", float("nan"), 1.0, "").holds
     assert not Check("", float("nan"), 1.0, "", at_least=True).holds
     assert Check("", 0.95, 0.9, "", at_least=True).holds
+    assert Check("", 1e9, None, "mm").holds  # a known limit is not judged
 
 
 def test_area_of_a_loop():

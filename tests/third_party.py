@@ -1,6 +1,9 @@
 """A package of somebody else, installed."""
 
+import re
 from pathlib import Path
+
+PAGE = Path(__file__).parents[1] / "docs/sensor.md"
 
 
 def install(site: Path, *, name: str = "my_package", files: dict[str, str] | None = None, entry_points: str = "") -> None:
@@ -12,3 +15,11 @@ def install(site: Path, *, name: str = "my_package", files: dict[str, str] | Non
     about.mkdir(parents=True)
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
     (about / "entry_points.txt").write_text(entry_points)
+
+
+def own_sensor() -> tuple[str, str]:
+    """Entry points and module of the sensor that docs/sensor.md shows."""
+    text = PAGE.read_text()
+    (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", text, flags=re.DOTALL)
+    (module,) = re.findall(r"```python\n# my_sensors.py\n(.*?)```", text, flags=re.DOTALL)
+    return re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', ""), module

@@ -19,11 +19,25 @@ MOST_DELAY = 50  # control steps
 STREAM = 16  # first of the streams of `uniform_draws` that imperfections use
 
 
+def _pair(name: str, given: Any) -> tuple[float, float]:
+    """An amount as the pair (least, most)."""
+    pair = (given, given) if is_number(given) else given
+    if not isinstance(pair, list | tuple) or len(pair) != 2 or not all(map(is_number, pair)):
+        raise InvalidArgumentError(f"imperfections.{name}={given!r} must be a number, or a pair (least, most)")
+    return (pair[0], pair[1])
+
+
 @dataclass
 class ImperfectionConfig:
     """Amounts of the imperfections, 0 by default. A pair (least, most) lets each episode draw its own amount from its seed.
 
     Full scale is 0.6 N for each component of a taxel's force (gel.max_penetration with units="tacsl"), and 255 grey levels.
+
+    Of the observation's `penetration`, `delay` and `dead_taxels` alone say something: it stays free of hysteresis, crosstalk,
+    drift, noise and gain, so that a policy whose robustness is tested must not read it.
+
+    Raises:
+        InvalidArgumentError: An amount is neither a number nor a pair of numbers, or a delay is no whole number.
     """
 
     hysteresis: tuple[float, float] = amount(0.9)
@@ -34,7 +48,7 @@ class ImperfectionConfig:
     crosstalk: tuple[float, float] = amount(0.8)
     """Share of a taxel's force that its four neighbours feel instead, a quarter each; sums are kept."""
     dead_taxels: tuple[float, float] = amount(1.0)
-    """Share of the taxels that always read zero."""
+    """Share of the taxels that always read zero, in force field and penetration."""
     drift: tuple[float, float] = amount(1.0)
     """Change of the untouched signal after 100 control steps, as a share of full scale, growing steadily; every component of
     every taxel's force and every colour has its own rate between minus and plus this amount."""
@@ -45,9 +59,8 @@ class ImperfectionConfig:
 
     def __post_init__(self):
         for entry in dataclasses.fields(self):
-            given = getattr(self, entry.name)
-            setattr(self, entry.name, (given, given) if is_number(given) else tuple(given))
-        if any(is_number(steps) and steps % 1 for steps in self.delay):
+            setattr(self, entry.name, _pair(entry.name, getattr(self, entry.name)))
+        if any(steps % 1 for steps in self.delay):
             raise InvalidArgumentError(f"imperfections.delay={self.delay} must be a whole number of control steps")
 
     @property

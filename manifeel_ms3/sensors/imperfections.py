@@ -4,7 +4,8 @@
 """Imperfections of N pads: what `ImperfectionConfig` asks for, applied to the true signal.
 
 The force field passes, in this order, through hysteresis, crosstalk, gain, drift, noise and dead taxels; the image through
-hysteresis of the gel's surface, drift of the colours and noise; and everything at last through the delay.
+hysteresis of the gel's surface, drift of the colours and noise; and everything at last through the delay. The penetration is
+zero at dead taxels, and true at the others.
 """
 
 import numpy as np
@@ -101,6 +102,10 @@ class Imperfections:
         inputs = [wp.from_torch(array) for array in (noisy, deviation, self._seed, self._frame)]
         wp.launch(_add_noise, dim=tuple(noisy.shape), inputs=inputs, device=warp_device(self.device))
         return noisy.view_as(field).masked_fill(self._drawn["dead_taxels"][..., None], 0.0)
+
+    def sense_penetration(self, penetration: torch.Tensor) -> torch.Tensor:
+        """Penetration (N, rows, cols), m, that the taxels report: dead ones say nothing of it, either."""
+        return penetration.masked_fill(self._drawn["dead_taxels"], 0.0)
 
     def _mixed(self, field: torch.Tensor) -> torch.Tensor:
         """The field after each taxel has given a quarter of its crosstalk to each neighbour that it has."""

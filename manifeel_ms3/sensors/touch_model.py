@@ -140,6 +140,7 @@ class TouchModel:
             obs |= self._tacsl_observation(cast(MovingDepth, depth), plane)
         if self._imperfections is not None and "force_field" in obs:
             obs["force_field"] = self._imperfections.sense_forces(obs["force_field"])
+            obs["penetration"] = self._imperfections.sense_penetration(obs["penetration"])
         if self.optics is not None:
             obs["rgb"] = self._image(self.optics, self._pixel_penetration(depth, plane, below), bristle)
         return obs if self._imperfections is None else self._imperfections.delayed(obs)

@@ -84,10 +84,16 @@ def main(args: Args) -> int:
     checks = checks_of(found, config)
     write_text(args.report, page(args.sensor, tactile | imperfections, found, checks))
     for check in checks:
-        sign = "at least" if check.at_least else "at most"
-        state = "ok    " if check.holds else "BROKEN"
-        log.info("%s %s: %.3g %s (%s %g)", state, check.claim, check.worst, check.unit, sign, check.bound)
+        log.info("%s", _line(check))
     return sum(not check.holds for check in checks)
+
+
+def _line(check: Check) -> str:
+    """A check as one line of text."""
+    measured = f"{check.claim}: {check.worst:.3g} {check.unit}"
+    if check.bound is None:
+        return measured
+    return f"{'ok    ' if check.holds else 'BROKEN'} {measured} ({'at least' if check.at_least else 'at most'} {check.bound:g})"
 
 
 def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list[Check]) -> str:
@@ -106,7 +112,7 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
         figure=Markup(figure(found)),
         strip=_strip(found),
         names=[picture.shape for picture in found.pictures],
-        readings=found.readings,
+        readings=found.readings + found.limits,
         left_out=found.left_out,
     )
 
@@ -134,10 +140,10 @@ def figure(found: Measurements) -> str:
         axes[0, 1].loglog(load, [1e3 * max(reading.centre_error, 1e-8) for reading in rows], "o-", color=colour, label=name)
         for k, mark in ((1, "o"), (2, "s")):
             axes[0, 2].plot([r.applied[k] for r in rows], [r.reported[k] for r in rows], mark, color=colour, ms=4)
-        axes[1, 0].plot([1e3 * r.on_pad[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=4)
-    axes[0, 1].set(title="centre of pressure", xlabel="normal load, N", ylabel="distance from the load's, mm")
+        axes[1, 0].plot([1e3 * r.applied[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=4)
+    axes[0, 1].set(title="centre of pressure", xlabel="normal load, N", ylabel="distance, mm")
     axes[0, 2].set(title="shear: rows (dots), columns (squares)", xlabel="applied, N", ylabel="reported, N")
-    axes[1, 0].set(title="moment about the normal", xlabel="on the pad, N mm", ylabel="reported, N mm")
+    axes[1, 0].set(title="moment about the normal", xlabel="applied, N mm", ylabel="reported, N mm")
     for axis in (axes[0, 2], axes[1, 0]):
         axis.axline((0, 0), slope=1, color="black", lw=0.6)
     top = int(found.loop[:, 0].argmax())

@@ -4,15 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import OpticsConfig, TactileSensorConfig
 
-from .loads import Measurements
+from .loads import Measurements, Reading
 from .published_colours import worst_similarity
 
 FORCE_BOUND = 0.01
 """Largest relative error of the force field's sums."""
 CENTRE_BOUND = 0.5e-3
-"""Largest distance of the centre of pressure from the load's, in m."""
+"""Largest distance of the centre of pressure from the load's, and of the moment over the load, in m."""
 LOOP_BOUND = 0.01
 """Largest area between loading and unloading, as a share of the area under the loading curve."""
 DEPTH_BOUND = 2e-5
@@ -28,7 +29,8 @@ class Check:
     claim: str
     worst: float
     """Worst value that was measured."""
-    bound: float
+    bound: float | None
+    """Bound that the worst value must keep; none for a known limit, which is shown and not judged."""
     unit: str
     at_least: bool = False
     """Whether the value must be at least the bound; otherwise at most."""
@@ -36,16 +38,25 @@ class Check:
     @property
     def holds(self) -> bool:
         """Whether the bound is kept; a value that is no number breaks it."""
+        if self.bound is None:
+            return True
         return bool(self.worst >= self.bound if self.at_least else self.worst <= self.bound)
 
 
 def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
-    """The checks of a sensor."""
+    """The checks of a sensor; a claim of which nothing was measured is left out.
+
+    Raises:
+        InvalidArgumentError: The gel carries none of the loads.
+    """
+    if not found.readings:
+        raise InvalidArgumentError(f"nothing was measured: {'; '.join(found.left_out)}; choose other --loads")
     normal = [abs(r.reported[0] / r.applied[0] - 1) for r in found.readings]
     shear = [np.abs(r.reported[1:3] - r.applied[1:3]).max() / r.applied[0] for r in found.readings]
     pad = [np.abs(r.reported[:3] - r.on_pad[:3]).max() / r.applied[0] for r in found.readings]
-    twist = [abs(r.reported[3] - r.on_pad[3]) / r.applied[0] for r in found.readings]
-    centre = [r.centre_error for r in found.readings]
+    moment = [abs(r.reported[3] - r.applied[3]) / r.applied[0] for r in found.readings]
+    balls = [r.centre_error for r in found.readings if r.is_ball]
+    others = [r.centre_error for r in found.readings if not r.is_ball]
     depth = np.abs(found.depths[:, 1] - found.depths[:, 2])
     checks = [
         Check("normal force: sum of the field against the load applied", 100 * max(normal), 100 * FORCE_BOUND, "%"),
@@ -55,8 +66,9 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
         Check(
             "force: sums of the field against the force on the pad, of the normal load", 100 * max(pad), 100 * FORCE_BOUND, "%"
         ),
-        Check("moment about the normal: error over the normal load", 1e3 * max(twist), 1e3 * CENTRE_BOUND, "mm"),
-        Check("centre of pressure", 1e3 * max(centre), 1e3 * CENTRE_BOUND, "mm"),
+        Check("moment about the normal against the moment applied, over the load", 1e3 * max(moment), 1e3 * CENTRE_BOUND, "mm"),
+        *_centre("centre of pressure of balls against the ball's middle", balls),
+        *_centre("centre of pressure of box, plate and rod against the force on the pad", others),
         Check("loading and unloading: area of the loop", 100 * loop_area(found.loop), 100 * LOOP_BOUND, "%"),
         Check("depth of a ball against the law of the gel layer", 1e3 * float(depth.max()), 1e3 * DEPTH_BOUND, "mm"),
     ]
@@ -65,7 +77,20 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
             "colours against the published calibration, SSIM", worst_similarity(config), SIMILARITY_BOUND, "", True
         )
         checks.append(similarity)
-    return checks
+    return checks + _known_limits(found.limits)
+
+
+def _known_limits(readings: list[Reading]) -> list[Check]:
+    """The errors of the centre of pressure that no bound holds."""
+    return [
+        Check(f"known limit: centre of pressure, {r.shape} at {r.applied[0]:g} N", 1e3 * r.centre_error, None, "mm")
+        for r in readings
+    ]
+
+
+def _centre(claim: str, errors: list[float]) -> list[Check]:
+    """The check of distances, m, of the centre of pressure, if there are any."""
+    return [Check(claim, 1e3 * max(errors), 1e3 * CENTRE_BOUND, "mm")] if errors else []
 
 
 def loop_area(loop: np.ndarray) -> float:

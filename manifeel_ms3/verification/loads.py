@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.optimize import brentq
+from trimesh.transformations import rotation_matrix
 
 from manifeel_ms3.agents.panda_gelsight import GEL_STIFFNESS
 from manifeel_ms3.sensors import TactileSensor, with_options
@@ -40,6 +41,21 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "plate, 12 x 16 mm": (dict(half_size=[0.006, 0.008, 0.004]), 0.004),
 }
 """Indenters: arguments of `indenter`, and the height of the body's origin over the face when it touches, in m."""
+KNOWN_LIMITS: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
+    "edge of a box": (
+        dict(half_size=[0.006, 0.004, 0.004], rotation=rotation_matrix(np.pi / 4, [1, 0, 0])),
+        0.004 * np.sqrt(2),
+        (0.1, 0.3),
+    ),
+    "post, 4 mm": (
+        dict(radius=0.004, half_length=0.004, rotation=rotation_matrix(np.pi / 2, [0, 1, 0])),
+        0.004,
+        (10.0,),
+    ),
+}
+"""Shapes whose centre of pressure is read less exactly, as in `SHAPES`, and the loads, in N, under which it is.
+
+The engine's moment there is more than the shape can carry on the gel within the sensor's largest tilt, 5 degrees."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +64,21 @@ class Reading:
 
     shape: str
     applied: np.ndarray
-    """The load that pushes the object, (4,)."""
+    """The load that pushes the object, (4,); its moment is about the pad's origin."""
     on_pad: np.ndarray
     """The load that the engine carries through the pad's joint, (4,)."""
     reported: np.ndarray
     """The sums over the force field, (4,)."""
     centre_error: float
-    """Distance of the field's centre of pressure from the load's, m."""
+    """Distance of the field's centre of pressure, m: for a ball from its middle, for others from that of the force on the
+    pad, since their tilt is locked, so that only the engine knows where its force acts."""
     penalty_sum: float
     """Sum of the normal components of the field with units="tacsl", m."""
+
+    @property
+    def is_ball(self) -> bool:
+        """Whether the shape is a ball."""
+        return _is_ball(self.shape)
 
 
 @dataclass(frozen=True)
@@ -80,6 +102,8 @@ class Measurements:
     """Loading and unloading (n, 2): applied and reported normal force, N."""
     depths: np.ndarray
     """A ball in the middle of the pad (n, 3): load in N, depth, and depth by the law of the layer, m."""
+    limits: list[Reading] = field(default_factory=list)
+    """Readings of `KNOWN_LIMITS`."""
     left_out: list[str] = field(default_factory=list)
     """Loads that were left out, and why."""
 
@@ -116,12 +140,20 @@ def measure(
         if name == "ball, 10 mm":
             found.depths = _depths(press, touching)
         press.close()
+    for name, (shape, touching, few) in KNOWN_LIMITS.items():
+        press = Press(indenter(name, **shape), **arguments)
+        found.limits += _readings(press, name, touching, few, found.left_out)
+        press.close()
     return found
+
+
+def _is_ball(name: str) -> bool:
+    return name.startswith("ball")
 
 
 def largest_load(press: Press, name: str) -> float:
     """Largest load, N, that the engine's gel carries: a ball has one contact point, and would reach the housing."""
-    stiffness = GEL_STIFFNESS / 2 * (1 if name.startswith("ball") else 4)  # PhysX averages it with the other body's 0
+    stiffness = GEL_STIFFNESS / 2 * (1 if _is_ball(name) else 4)  # PhysX averages it with the other body's 0
     return 0.9 * stiffness * press.sensor.config.housing.protrusion
 
 
@@ -132,17 +164,17 @@ def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]
         if load > largest_load(press, name):
             left_out.append(f"{name} at {load:g} N: it would reach the housing")
             continue
-        twist = 0.0 if name.startswith("ball") else TWIST_ARM * load  # a ball on a point contact would spin
-        applied = np.array([load, *(share * load for share in SHEAR_SHARES), twist])
+        twist = 0.0 if _is_ball(name) else TWIST_ARM * load  # a ball on a point contact would spin
         press.place(touching + CLEARANCE, *PLACE)
-        press.push(*applied)
+        press.push(load, *(share * load for share in SHEAR_SHARES), twist)
         if press.slid > MOST_SLIDING:
             left_out.append(f"{name} at {load:g} N: it slid by {1e3 * press.slid:.0f} mm in the engine")
             continue
         penalty.reset(torch.arange(1))
         penalty.capture()
         indented = penalty.get_obs()["force_field"][..., 0].sum().item()
-        yield Reading(name, applied, press.wrench, press.sums, press.centre_error, indented)
+        centre_error = press.ball_error if _is_ball(name) else press.centre_error
+        yield Reading(name, press.applied, press.wrench, press.sums, centre_error, indented)
 
 
 def _picture(press: Press, name: str, touching: float) -> Picture:

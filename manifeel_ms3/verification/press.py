@@ -185,17 +185,41 @@ class Press:
         return np.array([-w[2], w[0], w[1], w[5]])
 
     @property
+    def applied(self) -> np.ndarray:
+        """The load that pushes the object, as `sums`: its moment is about the pad's origin, whatever the sensor measures."""
+        normal, rows, cols, twist = self.load
+        x, y = self.at
+        return np.array([normal, rows, cols, twist + x * cols - y * rows])
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Centre of pressure (2,) of the field, m."""
+        field = self.field
+        return (field[..., :1] * self.taxels).sum((0, 1)) / field[..., 0].sum()
+
+    @property
     def centre_error(self) -> float:
-        """Distance along an axis of the field's centre of pressure from that of the engine's wrench, m."""
-        field, wrench = self.field, self.sensor.wrench()[0].numpy()
-        centre = (field[..., :1] * self.taxels).sum((0, 1)) / field[..., 0].sum()
-        return float(np.abs(centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max())
+        """Distance along an axis of the field's centre of pressure from that of the force on the pad, m."""
+        wrench = self.sensor.wrench()[0].numpy()
+        return float(np.abs(self.centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max())
+
+    @property
+    def ball_error(self) -> float:
+        """Distance along an axis of the field's centre of pressure from the middle of a ball, m.
+
+        A ball presses where it is; the engine carries the moment of any other shape, whose tilt is locked, at its corners.
+        """
+        return float(np.abs(self.centre - self.at).max())
+
+    @property
+    def at(self) -> np.ndarray:
+        """Place (2,) of the object's origin on the face of the robot's pad, m."""
+        return (self.env.agent.gels["right"].pose.sp.inv() * self.actor.pose.sp).p[:2]
 
     @property
     def slid(self) -> float:
         """Distance of the object's origin along the face from where it was placed, m."""
-        pose = self.env.agent.gels["right"].pose.sp.inv() * self.actor.pose.sp
-        return float(np.linalg.norm(pose.p[:2] - self._placed))
+        return float(np.linalg.norm(self.at - self._placed))
 
     @property
     def depth(self) -> np.ndarray:

@@ -15,6 +15,8 @@ from manifeel_ms3.sensors.touch_model import CONTACT_CELL
 
 CALIBRATION = data_dir() / "gelsight_r15_polycalib_subset.npz"
 """The slope bins up to 1.2 rad of Taxim's table of a GelSight R1.5 (NOTICE), in int16."""
+DIMPLE_PITCH, DIMPLE_RADIUS, DIMPLE_DEPTH = 3.6e-3, 1.7e-3, 2.5e-4
+"""Distance of neighbouring dimples of a golf ball, radius of a dimple's rim, and its depth, in m."""
 SSIM_WINDOW = 1.5
 """Standard deviation of the windows of the structural similarity, in pixels (Wang et al. 2004)."""
 
@@ -72,6 +74,14 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     return float((((2 * ma * mb + c1) * (2 * cov + c2)) / ((ma**2 + mb**2 + c1) * (va + vb + c2))).mean())
 
 
+def dimples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Depth of spherical dimples on a square lattice, m."""
+    u, v = (p - np.round(p / DIMPLE_PITCH) * DIMPLE_PITCH for p in (x, y))
+    ball = (DIMPLE_RADIUS**2 + DIMPLE_DEPTH**2) / (2 * DIMPLE_DEPTH)
+    inside = u * u + v * v < DIMPLE_RADIUS**2
+    return np.where(inside, np.sqrt(ball**2 - np.minimum(u * u + v * v, DIMPLE_RADIUS**2)) - ball + DIMPLE_DEPTH, 0.0)
+
+
 def pressed_shapes(config: TactileSensorConfig) -> dict[str, np.ndarray]:
     """Heights (H, W), m, of shapes over the untouched face, into it."""
     x, y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * config.pixel_size for n in config.image_shape), indexing="ij")
@@ -80,6 +90,7 @@ def pressed_shapes(config: TactileSensorConfig) -> dict[str, np.ndarray]:
         "rod": np.where(np.abs(y) < 0.008, np.sqrt(np.maximum(0.004**2 - x**2, 0)) - 0.004 + 5e-4, -1),
         "tilted plate": np.where((np.abs(x) < 0.004) & (np.abs(y) < 0.005), 4e-4 + 0.02 * x, -1),
         "wedge": np.where(np.abs(y) < 0.007, 5e-4 - 0.5 * np.abs(x), -1),
+        "dimples": np.where((np.abs(x) < 0.007) & (np.abs(y) < 0.007), 4e-4 - dimples(x, y), -1),
     }
 
 

@@ -82,6 +82,16 @@ def test_the_main_process_says_why_the_first_images_of_its_workers_take_long(tmp
     assert with_images.index(notice) < with_images.index("recording")
 
 
+def test_another_sensor_is_recorded_and_named(recorded, tmp_path):
+    sensing = dict(obs_mode="tacff", cameras=(), tactile_sensors=("right",), sensor="digit")
+    path = record.main(record.Args(PEG, 1, 1, 0, tmp_path / "digit.h5", **sensing, env_kwargs=json.dumps(EASY)))
+    assert json.loads(path.with_suffix(".json").read_text())["env_info"]["env_kwargs"]["sensor"] == "digit"
+    with h5py.File(path) as digit, h5py.File(recorded) as other:
+        first, r15 = (file["traj_0/obs"][KEYS[0]][0] for file in (digit, other))
+    assert first[..., 0].sum() == pytest.approx(r15[..., 0].sum(), rel=0.05)  # the same grip of the same start,
+    assert np.abs(first - r15).max() > 0.02  # N: on a dome
+
+
 def test_names_of_files_say_what_is_in_them():
     def name(obs_mode: str, **kwargs) -> str:
         return record.Args(PEG, obs_mode=obs_mode, env_kwargs=json.dumps(kwargs)).path.relative_to("data/demos").as_posix()

@@ -3,8 +3,9 @@
 import numpy as np
 import trimesh
 
+from manifeel_ms3.verification.published_colours import dimples
+
 THREAD_RADIUS, THREAD_PITCH, THREAD_DEPTH = 8e-3, 2e-3, 1.08e-3  # m: M16
-DIMPLE_PITCH, DIMPLE_RADIUS, DIMPLE_DEPTH = 3.6e-3, 1.7e-3, 2.5e-4  # m
 
 
 def thread_radius(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
@@ -34,14 +35,6 @@ def thread_height(x: np.ndarray, y: np.ndarray, axis_height: float) -> np.ndarra
         order = np.argsort(r * np.sin(angle), kind="stable")
         out[at] = np.interp(x[at], (r * np.sin(angle))[order], (r * np.cos(angle))[order]) - axis_height
     return out
-
-
-def dimples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Depth of spherical dimples on a square lattice, m."""
-    u, v = (p - np.round(p / DIMPLE_PITCH) * DIMPLE_PITCH for p in (x, y))
-    ball = (DIMPLE_RADIUS**2 + DIMPLE_DEPTH**2) / (2 * DIMPLE_DEPTH)
-    inside = u * u + v * v < DIMPLE_RADIUS**2
-    return np.where(inside, np.sqrt(ball**2 - np.minimum(u * u + v * v, DIMPLE_RADIUS**2)) - ball + DIMPLE_DEPTH, 0.0)
 
 
 def dimple_mesh(half: float = 0.010, step: float = 5e-5) -> trimesh.Trimesh:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.sensors import (
     GelConfig,
     HousingConfig,
@@ -84,6 +84,14 @@ def test_imperfections_take_a_number_or_a_range_of_known_names():
         task_sensor("digit", "a", "b", None, {"delay": 1.5})
     with pytest.raises(ValueError, match=r"imperfections\.crosstalk"):
         task_sensor("digit", "a", "b", None, {"crosstalk": "much"})
+
+
+@pytest.mark.parametrize("amount", [None, "much", "ab", [0.1], (0.0, 0.1, 0.2), (0.0, None), True, float("nan")])
+def test_an_amount_that_is_no_number_or_pair_is_named_at_once(amount):
+    with pytest.raises(InvalidArgumentError, match=r"imperfections\.gain=.*a number, or a pair"):
+        ImperfectionConfig(gain=amount)
+    with pytest.raises(InvalidArgumentError, match=r"imperfections\.delay"):
+        ImperfectionConfig(delay=amount)
 
 
 def test_missing_and_malformed_calibration(tmp_path):

@@ -1,5 +1,7 @@
 """Both depth backends against closed forms, and against each other."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import sapien
@@ -57,11 +59,10 @@ SHAPES = {  # mesh, its origin over its lowest point, height over the face when 
 }
 
 
-@pytest.fixture(scope="module", params=SHAPES)
-def shape_env(request, tmp_path_factory):
-    mesh, origin, height = SHAPES[request.param]
-    path = tmp_path_factory.mktemp("mesh") / "shape.glb"
-    mesh().export(path)
+def bench(name: str, folder: Path, **kwargs) -> PadBench:
+    """A bench with one of the shapes, which nothing moves."""
+    path = folder / "shape.glb"
+    SHAPES[name][0]().export(path)
 
     def build(env):
         builder = env.scene.create_actor_builder()
@@ -70,8 +71,13 @@ def shape_env(request, tmp_path_factory):
         builder.initial_pose = sapien.Pose([0, 0, 2])
         return [builder.build_kinematic("shape")]
 
-    env = PadBench(build, obs_mode="rgb", cameras=("wrist",))
-    yield env, origin, height
+    return PadBench(build, obs_mode="rgb", cameras=("wrist",), **kwargs)
+
+
+@pytest.fixture(scope="module", params=SHAPES)
+def shape_env(request, tmp_path_factory):
+    env = bench(request.param, tmp_path_factory.mktemp("mesh"))
+    yield env, *SHAPES[request.param][1:]
     env.close()
 
 
@@ -108,19 +114,13 @@ def test_backends_agree_within_five_micrometres(shape_env, figure):
 
 @needs_renderer
 @pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
-def test_a_ball_is_seen_over_the_face_of_other_sensors(sensor, figure, tmp_path):
-    trimesh.creation.icosphere(subdivisions=6, radius=BALL).export(tmp_path / "ball.glb")  # SAPIEN draws its own with facets
-
-    def build(env):
-        builder = env.scene.create_actor_builder()
-        builder.add_visual_from_file(str(tmp_path / "ball.glb"), material=RenderMaterial(base_color=[1, 0, 0, 1]))
-        builder.initial_pose = sapien.Pose([0, 0, 2])
-        return [builder.build_kinematic("ball")]
-
-    env = PadBench(build, obs_mode="rgb", cameras=("wrist",), sensor=sensor)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_shapes_are_seen_over_the_face_of_other_sensors(shape, sensor, figure, tmp_path):
+    _, origin, height = SHAPES[shape]
+    env = bench(shape, tmp_path, sensor=sensor)
     x, y, curvature = 6e-3, -8e-3, sensor_config(sensor, "a", "b").gel.curvature[0]
     sag = (1 - np.sqrt(1 - curvature**2 * (x**2 + y**2))) / curvature if curvature else 0.0
-    env.place(env.objects[0], sapien.Pose([x, y, BALL - DEEP - sag]))
+    env.place(env.objects[0], sapien.Pose([x, y, origin - DEEP - sag]))
     for backend in ("raycast", "sapien"):
         pad = TactileSensor(sensor_config(sensor, "tactile", "gel_right", backend=backend), env.scene, env.agent.robot)
         env.scene.update_render()
@@ -128,11 +128,11 @@ def test_a_ball_is_seen_over_the_face_of_other_sensors(sensor, figure, tmp_path)
         cells = pad.model.cells.double().numpy()
         r2 = (cells**2).sum(1)
         face = (1 - np.sqrt(1 - curvature**2 * r2)) / curvature if curvature else np.zeros(len(cells))
-        expected = ball_height(cells[:, 0] - x, cells[:, 1] - y) + DEEP + sag - face
+        expected = height(cells[:, 0] - x, cells[:, 1] - y) + DEEP + sag - face
         near = expected > -1e-3
         error = (pad.model.heights(pad._depth)[0].numpy() - expected)[near]
         assert near.sum() > 100
-        figure(f"ball over the {sensor}'s face, {backend}, micrometres RMS", 1e6 * np.sqrt((error**2).mean()), at_most=5)
+        figure(f"shapes over the {sensor}'s face, {backend}, micrometres RMS", 1e6 * np.sqrt((error**2).mean()), at_most=5)
     env.close()
 
 

@@ -7,6 +7,7 @@ import torch
 import trimesh
 
 from manifeel_ms3.sensors.mechanics.contact import depth_below_face, solve_indentation
+from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.verification.press import PadBench, Press, indenter
 from tests.conftest import needs_renderer
 from tests.sensors.shapes import thread_mesh
@@ -21,15 +22,18 @@ INDENTERS = {  # builder, height of the body's origin over the face when it touc
 }
 
 
-LOADS = {"gelsight_r15": (1.0, 3.0, 10.0, 30.0), "gelsight_mini": (1.0, 30.0), "digit": (1.0, 30.0)}  # N
+LOADS = (1.0, 3.0, 10.0, 30.0)  # N
+# the rod's centre on the dome was 1.16 mm off at 3 or 10 N after other loads: a known limit
+FEWER_LOADS = {("digit", "cylinder"): (1.0, 30.0)}
 
 
-@pytest.fixture(scope="module", params=[(sensor, shape) for sensor in LOADS for shape in INDENTERS], ids="-".join)
+@pytest.fixture(scope="module", params=[(sensor, shape) for sensor in SENSORS for shape in INDENTERS], ids="-".join)
 def press(request):
     sensor, name = request.param
     shape, height = INDENTERS[name]
     press = Press(indenter(name, **shape), sensor=sensor)
     press.touching = height
+    press.loads = FEWER_LOADS.get((sensor, name), LOADS)
     yield press
     press.close()
 
@@ -43,15 +47,22 @@ def assert_carries(figure, press: Press, normal: float, rows: float, cols: float
     bottoms_out = normal > 20 and press.touching == BALL  # one contact point of 8 kN/m: the housing behind takes its share
     if not bottoms_out:
         assert wrench[:3] == pytest.approx([normal, rows, cols], rel=0.01, abs=0.005 * normal)
+        figure(
+            "field's moment against the applied, over the load, mm",
+            1e3 * abs(sums[3] - press.applied[3]) / normal,
+            at_most=0.1,
+        )
 
 
 def test_sums_are_the_load_and_the_engines_wrench(press, figure):
-    for force in LOADS[press.env.sensor]:
+    for force in press.loads:
         press.place(press.touching + 2e-4, 1e-3, -2e-3)
         twist = 0.0 if press.touching == BALL else 4e-4 * force  # a ball on a point contact would spin
         press.push(force, 0.25 * force, -0.15 * force, twist)
         assert_carries(figure, press, force, 0.25 * force, -0.15 * force)
-        figure("centre of pressure, mm off", 1e3 * press.centre_error, at_most=0.5)
+        figure("centre of pressure against the force on the pad, mm off", 1e3 * press.centre_error, at_most=0.5)
+        if press.touching == BALL and force < 20:  # beyond, it sinks in the engine until it touches more than the gel's face
+            figure("centre of pressure against the ball's middle, mm off", 1e3 * press.ball_error, at_most=0.01)
         limit = press.sensor.config.gel.friction * press.field[..., 0]
         assert (np.linalg.norm(press.field[..., 1:], axis=-1) <= limit + 1e-6).all()
 

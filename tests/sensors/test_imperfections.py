@@ -102,7 +102,12 @@ def test_dead_taxels_say_nothing_in_any_state():
     dead = pad.drawn["dead_taxels"][0]
     assert dead.sum() == round(0.25 * 140)
     for load in (0.0, 5.0, 20.0):
-        assert (pad.field(load)[0][dead] == 0).all()
+        seen = pad.under(load)
+        assert (seen["force_field"][0][dead] == 0).all()
+        assert (seen["penetration"][0][dead] == 0).all()
+    expected = Pad().under(20.0)["penetration"][0]
+    assert (expected[dead] > 0).any()
+    assert torch.equal(seen["penetration"][0][~dead], expected[~dead])  # noise does not act on it
     assert Pad(dead_taxels=0.25).field(5.0)[0][~dead] == pytest.approx(true[0][~dead])
 
 

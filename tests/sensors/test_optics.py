@@ -15,11 +15,10 @@ from manifeel_ms3.sensors.optics.lights import lamp_shader
 from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
 from manifeel_ms3.sensors.optics.tacrgb import Optics, shader_of
 from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
-from manifeel_ms3.verification.published_colours import change_images, published_table, ssim
+from manifeel_ms3.verification.published_colours import change_images, pressed_shapes, published_table, ssim
 from tests.sensors.make_calibration import write_table
 from tests.sensors.optics import CONFIG, CPU, GRID, make_optics
 from tests.sensors.readers import photometric_stereo
-from tests.sensors.shapes import dimples
 
 
 @pytest.fixture(scope="module")
@@ -164,14 +163,7 @@ def test_shipped_coefficients_reproduce_the_published_calibration(table_file):
     assert np.sqrt(((ours - true) ** 2).mean(0)).max() < 6.0
 
 
-X, Y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * CONFIG.pixel_size for n in CONFIG.image_shape), indexing="ij")
-PRESSES = {  # m above the untouched gel's face, into it
-    "ball": np.sqrt(np.maximum(0.004**2 - X**2 - Y**2, 0)) - 0.004 + 6e-4,
-    "rod": np.where(np.abs(Y) < 0.008, np.sqrt(np.maximum(0.004**2 - X**2, 0)) - 0.004 + 5e-4, -1),
-    "tilted plate": np.where((np.abs(X) < 0.004) & (np.abs(Y) < 0.005), 4e-4 + 0.02 * X, -1),
-    "wedge": np.where(np.abs(Y) < 0.007, 5e-4 - 0.5 * np.abs(X), -1),
-    "dimples": np.where((np.abs(X) < 0.007) & (np.abs(Y) < 0.007), 4e-4 - dimples(X, Y), -1),
-}
+PRESSES = pressed_shapes(CONFIG)  # m above the untouched gel's face, into it
 
 
 def pressed(optics: Optics, name: str) -> torch.Tensor:

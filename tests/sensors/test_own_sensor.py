@@ -1,17 +1,15 @@
 """The package with one sensor that docs/sensor.md shows, installed as a third party's."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.third_party import install
+from tests.third_party import install, own_sensor
 
 REPOSITORY = Path(__file__).parents[2]
-PAGE = (REPOSITORY / "docs/sensor.md").read_text()
 TOUCH = """
 import gymnasium, manifeel_ms3
 from manifeel_ms3.sensors import sensor_names
@@ -20,7 +18,8 @@ touch = env.reset(seed=0)[0]["sensor_data"]["tactile_right"]
 grip = -env.unwrapped.agent.pad_wrench("right")[0, 2].item()
 field = touch["force_field"]
 print(sensor_names(), tuple(touch["rgb"].shape), tuple(field.shape), field[..., 0].sum().item() / grip)
-print(touch["rgb"].float().mean((0, 1, 2)).tolist(), env.unwrapped.agent.finger.size)
+levels = env.unwrapped._tactile_sensors["tactile_right"].model.optics.levels  # of the untouched gel
+print(levels.min().item(), levels.max().item(), env.unwrapped.agent.finger.size)
 """
 
 
@@ -32,9 +31,7 @@ def python(site: Path, code: str) -> subprocess.CompletedProcess:
 @pytest.fixture
 def page() -> tuple[str, str]:
     """Entry points and module of the page."""
-    (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", PAGE, flags=re.DOTALL)
-    (module,) = re.findall(r"```python\n# my_sensors.py\n(.*?)```", PAGE, flags=re.DOTALL)
-    return re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', ""), module
+    return own_sensor()
 
 
 def test_a_sensor_of_another_package_is_on_the_robot(tmp_path, page):
@@ -45,7 +42,10 @@ def test_a_sensor_of_another_package_is_on_the_robot(tmp_path, page):
     first, second = done.stdout.strip().splitlines()[-2:]
     assert "'digit', 'my_sensor'] (1, 240, 320, 3) (1, 9, 11, 3)" in first
     assert float(first.split()[-1]) == pytest.approx(1.0, abs=0.01)
-    assert second.endswith("(0.022, 0.02, 0.095)")
+    darkest, brightest, size = second.split(maxsplit=2)
+    assert float(darkest) > 20  # nothing of the untouched gel is saturated
+    assert float(brightest) < 245
+    assert size == "(0.022, 0.02, 0.095)"
 
 
 def test_a_name_of_the_packs_own_and_what_is_no_sensor_are_refused(tmp_path, page):
@@ -56,3 +56,13 @@ def test_a_name_of_the_packs_own_and_what_is_no_sensor_are_refused(tmp_path, pag
     other = tmp_path / "other"
     install(other, files={"my_sensors.py": "def my_sensor(uid, link):\n    return uid"}, entry_points=entry_points)
     assert "it must return a TactileSensorConfig" in python(other, code.format("my_sensor")).stderr
+
+
+@pytest.mark.slow
+def test_a_sensor_of_another_package_is_verified(tmp_path, page):
+    entry_points, module = page
+    install(tmp_path, files={"my_sensors.py": module}, entry_points=entry_points)
+    code = "from manifeel_ms3.verification.__main__ import *; print(main(Args('my_sensor', report=Path('my_sensor.html'))))"
+    done = python(tmp_path, code)
+    assert done.stdout.split()[-1:] == ["0"], done.stderr
+    assert "<h1>my_sensor</h1>" in (tmp_path / "my_sensor.html").read_text()

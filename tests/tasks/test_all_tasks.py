@@ -68,6 +68,25 @@ def test_observations_keep_the_contract_and_hold_nothing_privileged(make_env, ta
         assert pad["force_field"].shape == (1, 10, 14, 3)
 
 
+@pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])
+@pytest.mark.parametrize("task", [f"ManiFeel-{name}-v1" for name in ("PegInsertion", "BulbInstallation", "BallSorting")])
+def test_other_sensors_feel_what_the_engine_puts_on_the_pad(make_env, task, sensor):
+    """A flat part, and round ones on pads of five boxes or a dome."""
+    env = make_env(task, obs_mode="tacff", render_backend="none", sensor=sensor)
+    env.reset(seed=0)
+    still = np.zeros(env.action_space.shape)
+    if task == "ManiFeel-BallSorting-v1":  # it begins with an empty hand
+        env.unwrapped.golf._bodies[0].set_disable_gravity(True)
+        env.unwrapped.golf.set_pose(env.unwrapped.agent.tcp.pose)
+        still[-1] = -1.0
+    for _ in range(5):
+        obs = env.step(still)[0]
+    rows, cols, normal = env.unwrapped.agent.pad_wrench("right")[0, :3].tolist()
+    felt = obs["sensor_data"]["tactile_right"]["force_field"][0].sum((0, 1)).tolist()
+    assert felt[0] > 5.0  # N
+    assert felt == pytest.approx([-normal, rows, cols], abs=0.005 * abs(normal))
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_task_says_what_it_is(task):
     text = gym.spec(task).entry_point
