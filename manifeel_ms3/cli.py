@@ -1,7 +1,7 @@
 """`manifeel`: every command of the package in one place.
 
-    manifeel record ManiFeel-PegInsertion-v1 -n 50 --out trajectory.h5
-    manifeel train diffusion_policy cpu --demos trajectory.h5
+    manifeel record ManiFeel-PegInsertion-v1 -n 50 --out peg.h5
+    manifeel train diffusion_policy cpu --demo-path peg.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
 Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). If it has
