@@ -107,6 +107,22 @@ def linked(success: Estimate, file: str | None) -> str:
     return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
 
 
+def table_one(found: Found) -> tuple[Setup, dict[tuple[str, str], Condition]] | None:
+    """The conditions of Table I, by task and observation mode, in the set-up in which most of them were run.
+
+    None if none was run.
+
+    Args:
+        found: The results that enter comparisons.
+    """
+    by_setup: dict[Setup, dict[tuple[str, str], Condition]] = {}
+    for task in MODALITIES:
+        for mode in MODES:
+            for setup, condition in answering(paper_condition(task, mode), found).items():
+                by_setup.setdefault(setup, {})[task, mode] = condition
+    return max(by_setup.items(), key=lambda item: len(item[1]), default=None)
+
+
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
     """Draw the success of Table I as bars: tasks side by side, a bar for each sensing, the paper's rates as black lines.
 
@@ -124,16 +140,12 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    bars: dict[Setup, dict[tuple[str, str], Estimate]] = {}
-    for task in MODALITIES:
-        for mode in MODES:
-            for setup, condition in answering(paper_condition(task, mode), found).items():
-                bars.setdefault(setup, {})[task, mode] = mean_success(found[condition])
-    if not bars:
+    if not (most := table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    setup, drawn = max(bars.items(), key=lambda item: len(item[1]))
+    setup, conditions = most
+    drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
     tasks = list(MODALITIES)
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
