@@ -20,7 +20,7 @@ from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import write_text
-from manifeel_ms3.tasks.registry import short_name
+from manifeel_ms3.tasks.registry import all_tasks
 
 from .answers import answers
 from .census import census_table
@@ -83,8 +83,8 @@ The curves end at the success of the tables, and the dashed line is the limit of
 FLOORS = """
 ## Failure floors
 
-Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes: {policies}.
-`python -m baselines.floors` measures them.
+Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes, on the present revision
+of each task: {policies}. `python -m baselines.floors` measures them; tasks that are not in the table were not measured.
 
 """
 LEFT_OUT = """
@@ -220,7 +220,7 @@ def page(
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
-    yield _table_of_floors(collected)
+    yield _table_of_floors()
     yield census_table(results, [condition for condition, _ in _sorted(found)])
     yield rank_table(found)
     yield f"{CLAIMS}\n"
@@ -249,16 +249,15 @@ def _floor(condition: Condition) -> str | None:
     return floor and str(floor)
 
 
-def _table_of_floors(found: dict[Condition, ConditionResults]) -> str:
-    """The floors of the tasks of some conditions; "" where none was measured."""
-    tasks = dict.fromkeys((condition.env_id, condition.revision) for condition, _ in _sorted(found))
-    floors = {task: here for task in tasks if (here := floors_of(*task))}
+def _table_of_floors() -> str:
+    """The floors of all tasks that have some on their present revision; "" where none was measured."""
+    floors = [(spec, here) for spec in all_tasks().values() if (here := floors_of(spec.env_id, spec.revision))]
     rows = [
-        (short_name(env_id), *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
-        for (env_id, _), here in floors.items()
+        (spec.name, spec.revision, *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
+        for spec, here in floors
     ]
     policies = "; ".join(f"{name}: {about}" for name, about in POLICIES.items())
-    return f"{FLOORS.format(policies=policies)}{markdown_table(('task', *POLICIES), rows)}" if rows else ""
+    return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 
 def _deviation(results: ConditionResults) -> str | None:
