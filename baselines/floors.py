@@ -1,4 +1,4 @@
-"""Measure the failure floors of tasks: `python -m baselines.floors ManiFeel-PegInsertion-v1 --episodes 20`.
+"""Measure the failure floors of tasks: `python -m baselines.floors ManiFeel-PegInsertion-v1 --num-eval-episodes 20`.
 
 Three policies that have learnt nothing are evaluated on the first evaluation seeds: random actions, the mean action of
 demonstrations, and the network of Diffusion Policy's preset `cpu` before training. An episode ends at success, and where it
@@ -12,9 +12,10 @@ import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
+from tyro.conf import arg
 
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.command_line import run
@@ -43,11 +44,11 @@ class Args:
     """Ids of the tasks; all tasks if none is given."""
     policies: tuple[str, ...] = tuple(POLICIES)
     """Names of the policies: "random", "mean action", "untrained"."""
-    episodes: int = 50
+    episodes: Annotated[int, arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes for each policy."""
-    workers: int = 1
+    workers: Annotated[int, arg(name="num-eval-envs", aliases=["--workers"])] = 1
     """Number of processes that simulate."""
-    demos: Path | None = None
+    demos: Annotated[Path | None, arg(name="demo-path", aliases=["--demos"])] = None
     """Folder with trajectory files in a folder for each task, from which the mean action and the ranges of the network's inputs
     are taken; the sample of the package if not given."""
     out: Path | None = None
@@ -61,7 +62,7 @@ def main(args: Args) -> list[Path]:
         UnknownNameError: A task is not registered.
         DemonstrationError: The demonstrations of a task are missing or broken.
     """
-    command = f"python -m baselines.floors --episodes {args.episodes}"
+    command = f"python -m baselines.floors --num-eval-episodes {args.episodes}"
     return [_measure_task(env_id, args, command) for env_id in args.tasks or all_tasks()]
 
 

@@ -3,7 +3,7 @@
 `python -m baselines.floors` measures all of them. One of them is evaluated with `manifeel eval`:
 
     --policy baselines.references:RandomActions --policy-kwargs '{"env_id": "ManiFeel-PegInsertion-v1"}'
-    --policy baselines.references:MeanAction --policy-kwargs '{"demos": "trajectory.h5"}'
+    --policy baselines.references:MeanAction --policy-kwargs '{"demos": "peg.h5"}'
     --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/peg/checkpoints/last"}'
 
 and with `--env-id` and `--obs-mode`, because neither has a checkpoint that says them.

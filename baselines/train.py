@@ -1,4 +1,4 @@
-"""Train any registered policy: `manifeel train diffusion_policy cpu --demos trajectory.h5`."""
+"""Train any registered policy: `manifeel train diffusion_policy cpu --demo-path peg.h5`."""
 
 import sys
 from functools import reduce

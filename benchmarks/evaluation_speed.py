@@ -1,18 +1,18 @@
 """Wall-clock time of evaluations, in turns, so that a change of the machine's speed meets all of them alike.
 
-    python benchmarks/evaluation_speed.py --checkpoint runs/ball/checkpoints/last --episodes 50 --workers 2 --rounds 2 \
-        --before ../manifeel_at_721bfa4
+    git clone . ../manifeel_at_721bfa4 && git -C ../manifeel_at_721bfa4 checkout 721bfa4
+    python benchmarks/evaluation_speed.py --episodes 50 --workers 2 --rounds 2 --before ../manifeel_at_721bfa4
 
-evaluates a checkpoint with this code, once by the present rule and once with `--stop-at-success`, and with an older checkout
-of the repository, as its users would: with imports, the start of all processes, and the result file. The older code gets the
-same weights; names in its configuration are translated to those of 721bfa4. Compared are seconds, and seconds for each
-control step, since the rules and the time limits differ.
+evaluates Diffusion Policy on ball sorting with this code, once by the present rule and once with `--stop-at-success`, and with
+an older checkout of the repository, as its users would: with imports, the start of all processes, and the result file. Neither
+code reads the other's checkpoints. Each therefore evaluates the network of its own preset `cpu`, which one gradient step on the
+sample of demonstrations in its repository has made a checkpoint of, on images of 256 x 256 pixels. Compared are seconds, and
+seconds for each control step, since the rules and the time limits differ.
 """
 
 import json
 import os
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -25,19 +25,20 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-OLD_NAMES = dict(down_dims="channels", kernel_size="kernel", n_groups="groups", diffusion_step_embed_dim="step_embedding")
-"""Settings of the U-Net, and what 721bfa4 calls them."""
-OLD_CLASSES = dict(diffusion_policy="baselines.diffusion_policy.policy:DiffusionPolicy")
-"""Policies by their registered names, and what a checkpoint of 721bfa4 says instead."""
+TASK = "ManiFeel-BallSorting-v1"
+CAMERA = "wrist"
+"""Camera of the sample of demonstrations."""
+RENDERED = dict(sensor_configs=dict(width=256, height=256))
+"""Arguments of the task in evaluation: the size of images that policies are trained on; those of the sample are smaller."""
 HERE = Path(__file__).parents[1]
 
 
 @dataclass
 class Args:
-    checkpoint: Path
-    """Checkpoint folder of a Diffusion Policy."""
+    checkpoint: Path | None = None
+    """Checkpoint folder of a policy that this code evaluates; the network of the preset `cpu`, untrained, if not given."""
     before: Path | None = None
-    """Root of a checkout of 721bfa4, such as `git worktree add ../manifeel_at_721bfa4 721bfa4` makes; left out if not given."""
+    """Root of a clone with 721bfa4 checked out, which evaluates its own preset `cpu`; left out if not given."""
     episodes: int = 50
     """Number of episodes of each evaluation."""
     workers: int = 2
@@ -70,27 +71,26 @@ def timed(root: Path, module: str, checkpoint: Path, args: Args, *flags: str) ->
     return Run(seconds, used, steps, sum(episode["success_once"] for episode in episodes))
 
 
-def for_721bfa4(checkpoint: Path, folder: Path) -> Path:
-    """The checkpoint as 721bfa4 reads it."""
-    config = json.loads((checkpoint / "config.json").read_text())
-    policy = {OLD_NAMES.get(name, name): value for name, value in config["policy"].items()}
-    old = dict(kind="baselines.common.agent:PolicyAgent", policy_class=OLD_CLASSES[config["policy_name"]], policy=policy)
-    folder.mkdir()
-    (folder / "config.json").write_text(json.dumps(config | old))
-    shutil.copy(checkpoint / "model.safetensors", folder)
-    return folder
+def untrained(root: Path, folder: Path) -> Path:
+    """The preset `cpu` of the code in a checkout, after one gradient step; flags have the names that both know."""
+    recorded = (root / "data/sample" / TASK).glob("trajectory*.h5")
+    demos = max(recorded, key=lambda path: len(path.name))  # where there are two, the name of observations says more
+    command = [sys.executable, "baselines/diffusion_policy/train.py", "cpu", "--demos", str(demos.absolute()), "--env-id", TASK]
+    command += ["--cameras", CAMERA, "--steps", "1", "--run-dir", str(folder)]
+    environment = os.environ | dict(PYTHONPATH=str(root.absolute()), OMP_NUM_THREADS="1")
+    subprocess.run(command, cwd=root, env=environment, check=True)
+    return folder / "checkpoints/last"
 
 
 def main(args: Args) -> None:
     with tempfile.TemporaryDirectory() as folder:
         now = "manifeel_ms3.evaluation.evaluate"
-        commands = {
-            "to the time limit": (HERE, now, args.checkpoint),
-            "stops at success": (HERE, now, args.checkpoint, "--stop-at-success"),
-        }
+        rendered = ("--env-kwargs", json.dumps(RENDERED))
+        here = (args.checkpoint,) if args.checkpoint else (untrained(HERE, Path(folder) / "now"), *rendered)
+        commands = {"to the time limit": (HERE, now, *here), "stops at success": (HERE, now, *here, "--stop-at-success")}
         if args.before:
-            old = for_721bfa4(args.checkpoint, Path(folder) / "checkpoint")
-            commands["721bfa4"] = (args.before, "manifeel_ms3.evaluation.run", old)
+            old = untrained(args.before, Path(folder) / "before")
+            commands["721bfa4"] = (args.before, "manifeel_ms3.evaluation.run", old, *rendered)
         runs: dict[str, list[Run]] = {name: [] for name in commands}
         for _ in range(args.rounds):
             for name, (root, module, checkpoint, *flags) in commands.items():

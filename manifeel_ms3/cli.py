@@ -1,7 +1,7 @@
 """`manifeel`: every command of the package in one place.
 
-    manifeel record ManiFeel-PegInsertion-v1 -n 50 --out trajectory.h5
-    manifeel train diffusion_policy cpu --demos trajectory.h5
+    manifeel record ManiFeel-PegInsertion-v1 -n 50 --out peg.h5
+    manifeel train diffusion_policy cpu --demo-path peg.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
 Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). If it has
@@ -26,6 +26,7 @@ from manifeel_ms3 import plugins
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import PluginError, UnknownNameError
 from manifeel_ms3.plugins import Command
+from manifeel_ms3.typed_modules import import_typed_tasks
 
 log = logging.getLogger(__name__)
 COMMANDS = {
@@ -98,6 +99,7 @@ def _run(arguments: list[str]) -> Any:
         module = command_module(name)
         getattr(module, "check_arguments", lambda _: None)(arguments[1:])
         args = tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:])
+        import_typed_tasks(args)
         answer = module.main(args)
         if hasattr(module, "next_step"):
             log.info("%s", module.next_step(args, answer))

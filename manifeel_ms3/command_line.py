@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 
 from .errors import InvalidArgumentError, ManifeelError, MissingExtraError
 from .paths import troubleshooting
+from .typed_modules import import_typed_tasks
 
 log = logging.getLogger(__name__)
 TRACEBACK = "MANIFEEL_TRACEBACK"
@@ -37,12 +38,13 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
 
     Args:
         main: Function of the command.
-        args: Its only argument.
+        args: Its only argument, as it was typed: a module before the id of a task, "my_task:MyLab-Press-v1", is imported.
         next_step: Function from `args` and the answer of `main` to what it made and what one can do with it; this is logged
             at the end.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
+        import_typed_tasks(args)
         answer = main(args)
         if next_step:
             log.info("%s", next_step(args, answer))

@@ -16,6 +16,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import import_module
 from multiprocessing import active_children, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any, Generic, TypeVar
@@ -25,6 +26,7 @@ from pebble import ProcessExpired, ProcessPool
 from pebble.pool.process import WORKERS_NAME
 
 from .errors import InvalidArgumentError, WorkFailedError
+from .typed_modules import imported
 
 State = TypeVar("State")
 Task = TypeVar("Task")
@@ -134,7 +136,7 @@ class WorkerPool(Generic[State, Task]):
         if workers < 1:
             raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
         worker = _Worker(make_state)
-        self._pool = ProcessPool(workers, context=SafeSpawnContext(), initializer=_start, initargs=(worker,))
+        self._pool = ProcessPool(workers, context=SafeSpawnContext(), initializer=_start, initargs=(worker, imported()))
         self._running: dict[Future[Any], Task] = {}
 
     def __enter__(self) -> "WorkerPool[State, Task]":
@@ -192,8 +194,10 @@ _this_worker: _Worker | None = None
 """The worker of this process; None in a process that is not one. A process has no other place to keep a state."""
 
 
-def _start(worker: _Worker) -> None:
+def _start(worker: _Worker, modules: tuple[str, ...]) -> None:
     global _this_worker
+    for module in modules:
+        import_module(module)
     torch.set_num_threads(1)
     threading.Thread(target=end_with_parent, daemon=True).start()
     _this_worker = worker

@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 import tyro
 
+from baselines import floors
 from baselines.flow_matching import train as flow_matching
+from baselines.tactile_representations import pretrain
 from manifeel_ms3 import cli
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
@@ -218,6 +220,17 @@ def test_flags_have_maniskills_names_and_their_old_ones():
     assert evaluate(args=["--num-eval-episodes", "3", "--num-eval-envs", "2"]) == evaluate(
         args=["--episodes", "3", "--workers", "2"]
     )
+    for args, theirs, ours in (
+        (pretrain.Args, "t3 --demo-path a.h5 --total-iters 7 --log-freq 2", "t3 --demos a.h5 --steps 7 --log-every 2"),
+        (
+            floors.Args,
+            "--num-eval-episodes 3 --num-eval-envs 2 --demo-path demos",
+            "--episodes 3 --workers 2 --demos demos",
+        ),
+        (cli.command_module("leaderboard").Args, "submit x --num-eval-envs 2", "submit x --workers 2"),
+        (cli.command_module("audit").Args, "--demo-path demos", "--demos demos"),
+    ):
+        assert tyro.cli(args, args=theirs.split()) == tyro.cli(args, args=ours.split())
     for command in ("record", "replay", "render-observations"):
         module = cli.command_module(command)
         positional = [PEG] if command == "record" else ["a.h5", *(["--out", "b.h5"] if command != "replay" else [])]

@@ -65,6 +65,18 @@ def test_a_command_that_is_shown_is_one(line, capsys):
         assert name == "pip" or words[:2] == ["manifeel", "--help"], line
 
 
+SOURCES = [*PAGES, *(path for folder in ("manifeel_ms3", "baselines") for path in (REPOSITORY / folder).rglob("*.py"))]
+OBSERVATIONS_IN = re.compile(
+    r"(record .*--out|render.observations .*--out|--demo-path|--demos|--sim|view|export) \S*\btrajectory\.h5"
+)
+
+
+def test_no_command_that_is_shown_writes_or_seeks_observations_in_a_file_of_states():
+    """A plain trajectory.h5 holds states and actions alone."""
+    wrong = {path.name: found[0] for path in SOURCES if (found := OBSERVATIONS_IN.search(path.read_text()))}
+    assert not wrong
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.stem}")
 def test_a_page_links_files_that_exist(page):
     assert not missing_targets(page)
@@ -105,21 +117,20 @@ ENDLESS = ("teleop",)  # runs until it is interrupted
 def shelf(tmp_path_factory) -> Path:
     """What pages take for granted: recordings, weights, pictures of a real sensor, a policy and a sensor of one's own."""
     shelf = tmp_path_factory.mktemp("shelf")
-    for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("trajectory", PEG)):
+    for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("peg", PEG)):
         states = states_sample(task)
         seen = dict(cameras=("wrist",), tactile_sensors=("right",), image_size=64)
         render_observations.main(render_observations.Args(states, shelf / f"{name}.h5", **seen, num=1))
     for suffix in (".h5", ".json"):
-        shutil.copy(shelf / f"trajectory{suffix}", shelf / f"peg{suffix}")
         shutil.copy(states.with_suffix(suffix), shelf / f"states{suffix}")
     (shelf / "real_pictures").mkdir()
-    with h5py.File(shelf / "trajectory.h5") as file:
+    with h5py.File(shelf / "peg.h5") as file:
         for k, picture in enumerate(file["traj_0/obs/sensor_data/tactile_right/rgb"][:20]):
             cv2.imwrite(str(shelf / f"real_pictures/{k}.png"), picture)
     module = re.search(r"```python\n(# my_module.*?)```", (REPOSITORY / "docs/evaluation.md").read_text(), flags=re.DOTALL)
     (shelf / "my_module.py").write_text(module[1])
     (shelf / "my_seeds.txt").write_text("734501\n220011\n")
-    flags = f"--demos {shelf}/trajectory.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
+    flags = f"--demo-path {shelf}/peg.h5 --run-dir {shelf}/runs/peg {SMALLER['train']}"
     evaluated = ["--num-eval-episodes", "2", "--eval-env-kwargs", json.dumps(dict(max_episode_steps=5))]
     diffusion.main(
         tyro.cli(cli.command_module("train").Args, args=["diffusion_policy", "cpu", *shlex.split(flags), *evaluated])
@@ -181,7 +192,7 @@ def _run(command: str, place: Path) -> None:
 
 def _prepare_submission(place: Path) -> None:
     """A policy that learnt nothing, and its 50 starts, of a few steps each."""
-    flags = "--demos trajectory.h5 --obs-mode tacff --run-dir runs/x --overwrite"
+    flags = "--demo-path peg.h5 --obs-mode tacff --run-dir runs/x --overwrite"
     _run(f"python baselines/diffusion_policy/train.py cpu {flags}", place)
     (place / "my_submission").mkdir()
     about = dict(name="Nothing learnt", authors="A page")

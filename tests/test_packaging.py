@@ -1,15 +1,17 @@
 """What is built is whole: the wheel made from the source archive has every asset, and works from any folder."""
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
 import venv
 import zipfile
-from importlib.metadata import version
+from importlib.metadata import requires, version
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).parents[1]
 MAKE = """
@@ -44,6 +46,21 @@ def test_the_wheel_holds_all_that_the_packages_hold(wheel):
     missing = {path.relative_to(REPOSITORY).as_posix() for path in files} - inside
     assert not missing
     assert {f"manifeel_ms3/data/{path.name}" for path in (REPOSITORY / "data").iterdir() if path.is_file()} <= inside
+
+
+def dependency(name: str) -> Requirement:
+    """What pyproject.toml asks for of a package."""
+    (asked,) = re.findall(rf'"({name}[<>=][^"]*)"', (REPOSITORY / "pyproject.toml").read_text())
+    return Requirement(asked)
+
+
+def test_gymnasium_has_the_modes_of_automatic_resets_that_evaluation_names():
+    """They came with version 1.1, which ManiSkill allows; the pinned version is a later one."""
+    asked = dependency("gymnasium").specifier
+    assert not asked.contains("1.0.0")
+    (theirs,) = (one for line in requires("mani-skill") or [] if (one := Requirement(line)).name == "gymnasium")
+    (pinned,) = re.findall(r"^gymnasium==([\d.]+)", (REPOSITORY / "requirements.lock").read_text(), flags=re.MULTILINE)
+    assert all(specifier.contains(one) for specifier in (asked, theirs.specifier) for one in ("1.1.0", pinned))
 
 
 def test_it_works_from_any_folder(wheel, tmp_path):

@@ -1,7 +1,7 @@
 """Train an Equivariant Diffusion Policy on demonstrations.
 
-    python baselines/equivariant_diffusion_policy/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
-    python baselines/equivariant_diffusion_policy/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
+    python baselines/equivariant_diffusion_policy/train.py paper --demo-path peg.h5 --obs-mode rgb+tacff
+    python baselines/equivariant_diffusion_policy/train.py cpu --demo-path peg.h5 --obs-mode rgb+tacff
 
 The preset `paper` has the settings of the paper's public code, `cpu` a small network that learns on two CPU cores in minutes.
 """

@@ -1,8 +1,8 @@
 """Train a Flow Matching policy on demonstrations.
 
-    python baselines/flow_matching/train.py paper --demos trajectory.h5 --obs-mode rgb+tacff
-    python baselines/flow_matching/train.py consistency --demos trajectory.h5 --obs-mode rgb+tacff
-    python baselines/flow_matching/train.py cpu --demos trajectory.h5 --obs-mode rgb+tacff
+    python baselines/flow_matching/train.py paper --demo-path peg.h5 --obs-mode rgb+tacff
+    python baselines/flow_matching/train.py consistency --demo-path peg.h5 --obs-mode rgb+tacff
+    python baselines/flow_matching/train.py cpu --demo-path peg.h5 --obs-mode rgb+tacff
 
 The preset `paper` has the settings of the paper's public code, `consistency` trains for generation in one step, and `cpu` has a
 small network that learns on two CPU cores in minutes.

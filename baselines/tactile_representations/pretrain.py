@@ -1,7 +1,7 @@
 """Train a tactile representation on TacRGB images alone, from demonstrations or any other trajectory file that holds them.
 
-    python -m baselines.tactile_representations.pretrain unit --demos nut.h5 --env-id ManiFeel-NutBoltAssembly-v1
-    python -m baselines.tactile_representations.pretrain t3 --demos a.h5 b.h5 --out t3.safetensors
+    python -m baselines.tactile_representations.pretrain unit --demo-path nut.h5 --env-id ManiFeel-NutBoltAssembly-v1
+    python -m baselines.tactile_representations.pretrain t3 --demo-path a.h5 b.h5 --out t3.safetensors
 
 The first is what the paper ManiFeel does for all its tasks. UniT is trained as a VQGAN (Esser et al. 2021), the transformers by
 masked autoencoding; the option `--tacrgb-weights` of a policy's training takes the result.
@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ import torch.nn as nn
 import torch.nn.functional as F  # noqa: N812
 import tyro
 from safetensors.torch import save_file
+from tyro.conf import arg
 
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
@@ -59,7 +60,7 @@ class Args:
 
     representation: tyro.conf.Positional[Representation]
     """Name of the representation."""
-    demos: tuple[Path, ...]
+    demos: Annotated[tuple[Path, ...], arg(name="demo-path", aliases=["--demos"])]
     """Trajectory files with TacRGB images."""
     env_id: str | None = None
     """Environment id of the task that all demonstrations must be of; any tasks if not given."""
@@ -70,7 +71,7 @@ class Args:
     for unit and 224 for the others, as in the paper."""
     batch_size: int = 16
     """Number of images in a gradient step; the default is that of the paper's public code for UniT."""
-    steps: int | None = None
+    steps: Annotated[int | None, arg(name="total-iters", aliases=["--steps"])] = None
     """Number of gradient steps; if not given, those of 50 epochs, as in the paper's public code for UniT."""
     lr: float = 7.2e-5
     """Learning rate of the optimiser; the default is that of the paper's public code for UniT, 4.5e-6 for each of 16 images."""
@@ -81,12 +82,12 @@ class Args:
     """Seed of the initial weights and of the order of the images."""
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
     """Device that trains, "cuda" or "cpu"."""
-    log_every: int = 10
+    log_freq: Annotated[int, arg(aliases=["--log-every"])] = 10
     """Number of gradient steps between the losses that are shown and returned."""
 
 
 def main(args: Args) -> list[float]:
-    """Train, write the weights, and return every `log_every`-th loss.
+    """Train, write the weights, and return every `log_freq`-th loss.
 
     Raises:
         InvalidArgumentError: The representation does not take images of this size.
@@ -116,7 +117,7 @@ def _pretrain(args: Args) -> list[float]:
         for step in range(steps):
             batch = images[torch.randint(len(images), (args.batch_size,))].to(args.device)
             loss = training.step(batch.movedim(-1, 1).float() / 127.5 - 1, step)
-            if step % args.log_every == 0:
+            if step % args.log_freq == 0:
                 losses.append(float(loss))
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)

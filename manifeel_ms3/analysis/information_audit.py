@@ -1,4 +1,4 @@
-"""Measure what vision and touch carry: `python -m manifeel_ms3.analysis.information_audit --demos data/demos --out runs/audit`.
+"""Measure what vision and touch carry: `python -m manifeel_ms3.analysis.information_audit --demo-path data/demos`.
 
 Small predictors, fitted to recorded observations of one camera or one pad at one moment, answer the questions of
 `manifeel_ms3.analysis.probes`, which a policy would need to answer. Where they cannot answer from a modality, a policy that
@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -298,7 +299,7 @@ def draw_figure(results: list[ProbeResult], path: Path) -> None:
 class Args:
     """Arguments of the information audit."""
 
-    demos: Path = Path("data/demos")
+    demos: Annotated[Path, tyro.conf.arg(name="demo-path", aliases=["--demos"])] = Path("data/demos")
     """Folder with the recordings of `manifeel dataset`, a folder of each task with a trajectory file that has observations."""
     out: Path = Path("runs/audit")
     """Folder for audit.json, audit.md and audit.png."""

@@ -26,7 +26,7 @@ SIMILARITY_TEXT = """
 
 Distances of simulated to real tactile images, by features of a network; the smaller, the more alike. The paper's are of a
 ResNet that it does not name. Ours need pictures of a real sensor, which this repository does not have: `manifeel similarity
---sim trajectory.h5 --real PICTURES --object ball` measures them, and this page shows them if it is given their folder.
+--sim peg.h5 --real PICTURES --object ball` measures them, and this page shows them if it is given their folder.
 """
 
 

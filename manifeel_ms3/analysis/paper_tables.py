@@ -1,10 +1,12 @@
 """The paper's tables in the paper's form: each cell has our success with its interval, and the paper's."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.evaluation.floors import highest_floor
+from manifeel_ms3.tasks.registry import task_spec
 
 from .condition import Condition
 from .estimates import Estimate, mean_success
@@ -18,7 +20,8 @@ TEXT = """
 
 A cell has our success with its interval of 95 %, and the paper's after the slash; a number of ours links to its result file,
 and what stands after ± is the standard deviation over training seeds, where there are several.
-Only conditions with the paper's number of demonstrations appear; each set-up has tables of its own. The paper contradicts
+Only conditions with the paper's number of demonstrations appear; each set-up has tables of its own. "Floor" is the highest
+success of policies that have learnt nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts
 itself on ball sorting: its list of set-ups has dim light alone, but Tables I and II report different rates for the same
 policies; here, Tables II and III are run in both lights.
 """
@@ -46,21 +49,30 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
     for setup in setups:
         if rows := list(_rows_by_sensing(found, files, setup, {(task, DP): rates for task, rates in MODALITIES.items()})):
             yield f"\n### Table I, what touch adds: Diffusion Policy, {setup}\n\n"
-            yield markdown_table(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
+            yield _with_floors(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
         by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
         rows = list(_rows_by_sensing(found, files, setup, by_policy))
         if {policy for (_, policy), _ in rows} - {DP}:
             yield f"\n### Table II, three policies: {setup}\n\n"
-            yield markdown_table(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
+            yield _with_floors(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
         if rows := list(_rows_by_encoder(found, files, setup)):
             yield f"\n### Table III, encoders of TacRGB: {setup}\n\n"
             names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
-            yield markdown_table(("task", *names), rows)
+            yield _with_floors(("task", *names), rows)
     missing = [] if any(setup.preset == PAPER for setup in setups) else ["the networks of the paper (ResNet-18)"]
     if not any(True for setup in setups for _ in _rows_by_encoder(found, files, setup)):
         missing.append("Table III, the encoders with published weights")
     if missing:
         yield NEEDS_GPU.format(what=", and ".join(missing))
+
+
+def _with_floors(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table, with a column for the failure floors of the tasks in its first column if any of them is known."""
+    specs = [task_spec(task) for task, *_ in rows]
+    floors = [highest_floor(spec.env_id, spec.revision) for spec in specs]
+    if not any(floors):
+        return markdown_table(names, rows)
+    return markdown_table((*names, "floor"), [(*row, floor) for row, floor in zip(rows, floors, strict=True)])
 
 
 def _setups(found: Found) -> list[Setup]:
@@ -107,6 +119,22 @@ def linked(success: Estimate, file: str | None) -> str:
     return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
 
 
+def table_one(found: Found) -> tuple[Setup, dict[tuple[str, str], Condition]] | None:
+    """The conditions of Table I, by task and observation mode, in the set-up in which most of them were run.
+
+    None if none was run.
+
+    Args:
+        found: The results that enter comparisons.
+    """
+    by_setup: dict[Setup, dict[tuple[str, str], Condition]] = {}
+    for task in MODALITIES:
+        for mode in MODES:
+            for setup, condition in answering(paper_condition(task, mode), found).items():
+                by_setup.setdefault(setup, {})[task, mode] = condition
+    return max(by_setup.items(), key=lambda item: len(item[1]), default=None)
+
+
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
     """Draw the success of Table I as bars: tasks side by side, a bar for each sensing, the paper's rates as black lines.
 
@@ -124,16 +152,12 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    bars: dict[Setup, dict[tuple[str, str], Estimate]] = {}
-    for task in MODALITIES:
-        for mode in MODES:
-            for setup, condition in answering(paper_condition(task, mode), found).items():
-                bars.setdefault(setup, {})[task, mode] = mean_success(found[condition])
-    if not bars:
+    if not (most := table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    setup, drawn = max(bars.items(), key=lambda item: len(item[1]))
+    setup, conditions = most
+    drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
     tasks = list(MODALITIES)
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()

@@ -1,7 +1,7 @@
 """The paper's protocol: success is the mean over the last ten checkpoints, all episodes and training seeds of a condition."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,8 @@ FEWEST_EPISODES = 50
 """Number of episodes of the paper's protocol. A result with fewer has another purpose, and enters no comparison."""
 FEWEST_STEPS = 2000
 """Number of gradient steps of the shortest preset. A run with fewer has another purpose, and enters no comparison."""
-Outcomes = dict[int, bool]
-"""Success in an episode, by the episode's seed."""
+Outcomes = dict[int, dict[str, Any]]
+"""Episodes of a result file, by their seeds."""
 
 
 @dataclass
@@ -32,6 +32,10 @@ class ConditionResults:
     """Gradient steps of the last checkpoint, of the training seed that has the fewest; None for a policy that names none."""
     planned_steps: int | None = None
     """Gradient steps that its training was to have; None if the results do not say it."""
+    episodes: list[dict[str, Any]] = field(default_factory=list)
+    """The episodes of `success` as their result files have them, in the same order."""
+    force_limit: float | None = None
+    """The task's limit of the contact force for gentle success when it was evaluated, in N; None without one."""
 
     @property
     def size(self) -> str:
@@ -69,8 +73,9 @@ def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Conditi
     """
     found: dict[Condition, dict[int | None, dict[int, Outcomes]]] = {}
     planned: dict[Condition, int] = {}
+    limits: dict[Condition, float] = {}
     for result in results:
-        outcomes = {episode["seed"]: episode["success_once"] for episode in result["episodes"]}
+        outcomes = {episode["seed"]: episode for episode in result["episodes"]}
         condition, seed, step = condition_of(result), result["training_seed"], result["config"].get("step", 0)
         steps = found.setdefault(condition, {}).setdefault(seed, {})
         if step in steps:
@@ -78,7 +83,12 @@ def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Conditi
         steps[step] = outcomes
         if isinstance(total := result["config"].get("total_steps"), int):
             planned[condition] = max(planned.get(condition, 0), total)
-    return {condition: _stacked(condition, by_seed, last, planned.get(condition)) for condition, by_seed in found.items()}
+        if (limit := result.get("force_limit")) is not None:
+            limits[condition] = limit
+    return {
+        condition: replace(_stacked(condition, by_seed, last, planned.get(condition)), force_limit=limits.get(condition))
+        for condition, by_seed in found.items()
+    }
 
 
 def of_the_protocol(found: dict[Condition, ConditionResults]) -> dict[Condition, ConditionResults]:
@@ -97,6 +107,8 @@ def _stacked(
             raise ResultError(
                 f"the results of {condition} are of different initial states; evaluate all of them with as many --episodes"
             )
-    success = np.array([[[outcomes[seed] for seed in seeds] for outcomes in run] for run in evaluated], float)
+    episodes = [outcomes[seed] for run in evaluated for outcomes in run for seed in seeds]
+    success = np.array([episode["success_once"] for episode in episodes], float)
     trained = min(max(steps) for steps in by_seed.values())
-    return ConditionResults(success, seeds, trained or None, planned)
+    shape = len(evaluated), checkpoints, len(seeds)
+    return ConditionResults(success.reshape(shape), seeds, trained or None, planned, episodes)

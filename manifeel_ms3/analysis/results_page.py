@@ -19,13 +19,14 @@ from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import read_json_lines, write_text
-from manifeel_ms3.tasks.registry import short_name
+from manifeel_ms3.tasks.registry import all_tasks
 
 from .answers import answers
 from .census import census_table
 from .claims import claims_page
 from .condition import Condition, condition_of
 from .estimates import difference, mean_success
+from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
 from .paper_beside import runtime_table, similarity_table
 from .paper_tables import draw_sensing_by_task, linked, tables_of_the_paper
@@ -47,9 +48,11 @@ HEAD = """# Results
 
 Success is success at any step of an episode, with its interval of 95 % over training seeds and initial states: the mean over
 training seeds, the last checkpoints (at most {last}) and the evaluation episodes; "of" says how many there are of each. "Std"
-is the standard deviation over training seeds. "Floor" is the highest success of policies that have learnt nothing, where it was
-measured on this revision of the task. "Settings" names the preset of the policy and what differs from it, "id" is the
-hash of everything that makes the condition another one. Cost is that of training, all seeds together.
+is the standard deviation over training seeds. "Gentle success" counts the episodes that succeed before the contact force
+exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor" is the highest
+success of policies that have learnt nothing, where it was measured on this revision of the task. "Settings" names the preset
+of the policy and what differs from it, "id" is the hash of everything that makes the condition another one. Cost is that of
+training, all seeds together.
 """
 CHART = """
 ![Success by task and sensing, with intervals of 95 %, and the paper's rates]({figure})
@@ -68,11 +71,19 @@ CURVES = """
 Success of the checkpoints in the course of training, with intervals of 95 %. An environment step is one recorded step that a
 sample of a batch begins at: gradient steps times batch size. The numbers: [csv]({table}).
 """
+GENTLE = """
+## Gentle success
+
+![Success against the contact force allowed, by sensing]({figure})
+
+Share of the episodes that succeed before their contact force exceeds the force allowed, in the tasks of Table I that were run.
+The curves end at the success of the tables, and the dashed line is the limit of the task.
+"""
 FLOORS = """
 ## Failure floors
 
-Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes: {policies}.
-`python -m baselines.floors` measures them.
+Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes, on the present revision
+of each task: {policies}. `python -m baselines.floors` measures them; tasks that are not in the table were not measured.
 
 """
 LEFT_OUT = """
@@ -119,7 +130,10 @@ def main(args: Args) -> Path:
     bars = figure.with_name(f"{args.out.stem}_sensing.png")
     has_bars = draw_sensing_by_task(of_the_protocol(collect(results)), bars)
     chart = bars.relative_to(args.out.parent) if has_bars else None
-    write_text(args.out, "".join(page(results, loss, similarities, curves, files, chart)))
+    forces = figure.with_name(f"{args.out.stem}_gentle.png")
+    has_forces = draw_success_under_force(of_the_protocol(collect(results)), forces)
+    gentle = forces.relative_to(args.out.parent) if has_forces else None
+    write_text(args.out, "".join(page(results, loss, similarities, curves, files, chart, gentle)))
     return args.out
 
 
@@ -168,6 +182,7 @@ def page(
     success: Path | None = None,
     files: Mapping[Condition, str] | None = None,
     chart: Path | None = None,
+    gentle: Path | None = None,
 ) -> Iterator[str]:
     """The Markdown page, part by part.
 
@@ -178,6 +193,7 @@ def page(
         success: Path of the figure with success in the course of training, beside its csv file; no figure if not given.
         files: Links to the result files of conditions; no links if not given.
         chart: Path of the figure with success by task and sensing; no figure if not given.
+        gentle: Path of the figure with success against the contact force allowed; no figure if not given.
     """
     collected = collect(results)
     found = of_the_protocol(collected)
@@ -187,6 +203,8 @@ def page(
         yield CHART.format(figure=chart)
     yield from tables_of_the_paper(found, files)
     yield from answers(found, results)
+    if gentle:
+        yield GENTLE.format(figure=gentle)
     yield "\n## What was run\n\n"
     yield _table_of_conditions(collected, results, files)
     if files:
@@ -201,7 +219,7 @@ def page(
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
-    yield _table_of_floors(collected)
+    yield _table_of_floors()
     yield census_table(results, [condition for condition, _ in _sorted(found)])
     yield rank_table(found)
     yield f"{CLAIMS}\n"
@@ -218,10 +236,11 @@ def _table_of_conditions(
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
         what = (_task(condition), condition.sensing, condition.policy, condition.encoder, condition.num_demos)
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
-        success = (linked(mean_success(here), files.get(condition)), _floor(condition), _deviation(here), here.size, note)
-        rows.append((*what, setup_of(condition), f"`{condition.key}`", *success, cost, machines))
+        success = linked(mean_success(here), files.get(condition))
+        measured = (success, _floor(condition), _deviation(here), gentle_cell(here), here.size, note)
+        rows.append((*what, setup_of(condition), f"`{condition.key}`", *measured, cost, machines))
     names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
-    return markdown_table((*names, "success", "floor", "std", "of", "note", "cost", "on"), rows)
+    return markdown_table((*names, "success", "floor", "std", "gentle success", "of", "note", "cost", "on"), rows)
 
 
 def _floor(condition: Condition) -> str | None:
@@ -229,16 +248,15 @@ def _floor(condition: Condition) -> str | None:
     return floor and str(floor)
 
 
-def _table_of_floors(found: dict[Condition, ConditionResults]) -> str:
-    """The floors of the tasks of some conditions; "" where none was measured."""
-    tasks = dict.fromkeys((condition.env_id, condition.revision) for condition, _ in _sorted(found))
-    floors = {task: here for task in tasks if (here := floors_of(*task))}
+def _table_of_floors() -> str:
+    """The floors of all tasks that have some on their present revision; "" where none was measured."""
+    floors = [(spec, here) for spec in all_tasks().values() if (here := floors_of(spec.env_id, spec.revision))]
     rows = [
-        (short_name(env_id), *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
-        for (env_id, _), here in floors.items()
+        (spec.name, spec.revision, *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
+        for spec, here in floors
     ]
     policies = "; ".join(f"{name}: {about}" for name, about in POLICIES.items())
-    return f"{FLOORS.format(policies=policies)}{markdown_table(('task', *POLICIES), rows)}" if rows else ""
+    return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 
 def _deviation(results: ConditionResults) -> str | None:

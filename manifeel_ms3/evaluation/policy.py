@@ -3,7 +3,6 @@
 import importlib
 import importlib.util
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 
 from manifeel_ms3 import plugins
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
+from manifeel_ms3.typed_modules import look_in_working_folder
 
 from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash, file_hash
 from .redaction import redacted
@@ -209,12 +209,3 @@ def import_name(name: str) -> Any:
     look_in_working_folder()
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)
-
-
-def look_in_working_folder() -> None:
-    """Let modules of the working folder be imported, which an installed command, unlike `python -m`, does not find.
-
-    The folder is searched last, so that nothing in it can take the place of an installed module.
-    """
-    if (here := str(Path.cwd())) not in sys.path:
-        sys.path.append(here)

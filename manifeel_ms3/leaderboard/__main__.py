@@ -61,7 +61,7 @@ class Submit:
     needed."""
     seed: int | None = None
     """Seed of the draw of these episodes, to repeat an earlier draw; a new one if not given."""
-    workers: int = 1
+    workers: Annotated[int, tyro.conf.arg(name="num-eval-envs", aliases=["--workers"])] = 1
     """Number of processes that run episodes side by side."""
     board: Path = Path("leaderboard")
     """Folder of the leaderboard."""

@@ -94,7 +94,7 @@ def trajectory_file(folder: Path, **images: np.ndarray) -> Path:
 def test_pictures_alone_train_a_representation(name, pictures, tmp_path, monkeypatch):
     make, size = SMALL[name]
     monkeypatch.setitem(pretrain.REPRESENTATIONS, name, make)
-    sizes = dict(image_size=size, batch_size=4, steps=20, lr=2e-3, adversary_from=17, log_every=1)
+    sizes = dict(image_size=size, batch_size=4, steps=20, lr=2e-3, adversary_from=17, log_freq=1)
     losses = trained(name, pictures, tmp_path / "weights.safetensors", **sizes)
     assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:3])
     fresh = RepresentationEncoder(make(), size, features=64)

@@ -1,0 +1,59 @@
+"""A task in a module of the working folder is found where its id is typed on a command line, and nowhere else."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+MODULE = '''
+from manifeel_ms3.experts.object_search import ObjectSearchExpert
+from manifeel_ms3.tasks.exploration.object_search import ObjectSearchEnv
+from manifeel_ms3.tasks.registry import register_demonstrator, register_task
+
+
+@register_task("MyLab-Press-v1", max_episode_steps=160, category="exploration", paper_demos=1)
+class Press(ObjectSearchEnv):
+    """Press the button of my laboratory."""
+
+
+register_demonstrator("MyLab-Press-v1")(ObjectSearchExpert)
+'''
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    (tmp_path / "my_task.py").write_text(MODULE)
+    return tmp_path
+
+
+def manifeel(folder: Path, *arguments: str, python=("-P", "-m", "manifeel_ms3.cli")) -> subprocess.CompletedProcess:
+    """The installed command, which has no working folder on its path."""
+    environment = os.environ | dict(PYTHONPATH=str(REPOSITORY))
+    command = [sys.executable, *python, *arguments]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
+def test_a_task_is_shown_where_its_module_is_typed_with_it(folder):
+    shown = manifeel(folder, "tasks", "my_task:MyLab-Press-v1")
+    assert "Press the button of my laboratory" in shown.stdout, shown.stderr
+    by_module = manifeel(folder, "my_task:MyLab-Press-v1", python=("-P", "-m", "manifeel_ms3.tasks"))
+    assert "Press the button of my laboratory" in by_module.stdout, by_module.stderr
+    without = manifeel(folder, "tasks", "MyLab-Press-v1")
+    assert "'MyLab-Press-v1' is not registered" in without.stderr
+    missing = manifeel(folder, "tasks", "no_task:MyLab-Press-v1")
+    assert "the module 'no_task' of the task 'no_task:MyLab-Press-v1' is neither installed nor in the" in missing.stderr
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
+def test_it_is_recorded_by_worker_processes_and_its_file_imports_nothing(folder):
+    bare = ("--obs-mode", "none", "--env-kwargs", json.dumps(dict(render_backend="none")))
+    recorded = manifeel(folder, "record", "my_task:MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)
+    assert recorded.returncode == 0, recorded.stderr
+    assert json.loads((folder / "press.json").read_text())["env_info"]["env_id"] == "my_task:MyLab-Press-v1"
+    replayed = manifeel(folder, "replay", "press.h5")
+    assert "'MyLab-Press-v1' is not registered" in replayed.stderr
