@@ -68,7 +68,8 @@ class Args:
     """Print the plan and the hours that it will take, without running it."""
     publish: Path | None = None
     """Folder of a submission on the leaderboard, such as leaderboard/cpu, into which the results that are done are copied, with
-    a checkpoint of each row; nothing is run. Only evaluations with `half_precision: true` are copied."""
+    a checkpoint of each row; nothing is run. Other results of the folder stay. Only evaluations with `half_precision: true` are
+    copied."""
     name: str = ""
     """Name of that submission; the study's name if not given."""
     authors: str = "The authors of manifeel_ms3"

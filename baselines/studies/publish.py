@@ -12,8 +12,9 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.entries import ABOUT, CHECKPOINTS
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.files import atomic_folder, write_json
+from manifeel_ms3.files import atomic_folder, read_json, write_json
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
 from .jobs import is_done
@@ -21,7 +22,9 @@ from .study import Job
 
 
 def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) -> int:
-    """Copy the results of a study's finished evaluations into a submission's folder; what it held before is replaced.
+    """Copy the results of a study's finished evaluations into a submission's folder.
+
+    Results that the folder holds of other evaluations stay, such as those of a machine that did another part of the study.
 
     Args:
         jobs: Jobs of the study; of those that are evaluations, those in half precision are published.
@@ -31,7 +34,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         authors: Names of its authors.
 
     Returns:
-        The number of results.
+        The number of results that the folder then holds.
 
     Raises:
         InvalidArgumentError: No evaluation in half precision is done.
@@ -45,22 +48,38 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         )
     if folder.is_dir() and not (folder / ABOUT).is_file():
         raise FileExistsAlreadyError(f"{folder} exists and is no submission: it has no {ABOUT}; give another folder")
-    hashes: dict[str, str] = {}
     with owned(folder), atomic_folder(folder, replace=True) as partial:
-        for job in done:
-            for path in sorted(job.folder(root).glob("*.json")):
-                if path.stem.isdigit():
-                    checkpoint = job.folder(root) / CHECKPOINTS / path.stem
-                    copied = _publish_result(path, checkpoint, partial)
-                    hashes[copied.relative_to(partial).as_posix()] = checkpoint_sha256(checkpoint)
+        hashes = _copy_old(folder, partial)
+        results = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]
+        for run in {_run_folder(partial, read_result(path)) for path in results}:
+            shutil.rmtree(run, ignore_errors=True)
+        for path in results:
+            checkpoint = path.parent / CHECKPOINTS / path.stem
+            copied = _publish_result(path, checkpoint, partial)
+            hashes[copied.relative_to(partial).as_posix()] = checkpoint_sha256(checkpoint)
+        hashes = {result: sha256 for result, sha256 in hashes.items() if (partial / result).is_file()}
         write_json(partial / ABOUT, dict(name=name, authors=authors, checkpoints=hashes))
     return len(hashes)
+
+
+def _copy_old(folder: Path, partial: Path) -> dict[str, str]:
+    """Copy what the folder holds, and return the hashes of its checkpoints by their results."""
+    if not folder.is_dir():
+        return {}
+    shutil.copytree(folder, partial, dirs_exist_ok=True)
+    schema = json.loads((data_dir() / "submission_schema.json").read_text(encoding="utf-8"))
+    return read_json(folder / ABOUT, schema, "a submission")["checkpoints"]
+
+
+def _run_folder(folder: Path, result: dict[str, Any]) -> Path:
+    """Folder of the results of one training seed in a submission."""
+    return folder / entry_name(result) / f"seed{result['training_seed']}"
 
 
 def _publish_result(path: Path, checkpoint: Path, folder: Path) -> Path:
     """Copy a result, and its checkpoint if it is of the first training seed; return the copy of the result."""
     result = read_result(path)
-    run = folder / entry_name(result) / f"seed{result['training_seed']}"
+    run = _run_folder(folder, result)
     run.mkdir(parents=True, exist_ok=True)
     if result["training_seed"] == 0:
         shutil.copytree(checkpoint, run / CHECKPOINTS / checkpoint.name)

@@ -166,7 +166,7 @@ def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]
             continue
         twist = 0.0 if _is_ball(name) else TWIST_ARM * load  # a ball on a point contact would spin
         press.place(touching + CLEARANCE, *PLACE)
-        press.push(load, *(share * load for share in SHEAR_SHARES), twist)
+        press.push(load, *(share * load for share in SHEAR_SHARES), twist=twist)
         if press.slid > MOST_SLIDING:
             left_out.append(f"{name} at {load:g} N: it slid by {1e3 * press.slid:.0f} mm in the engine")
             continue

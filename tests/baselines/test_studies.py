@@ -326,6 +326,17 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
     study_command.main(study_command.Args(study, root, publish=board / "tiny"))
     monkeypatch.chdir(tmp_path)
     (entry,) = (path.parents[1].relative_to(board).as_posix() for path in board.rglob("00000012.json"))
+    about = json.loads((board / "tiny/submission.json").read_text())
+    assert len(about["checkpoints"]) == 2
+    other, gone = "Another/rgb/seed0/00000012.json", "Gone/rgb/seed0/00000012.json"
+    (board / "tiny" / other).parent.mkdir(parents=True)
+    (board / "tiny" / other).write_text("of another machine")
+    hashes = about["checkpoints"] | {other: "0" * 64, gone: "0" * 64}
+    (board / "tiny/submission.json").write_text(json.dumps(about | dict(checkpoints=hashes)))
+    study_command.main(study_command.Args(study, root, publish=board / "tiny"))
+    hashes.pop(gone)  # whose result is not there
+    assert json.loads((board / "tiny/submission.json").read_text())["checkpoints"] == hashes
+    assert (board / "tiny" / other).read_text() == "of another machine"
     evaluation.main(evaluation.Args(entry=entry, episodes=1))
     assert f"1 of 1 episodes agree with those of the entry {entry}" in caplog.text
     (board / entry / "seed0/checkpoints/00000012/config.json").write_text("{}")
