@@ -26,7 +26,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, Visuotact
 
 DOCS = Path(__file__).parent
 CARDS, FILMS, PICTURES = DOCS / "tasks", DOCS / "films", DOCS / "images" / "tasks"
-RESULT_COLUMNS = 14
+RESULT_COLUMNS = 15
 """Number of columns of the table of docs/results.md that says what was run."""
 CAPTION = "The scene, front, side and wrist camera, left and right pad, at four fifths of a demonstration."
 
