@@ -59,8 +59,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
             partial.replace(path)
             _flush(path.parent)
     finally:
-        if partial.is_file():
-            partial.unlink()
+        _delete(partial)
 
 
 @contextmanager
@@ -89,8 +88,8 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
             partial.rename(path)
             _flush(path.parent)
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
-        shutil.rmtree(old, ignore_errors=True)
+        _delete(partial)
+        _delete(old)
 
 
 def _temporary(path: Path) -> Path:
@@ -196,7 +195,16 @@ def remove_leftovers(folder: Path) -> None:
 
 def _delete_all(folder: Path, pattern: str) -> None:
     for path in folder.glob(pattern):
-        shutil.rmtree(path, ignore_errors=True)  # what cannot be deleted now is deleted by a later call
+        _delete(path)
+
+
+def _delete(path: Path) -> None:
+    """Delete a file, a link or a folder, which need not exist; what cannot be deleted now is deleted by a later call."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def _delete_abandoned(path: Path) -> None:
@@ -204,8 +212,7 @@ def _delete_abandoned(path: Path) -> None:
     for old in path.parent.glob(f".{escape(path.name)}.*-*{PARTIAL}"):
         writer = old.name.removeprefix(f".{path.name}.").partition("-")[0]
         if writer.isdigit() and not is_running(int(writer)):
-            with suppress(OSError):
-                old.unlink() if old.is_file() else shutil.rmtree(old)
+            _delete(old)
 
 
 def is_running(process: int) -> bool:

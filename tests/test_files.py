@@ -61,12 +61,18 @@ def test_two_processes_that_write_the_same_file_do_not_mix_their_texts(tmp_path)
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("is_link", [False, True])
 @pytest.mark.parametrize("make", [atomic_write, atomic_folder])
-def test_what_a_killed_writer_left_is_deleted_by_the_next(tmp_path, make):
+def test_what_a_killed_writer_left_is_deleted_by_the_next(tmp_path, make, is_link):
     child = os.fork()
     if child == 0:
         with make(tmp_path / "x") as partial:
-            (partial / "half" if partial.is_dir() else partial).write_text("half")
+            if partial.is_dir():
+                (partial / "half").write_text("half")
+            elif is_link:  # as that of the last checkpoint
+                partial.symlink_to("/")
+            else:
+                partial.write_text("half")
             os.kill(os.getpid(), signal.SIGKILL)
     os.waitpid(child, 0)
     assert len(list(tmp_path.iterdir())) == 1
