@@ -85,7 +85,12 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
                 _flush(entry)
             if replace and path.exists():
                 path.rename(old)
-            partial.rename(path)
+            try:
+                partial.rename(path)
+            except OSError:
+                if old.exists():
+                    old.rename(path)
+                raise
             _flush(path.parent)
     finally:
         _delete(partial)
