@@ -221,7 +221,7 @@ def undisturbed(tmp_path_factory) -> Path:
 
 def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
     path = tmp_path / "t.h5"
-    assert recorded(path, 2, ["os.remove", "seed_", 1])[0] == -signal.SIGKILL
+    assert recorded(path, 2, ["os.remove", "'seed_", 1])[0] == -signal.SIGKILL
     assert len(seeds(path)) == 2
     assert recorded(path, 3)[:2] == (0, 1)
     assert_same(path, undisturbed)
