@@ -45,12 +45,22 @@ class Args:
     """Seed of the networks, the environments and the actions."""
     total_timesteps: int = 60_000
     """Number of environment steps."""
+    save_model: bool = True
+    """Whether to write the weights to runs/<exp_name>/ckpt_<update>.pt at every evaluation."""
+    evaluate: bool = False
+    """Evaluate the weights of `checkpoint` and do not train."""
+    checkpoint: Path | None = None
+    """File of weights to start from."""
     learning_rate: float = 3e-4
     """Learning rate of Adam."""
     num_envs: int = 4
     """Number of environments, each in a process."""
     num_eval_envs: int = 2
     """Number of environments of an evaluation."""
+    num_eval_steps: int = 80
+    """Number of steps of each environment in an evaluation."""
+    partial_reset: bool = True
+    """Whether an episode of the training ends at success and failure, and not only at the time limit."""
     num_steps: int = 128
     """Number of steps of each environment between two updates."""
     eval_freq: int = 10
@@ -112,6 +122,7 @@ class Agent(nn.Module):
 
 
 def make_env(args: Args, ignore_terminations: bool = False) -> gym.Env:
+    torch.set_num_threads(1)
     env = gym.make(args.env_id, obs_mode=args.obs_mode, render_backend="none", **json.loads(args.env_kwargs))
     for wrapper in WRAPPERS:
         env = wrapper(env)
@@ -128,14 +139,16 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 
 @torch.no_grad()
-def evaluate(agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
-    """Metrics of one episode of the mean action in each environment, to the time limit."""
+def evaluate(args: Args, agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
+    """Mean metrics of the episodes of the mean action, which run to the time limit."""
     obs, _ = envs.reset(seed=100_000)
-    while True:
+    episodes = []
+    for _ in range(args.num_eval_steps):
         obs, _, _, truncated, infos = envs.step(agent.distribution(tensor(obs)).mean.clamp(-1, 1).numpy())
         if truncated.all():
-            metrics = infos["final_info"]["episode"]
-            return {f"eval/{name}": float(values.mean()) for name, values in metrics.items() if not name.startswith("_")}
+            episodes.append(infos["final_info"]["episode"])
+    names = [name for name in episodes[0] if not name.startswith("_")]
+    return {f"eval/{name}": float(np.mean([episode[name] for episode in episodes])) for name in names}
 
 
 class Rollout:
@@ -205,40 +218,56 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: 
     return losses
 
 
-def main(args: Args) -> Path:
-    """Train, and return the folder of the run."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    torch.manual_seed(args.seed)
-    random.seed(args.seed)
-    folder = Path("runs") / args.exp_name
+def train(args: Args, agent: Agent, envs: AsyncVectorEnv, eval_envs: AsyncVectorEnv, folder: Path) -> dict[str, float]:
+    """Train an agent, and return the metrics of the last evaluation."""
     writer, log = SummaryWriter(str(folder)), (folder / "log.jsonl").open("w")
-    envs, eval_envs = make_envs(args, args.num_envs), make_envs(args, args.num_eval_envs, ignore_terminations=True)
-    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0])
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
-    rollout, (obs, _), begin = Rollout(args, envs), envs.reset(seed=args.seed), time.time()
+    rollout, (obs, _), begin, metrics = Rollout(args, envs), envs.reset(seed=args.seed), time.time(), {}
     agent.watch(tensor(obs))
     num_updates = args.total_timesteps // (args.num_envs * args.num_steps)
     for iteration in range(num_updates + 1):
         step = iteration * args.num_envs * args.num_steps
         scalars = {}
         if iteration % args.eval_freq == 0 or iteration == num_updates:
-            scalars |= evaluate(agent, eval_envs)
+            scalars = metrics = evaluate(args, agent, eval_envs)
+            if args.save_model:
+                torch.save(agent.state_dict(), folder / f"ckpt_{iteration}.pt")
         if iteration < num_updates:
             obs, successes = rollout.collect(agent, envs, obs)
             advantages = rollout.advantages(args, agent.value(tensor(obs)).detach())
-            scalars |= update(args, agent, optimizer, rollout, advantages)
+            scalars = scalars | update(args, agent, optimizer, rollout, advantages)
             agent.watch(rollout.obs.flatten(0, 1))
-            scalars |= {"train/reward": rollout.rewards.mean().item(), "charts/SPS": step / (time.time() - begin)}
+            scalars |= {"train/reward": rollout.rewards.mean().item(), "time/total": time.time() - begin}
             scalars |= {"train/success_once": float(np.mean(successes))} if successes else {}
         for name, value in scalars.items():
             writer.add_scalar(name, value, step)
         log.write(json.dumps(dict(step=step) | scalars) + "\n")
         log.flush()
         logging.info("%d: %s", step, {name: round(value, 3) for name, value in scalars.items()})
-    torch.save(agent.state_dict(), folder / "agent.pt")
-    for made in (envs, eval_envs):
-        made.close()
-    return folder
+    return metrics
+
+
+def main(args: Args) -> dict[str, float]:
+    """Train or evaluate, and return the metrics of the last evaluation."""
+    if args.evaluate and not args.checkpoint:
+        raise SystemExit("--evaluate needs --checkpoint, the file of the weights")
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    torch.set_num_threads(1)  # networks this small gain nothing from more, and lose much where other processes run
+    torch.manual_seed(args.seed)
+    random.seed(args.seed)
+    eval_envs = make_envs(args, args.num_eval_envs, ignore_terminations=True)
+    agent = Agent(eval_envs.single_observation_space.shape[0], eval_envs.single_action_space.shape[0])
+    if args.checkpoint:
+        agent.load_state_dict(torch.load(args.checkpoint, weights_only=True))
+    if args.evaluate:
+        metrics = evaluate(args, agent, eval_envs)
+        logging.info("%s", {name: round(value, 3) for name, value in metrics.items()})
+    else:
+        envs = make_envs(args, args.num_envs, ignore_terminations=not args.partial_reset)
+        metrics = train(args, agent, envs, eval_envs, Path("runs") / args.exp_name)
+        envs.close()
+    eval_envs.close()
+    return metrics
 
 
 if __name__ == "__main__":
