@@ -147,6 +147,8 @@ def evaluate(args: Args, agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]
         obs, _, _, truncated, infos = envs.step(agent.distribution(tensor(obs)).mean.clamp(-1, 1).numpy())
         if truncated.all():
             episodes.append(infos["final_info"]["episode"])
+    if not episodes:
+        raise SystemExit(f"no episode ends in num_eval_steps={args.num_eval_steps}; give max_episode_steps or more")
     names = [name for name in episodes[0] if not name.startswith("_")]
     return {f"eval/{name}": float(np.mean([episode[name] for episode in episodes])) for name in names}
 
@@ -223,7 +225,8 @@ def train(args: Args, agent: Agent, envs: AsyncVectorEnv, eval_envs: AsyncVector
     writer, log = SummaryWriter(str(folder)), (folder / "log.jsonl").open("w")
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
     rollout, (obs, _), begin, metrics = Rollout(args, envs), envs.reset(seed=args.seed), time.time(), {}
-    agent.watch(tensor(obs))
+    if not args.checkpoint:
+        agent.watch(tensor(obs))
     num_updates = args.total_timesteps // (args.num_envs * args.num_steps)
     for iteration in range(num_updates + 1):
         step = iteration * args.num_envs * args.num_steps

@@ -170,6 +170,15 @@ def test_ppo_improves_a_policy_on_what_it_observes():
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.1
 
 
+@pytest.fixture
+def threads():
+    """Number of threads, which the script sets for its whole process, given back after a test."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
 def test_ppo_trains_on_a_task_and_evaluates_what_it_saved(tmp_path, monkeypatch):
     """ManiSkill's flags: `--save-model` writes weights, from which `--evaluate --checkpoint` makes the same numbers."""
     ppo = load("ppo")
@@ -183,23 +192,12 @@ def test_ppo_trains_on_a_task_and_evaluates_what_it_saved(tmp_path, monkeypatch)
     assert trained["eval/return"] > 0.0
     checkpoint = Path("runs/peg/ckpt_2.pt")
     assert ppo.main(ppo.Args(evaluate=True, checkpoint=checkpoint, **few)) == pytest.approx(trained)
-    ppo.main(ppo.Args(exp_name="more", checkpoint=checkpoint, save_model=False, total_timesteps=0, **few))
-    assert not list(Path("runs/more").glob("*.pt"))
-    first = json.loads(Path("runs/more/log.jsonl").read_text())
-    assert first["eval/return"] == pytest.approx(trained["eval/return"])
 
 
-@pytest.mark.parametrize(
-    ("args", "message"),
-    [
-        (dict(evaluate=True), "--evaluate needs --checkpoint"),
-        (dict(num_eval_steps=5), "num_eval_steps=5.*max_episode_steps"),
-    ],
-)
-def test_ppo_says_what_an_evaluation_needs(args, message):
+def test_ppo_needs_weights_to_evaluate():
     ppo = load("ppo")
-    with pytest.raises(SystemExit, match=message):
-        ppo.main(ppo.Args(**args))
+    with pytest.raises(SystemExit, match="--evaluate needs --checkpoint"):
+        ppo.main(ppo.Args(evaluate=True))
 
 
 class Aim(gym.Env):
