@@ -1,10 +1,10 @@
 """Feed our recordings to the data loader of ManiSkill's Diffusion Policy: `python examples/diffusion_policy_loader.py peg.h5`.
 
 `train_rgbd.py` of ManiSkill's `examples/baselines/diffusion_policy` reads a file with its `load_demo_dataset` and then turns
-each observation into `rgb`, `depth` and `state` with a function `obs_process_fn`. Ours is below. Put it into that script, and
-its loader, its training and its evaluation run on touch: the images of pads become channels of `rgb`, as the wrapper
-`FlattenVisuotactileObservationWrapper(env, sep_tacrgb=False, image_size=128, flat_tacff=True)` makes them in evaluation, and
-force fields become a part of `state`.
+each observation into `rgb` and `state` with a function `obs_process_fn`. Ours is below. Put it into that script, and wrap the
+environments of its `make_eval_envs` as `FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env))`, which makes the same `rgb`
+and `state` of what the policy observes: images of pads become channels of `rgb`, in the size of the cameras' images, and force
+fields become a part of `state`.
 """
 
 import logging
@@ -18,7 +18,6 @@ from torch.utils.data import DataLoader, Dataset
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.wrappers import resized
 
-IMAGE_SIZE = 128
 OBS_HORIZON, PRED_HORIZON = 2, 16  # those of ManiSkill's script
 
 
@@ -31,13 +30,14 @@ def leaves(tree):
 def obs_process_fn(obs) -> dict[str, np.ndarray]:
     """Observations of one episode, a group of the file, as ManiSkill's Diffusion Policy takes them: `rgb` and `state`."""
     rest = [leaf.reshape(len(leaf), -1) for name in ("agent", "extra") if name in obs for leaf in leaves(obs[name])]
-    sensors = obs["sensor_data"].values()
-    images = [torch.from_numpy(sensor["rgb"][()]) for sensor in sensors if "rgb" in sensor]
-    fields = [sensor["force_field"][()] for sensor in sensors if "force_field" in sensor]
+    sensors = sorted(obs["sensor_data"].items(), key=lambda item: item[0].startswith("tactile_"))  # cameras, then pads
+    images = [torch.from_numpy(sensor["rgb"][()]) for _, sensor in sensors if "rgb" in sensor]
+    fields = [sensor["force_field"][()] for _, sensor in sensors if "force_field" in sensor]
     fields = [field.reshape(len(field), -1) for field in fields]
     processed = dict(state=np.concatenate([*rest, *fields], axis=1).astype(np.float32))
     if images:
-        processed["rgb"] = torch.cat([resized(image, (IMAGE_SIZE, IMAGE_SIZE)) for image in images], dim=-1).numpy()
+        size = images[0].shape[1:3]
+        processed["rgb"] = torch.cat([resized(image, (size[0], size[1])) for image in images], dim=-1).numpy()
     return processed
 
 

@@ -1,4 +1,4 @@
-"""PPO on joint states and touch, with the arguments of ManiSkill's `ppo.py`: `python examples/ppo.py --total-timesteps 60000`.
+"""PPO on joint states and touch, with the arguments of ManiSkill's `ppo.py`: `python examples/ppo.py`.
 
 The observation is a vector of the state and of the right pad's force field; `FlattenVisuotactileObservationWrapper` makes it.
 Each environment simulates on the CPU in a process of its own. ManiSkill's own `ppo.py` needs the two wrappers of `WRAPPERS` and
@@ -28,32 +28,43 @@ import manifeel_ms3  # noqa: F401  (registers the tasks)
 from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper
 
 WRAPPERS = (partial(FlattenVisuotactileObservationWrapper, flat_tacff=True), FlattenObservationWrapper)
-FIXED = dict.fromkeys(("socket_xy", "start_xy", "start_z", "start_rotation", "in_hand_pitch"), 0.0)
+EASY = dict(socket_xy=0.0, start_xy=0.02, start_z=0.0, start_rotation=0.0, in_hand_pitch=0.0)
+"""The peg starts upright, up to 20 mm beside a socket that stays where it is."""
 
 
 @dataclass
 class Args:
     env_id: str = "ManiFeel-PegInsertion-v1"
     """Id of the task."""
-    env_kwargs: str = json.dumps(dict(randomization=FIXED, max_episode_steps=100))
-    """Arguments of the task as json. The default is the easiest PegInsertion: the socket and the start do not vary."""
+    env_kwargs: str = json.dumps(dict(randomization=EASY, max_episode_steps=40))
+    """Arguments of the task as json. By default it is easier than the paper's: see EASY, with short episodes."""
     obs_mode: str = "state+tacff"
     """Observation mode."""
     exp_name: str = "ppo"
     """Name of the run, whose log and weights are in runs/<exp_name>."""
     seed: int = 1
     """Seed of the networks, the environments and the actions."""
-    total_timesteps: int = 60_000
+    total_timesteps: int = 16_384
     """Number of environment steps."""
+    save_model: bool = True
+    """Whether to write the weights to runs/<exp_name>/ckpt_<update>.pt at every evaluation."""
+    evaluate: bool = False
+    """Evaluate the weights of `checkpoint` and do not train."""
+    checkpoint: Path | None = None
+    """File of weights to start from."""
     learning_rate: float = 3e-4
     """Learning rate of Adam."""
     num_envs: int = 4
     """Number of environments, each in a process."""
     num_eval_envs: int = 2
     """Number of environments of an evaluation."""
+    num_eval_steps: int = 80
+    """Number of steps of each environment in an evaluation."""
+    partial_reset: bool = True
+    """Whether an episode of the training ends at success and failure, and not only at the time limit."""
     num_steps: int = 128
     """Number of steps of each environment between two updates."""
-    eval_freq: int = 10
+    eval_freq: int = 4
     """Number of updates between two evaluations."""
     gamma: float = 0.9
     """Discount factor."""
@@ -112,6 +123,7 @@ class Agent(nn.Module):
 
 
 def make_env(args: Args, ignore_terminations: bool = False) -> gym.Env:
+    torch.set_num_threads(1)
     env = gym.make(args.env_id, obs_mode=args.obs_mode, render_backend="none", **json.loads(args.env_kwargs))
     for wrapper in WRAPPERS:
         env = wrapper(env)
@@ -128,14 +140,18 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 
 @torch.no_grad()
-def evaluate(agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
-    """Metrics of one episode of the mean action in each environment, to the time limit."""
+def evaluate(args: Args, agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
+    """Mean metrics of the episodes of the mean action, which run to the time limit."""
     obs, _ = envs.reset(seed=100_000)
-    while True:
+    episodes = []
+    for _ in range(args.num_eval_steps):
         obs, _, _, truncated, infos = envs.step(agent.distribution(tensor(obs)).mean.clamp(-1, 1).numpy())
         if truncated.all():
-            metrics = infos["final_info"]["episode"]
-            return {f"eval/{name}": float(values.mean()) for name, values in metrics.items() if not name.startswith("_")}
+            episodes.append(infos["final_info"]["episode"])
+    if not episodes:
+        raise SystemExit(f"no episode ends in num_eval_steps={args.num_eval_steps}; give max_episode_steps or more")
+    names = [name for name in episodes[0] if not name.startswith("_")]
+    return {f"eval/{name}": float(np.mean([episode[name] for episode in episodes])) for name in names}
 
 
 class Rollout:
@@ -205,40 +221,57 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: 
     return losses
 
 
-def main(args: Args) -> Path:
-    """Train, and return the folder of the run."""
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
-    torch.manual_seed(args.seed)
-    random.seed(args.seed)
-    folder = Path("runs") / args.exp_name
+def train(args: Args, agent: Agent, envs: AsyncVectorEnv, eval_envs: AsyncVectorEnv, folder: Path) -> dict[str, float]:
+    """Train an agent, and return the metrics of the last evaluation."""
     writer, log = SummaryWriter(str(folder)), (folder / "log.jsonl").open("w")
-    envs, eval_envs = make_envs(args, args.num_envs), make_envs(args, args.num_eval_envs, ignore_terminations=True)
-    agent = Agent(envs.single_observation_space.shape[0], envs.single_action_space.shape[0])
     optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
-    rollout, (obs, _), begin = Rollout(args, envs), envs.reset(seed=args.seed), time.time()
-    agent.watch(tensor(obs))
+    rollout, (obs, _), begin, metrics = Rollout(args, envs), envs.reset(seed=args.seed), time.time(), {}
+    if not args.checkpoint:
+        agent.watch(tensor(obs))
     num_updates = args.total_timesteps // (args.num_envs * args.num_steps)
     for iteration in range(num_updates + 1):
         step = iteration * args.num_envs * args.num_steps
         scalars = {}
         if iteration % args.eval_freq == 0 or iteration == num_updates:
-            scalars |= evaluate(agent, eval_envs)
+            scalars = metrics = evaluate(args, agent, eval_envs)
+            if args.save_model:
+                torch.save(agent.state_dict(), folder / f"ckpt_{iteration}.pt")
         if iteration < num_updates:
             obs, successes = rollout.collect(agent, envs, obs)
             advantages = rollout.advantages(args, agent.value(tensor(obs)).detach())
-            scalars |= update(args, agent, optimizer, rollout, advantages)
+            scalars = scalars | update(args, agent, optimizer, rollout, advantages)
             agent.watch(rollout.obs.flatten(0, 1))
-            scalars |= {"train/reward": rollout.rewards.mean().item(), "charts/SPS": step / (time.time() - begin)}
+            scalars |= {"train/reward": rollout.rewards.mean().item(), "time/total": time.time() - begin}
             scalars |= {"train/success_once": float(np.mean(successes))} if successes else {}
         for name, value in scalars.items():
             writer.add_scalar(name, value, step)
         log.write(json.dumps(dict(step=step) | scalars) + "\n")
         log.flush()
         logging.info("%d: %s", step, {name: round(value, 3) for name, value in scalars.items()})
-    torch.save(agent.state_dict(), folder / "agent.pt")
-    for made in (envs, eval_envs):
-        made.close()
-    return folder
+    return metrics
+
+
+def main(args: Args) -> dict[str, float]:
+    """Train or evaluate, and return the metrics of the last evaluation."""
+    if args.evaluate and not args.checkpoint:
+        raise SystemExit("--evaluate needs --checkpoint, the file of the weights")
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    torch.set_num_threads(1)  # networks this small gain nothing from more, and lose much where other processes run
+    torch.manual_seed(args.seed)
+    random.seed(args.seed)
+    eval_envs = make_envs(args, args.num_eval_envs, ignore_terminations=True)
+    agent = Agent(eval_envs.single_observation_space.shape[0], eval_envs.single_action_space.shape[0])
+    if args.checkpoint:
+        agent.load_state_dict(torch.load(args.checkpoint, weights_only=True))
+    if args.evaluate:
+        metrics = evaluate(args, agent, eval_envs)
+        logging.info("%s", {name: round(value, 3) for name, value in metrics.items()})
+    else:
+        envs = make_envs(args, args.num_envs, ignore_terminations=not args.partial_reset)
+        metrics = train(args, agent, envs, eval_envs, Path("runs") / args.exp_name)
+        envs.close()
+    eval_envs.close()
+    return metrics
 
 
 if __name__ == "__main__":

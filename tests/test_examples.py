@@ -1,16 +1,21 @@
 """What the documentation shows, works."""
 
 import importlib.util
+import json
 from pathlib import Path
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from mani_skill.utils.wrappers import FlattenRGBDObservationWrapper
 
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.sensors import pad_pose
 from manifeel_ms3.sensors.registry import SENSORS
+from manifeel_ms3.wrappers import PadsAsCamerasWrapper
 from tests.conftest import PEG, needs_renderer
 from tests.sample import observed_sample
 
@@ -111,13 +116,40 @@ def test_our_recordings_feed_the_loader_of_maniskills_diffusion_policy():
     """Its observations are those that the wrapper makes in evaluation."""
     example = load("diffusion_policy_loader")
     batch = example.main(observed_sample(PEG))
-    assert batch["observations"]["rgb"].shape == (8, 2, 128, 128, 3)
+    assert batch["observations"]["rgb"].shape == (8, 2, 32, 32, 3)
     assert batch["observations"]["state"].shape == (8, 2, 25 + 420)
     assert batch["actions"].shape == (8, 16, 6)
     dataset = example.DiffusionPolicyDataset(observed_sample(PEG))
     first, last = dataset[0], dataset[len(dataset.actions[0]) - 1]
     assert np.array_equal(first["observations"]["state"][0], first["observations"]["state"][1])  # padded
     assert np.array_equal(last["actions"][1], dataset.actions[0][-1])
+
+
+@needs_renderer
+def test_maniskills_loader_reads_what_its_evaluation_will_observe(make_env):
+    """Its loader gives `obs_process_fn` dictionaries of arrays, with the entries and in the order of the environment's space.
+
+    ManiSkill's package does not contain its loader, whose steps are written down here from its `train_rgbd.py`.
+    """
+    path = observed_sample(PEG)
+    header = read_header(path)
+    env = make_env(PEG, **header["env_info"]["env_kwargs"])
+    with h5py.File(path) as file:
+        recorded = arrays_like(file["traj_0/obs"], env.observation_space)
+    processed = load("diffusion_policy_loader").obs_process_fn(recorded)
+    observed, _ = FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env)).reset(seed=header["episodes"][0]["episode_seed"])
+    assert set(processed) == {"rgb", "state"} == set(observed)
+    assert processed["rgb"][:1] == pytest.approx(observed["rgb"].numpy(), abs=1)
+    assert processed["state"][:1] == pytest.approx(observed["state"].numpy(), abs=1e-3)
+    assert (processed["rgb"].dtype, processed["state"].dtype) == (np.uint8, np.float32)
+
+
+def arrays_like(group: h5py.Group, space: gym.spaces.Dict) -> dict:
+    """The arrays of a group that a space names, in the order of the space."""
+    return {
+        name: arrays_like(group[name], inner) if isinstance(inner, gym.spaces.Dict) else group[name][()]
+        for name, inner in space.spaces.items()
+    }
 
 
 def test_ppo_improves_a_policy_on_what_it_observes():
@@ -136,6 +168,36 @@ def test_ppo_improves_a_policy_on_what_it_observes():
         agent.watch(rollout.obs.flatten(0, 1))
         rewards.append(rollout.rewards.mean().item())
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.1
+
+
+@pytest.fixture
+def threads():
+    """Number of threads, which the script sets for its whole process, given back after a test."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("threads")
+def test_ppo_trains_on_a_task_and_evaluates_what_it_saved(tmp_path, monkeypatch):
+    """ManiSkill's flags: `--save-model` writes weights, from which `--evaluate --checkpoint` makes the same numbers."""
+    ppo = load("ppo")
+    monkeypatch.chdir(tmp_path)
+    few = dict(num_envs=1, num_eval_envs=1, num_steps=100, num_eval_steps=10, env_kwargs=json.dumps(dict(max_episode_steps=10)))
+    trained = ppo.main(ppo.Args(exp_name="peg", total_timesteps=200, eval_freq=2, **few))
+    assert sorted(path.name for path in Path("runs/peg").glob("*.pt")) == ["ckpt_0.pt", "ckpt_2.pt"]
+    log = [json.loads(line) for line in Path("runs/peg/log.jsonl").read_text().splitlines()]
+    assert [entry["step"] for entry in log] == [0, 100, 200]
+    assert "losses/policy_loss" in log[1]
+    assert trained["eval/return"] > 0.0
+    checkpoint = Path("runs/peg/ckpt_2.pt")
+    assert ppo.main(ppo.Args(evaluate=True, checkpoint=checkpoint, **few)) == pytest.approx(trained)
+
+
+def test_ppo_needs_weights_to_evaluate():
+    ppo = load("ppo")
+    with pytest.raises(SystemExit, match="--evaluate needs --checkpoint"):
+        ppo.main(ppo.Args(evaluate=True))
 
 
 class Aim(gym.Env):

@@ -109,6 +109,7 @@ def test_diffusion_policy_has_the_public_codes_learning_rate_for_each_encoder(mo
 def test_loss_falls(run, checkpoint):
     log = log_of(run.args.run_dir)
     assert [entry["step"] for entry in log] == [30, 60, 90, 120]
+    assert {"losses/total_loss", "charts/learning_rate"} <= set(log[0])
     consistency = getattr(run.args.policy, "consistency", False)  # its loss is a small disagreement, and noisy
     assert min(entry["losses/total_loss"] for entry in log) < (0.9 if consistency else 0.8) * log[0]["losses/total_loss"]
 

@@ -62,6 +62,14 @@ def test_maniskill_converts_controllers_and_observations(in_joints, capsys):
 
 
 @needs_renderer
+@pytest.mark.parametrize("mode", ["pd_ee_pose", "pd_joint_delta_pos", "pd_joint_target_delta_pos"])
+def test_maniskill_converts_joint_positions_to_every_mode_that_it_knows(mode, in_joints, capsys):
+    """Its other conversion, from `pd_joint_delta_pos`, fails in ManiSkill 3.0.1, which clips arrays as tensors there."""
+    files = replayed(in_joints, capsys, "--save-traj", "-c", mode)
+    assert read_header(files[".h5"])["env_info"]["env_kwargs"]["control_mode"] == mode
+
+
+@needs_renderer
 @pytest.mark.parametrize("flag", ["--use-first-env-state", "--use-env-states"])
 def test_maniskill_replays_from_recorded_states(flag, tmp_path, capsys):
     for suffix in (".h5", ".json"):

@@ -47,7 +47,7 @@ def test_a_file_that_is_not_there_is_said(tmp_path):
 
 @pytest.mark.parametrize("obs_mode", ["state", "state+tacff"])
 def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
-    """It has no contact forces, and its observations may be vectors."""
+    """It has no contact forces, its observations may be vectors, and its id names the module that registers the task."""
     env = make_env(PEG, obs_mode=obs_mode, render_backend="none")
     recorder = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)
     recorder.reset(seed=3)
@@ -55,6 +55,7 @@ def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
         recorder.step(recorder.action_space.sample())
     recorder.flush_trajectory()
     recorder._h5_file.close()
+    assert read_header(tmp_path / "theirs.h5")["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
     page = io.StringIO()
     Console(width=160, file=page).print(summary(tmp_path / "theirs.h5"))
     assert "2 on average" in page.getvalue()

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import sapien
 import torch
 
-from manifeel_ms3.sensors import with_options
+from manifeel_ms3.sensors import GelConfig, TactileSensorConfig, grids_for, with_options
+from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel
 from tests.sensors.pads import CONFIG, CPU, EVERYTHING, LOADS, meshes, pressed
 
@@ -27,6 +29,18 @@ def test_each_row_of_a_batch_is_as_if_alone():
         assert (one["force_field"][0] - seen["force_field"][i]).abs().max() < 1e-6
         assert (one["penetration"][0] - seen["penetration"][i]).abs().max() < 1e-6
         assert (one["rgb"][0].int() - seen["rgb"][i].int()).abs().max() <= 1
+
+
+def test_a_gel_of_another_size_needs_its_size_alone():
+    """16 x 20 mm, pressed with 3 N: image and taxels cover it, and the field holds the load."""
+    size = (0.016, 0.020)
+    pad = TouchModel(TactileSensorConfig("touch", "finger", sapien.Pose(), GelConfig(size=size), **grids_for(size)), 1, CPU)
+    load = torch.tensor([[0, 0, -3.0, 0, 0, 0]], dtype=torch.float64)
+    seen = pad.observe(MeshRays([meshes()[:1]], size, CPU), load)
+    for name, pitch in (("rgb", TactileSensorConfig.pixel_size), ("force_field", TactileSensorConfig.taxel_pitch)):
+        covered = np.array(seen[name].shape[1:3]) * pitch
+        assert covered == pytest.approx(size, abs=pitch), name
+    assert seen["force_field"][..., 0].sum().item() == pytest.approx(3.0, rel=1e-3)
 
 
 def test_batch_of_64_equals_itself_bit_for_bit():
