@@ -36,6 +36,8 @@ FIRST_ANSWER = 120.0
 ENDED = "the process that holds the policy has ended; run the command again"
 LONGEST_FOLDER = 60
 """Number of characters of the folder for temporary files beyond which /tmp is used: the path of a socket has 107 at most."""
+BACKLOG = 128
+"""Simulating processes that may wait to be connected; more than any machine runs at once."""
 LEAST_WAIT = 0.05
 """Time in s between two looks at a limit."""
 
@@ -89,7 +91,7 @@ class PolicyProcess:
     def __enter__(self) -> "PolicyProcess":
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(self.address)
-        self._listener.listen(128)
+        self._listener.listen(BACKLOG)
         self._start()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         with _without_ctrl_c():

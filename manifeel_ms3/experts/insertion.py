@@ -10,6 +10,8 @@ from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
 STRAIGHT = Rotation.identity()
+STREAM = 7
+"""Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class InsertionExpert:
     config = InsertionExpertConfig()
 
     def __init__(self, env: InsertionEnv, seed: int):
-        self._rng = np.random.default_rng([seed, 7])
+        self._rng = np.random.default_rng([seed, STREAM])
         self.env, self.fit = env, env.fit
         self.skills = Skills(env)
         self._pitch_error = Rotation.from_euler("y", self._rng.uniform(-1, 1) * self.config.grasp_error)
