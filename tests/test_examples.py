@@ -11,8 +11,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from manifeel_ms3.sensors import pad_pose
 from manifeel_ms3.sensors.registry import SENSORS
-from tests.conftest import PEG, needs_renderer
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG, needs_renderer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

@@ -1,8 +1,8 @@
 """One process that holds a policy and answers all episodes in batches, whichever processes simulate them.
 
-    simulating processes                    main process                     policy's process
-    SharedPolicy.act  --- Question --->  PolicyProcess (a thread)  --- batch --->  answer_batches
-                      <--- answer ---                             <--- answers ---
+    simulating processes                         main process                     policy's process
+    SharedPolicy.act  --- PolicyRequest --->  PolicyProcess (a thread)  --- batch --->  answer_batches
+                      <------ answer -------                            <-- answers ---
 
 The main process passes questions on, so that it knows which of them a policy that crashes or hangs was busy with. These are
 asked again one by one in a new process, and only the question that ends it alone fails its episode.
@@ -28,7 +28,7 @@ import torch
 from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.workers import SafeSpawnContext, end_with_parent
 
-from .policy import Policy, PolicySource, PolicyUnavailableError, Question
+from .policy import Policy, PolicyRequest, PolicySource, PolicyUnavailableError
 from .rollout import PolicyFault, begin_episode
 
 FIRST_ANSWER = 120.0
@@ -59,7 +59,7 @@ class _Caller:
     connection: Connection
     knows_policy: bool = False
     """Whether it has been sent the policy's description."""
-    question: Question | None = None
+    question: PolicyRequest | None = None
     """The question that waits for its answer."""
     asked_at: float = 0.0
     alone: bool = False
@@ -287,7 +287,7 @@ class SharedPolicy:
         self.waited = 0.0
         return self._part.act(obs)
 
-    def _ask(self, question: Question) -> np.ndarray:
+    def _ask(self, question: PolicyRequest) -> np.ndarray:
         """The policy's answer to a question.
 
         Raises:
@@ -332,7 +332,7 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
             connection.send(_answers(policy, connection.recv()))
 
 
-def _answers(policy: Any, questions: list[Question]) -> list[np.ndarray | Exception]:
+def _answers(policy: Any, questions: list[PolicyRequest]) -> list[np.ndarray | Exception]:
     try:
         answers = policy.answer(questions)
         if len(answers) != len(questions):

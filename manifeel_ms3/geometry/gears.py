@@ -51,7 +51,7 @@ class ShaftSizes:
     bore: float
     """Radius of a gear's bore."""
     clearance: float
-    """Largest distance from the shaft's axis at which the gear counts as on it; chosen."""
+    """Largest distance from the shaft's axis at which the gear counts as on it; chosen by hand."""
 
 
 SHAFTS = {

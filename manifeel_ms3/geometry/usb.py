@@ -10,7 +10,7 @@ from .part import Box, Part, Piece, block_with_holes
 
 HANDLE = (0.012, 0.030, 0.070)  # m; narrower than a pad, so that touch sees its edges
 GRIP = -0.012  # m, from the handle's middle
-ABOVE_TONGUE = 0.0005  # m over the tongue's end, from which on the insulator may meet it; tuned
+ABOVE_TONGUE = 0.0005  # m over the tongue's end, from which on the plug may meet it; chosen by hand
 BLOCK, RIM = (0.066, 0.066), 0.037  # m: the port's block, and its height
 
 

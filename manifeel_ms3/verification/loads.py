@@ -32,9 +32,10 @@ DEPTH_LOADS = (1.0, 3.0, 10.0)
 MOST_SLIDING = 2e-3
 """Distance, in m, from which an object counts as having slid off: the load then no longer acts where it was put."""
 HOUSING_SHARE = 0.9
-"""Share of the gel's protrusion to which an object may press the gel in: the housing would carry a part of the load beyond."""
+"""Share of the gel's protrusion to which an object may press the gel in: beyond, the housing would carry
+a part of the load. Chosen."""
 FLAT_CONTACT_POINTS = 4
-"""Contact points of PhysX between the gel and a flat face or a rod."""
+"""Contact points of PhysX between the gel and a shape that is no ball."""
 LOOP_SECONDS = 0.05
 """Time that each load of the loop acts, in s."""
 LAYER_POINTS = 401

@@ -28,7 +28,7 @@ LAST_BIN_MARGIN = 1e-3
 
 @dataclass(frozen=True)
 class PressedShapes:
-    """Sizes of the shapes that are pressed, in m; chosen to be well within the pad and to cover the slopes of objects."""
+    """Sizes of the shapes that are pressed, in m; chosen by hand."""
 
     round_radius: float = 0.004
     """Radius of the ball and the rod."""
