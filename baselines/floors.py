@@ -23,7 +23,7 @@ from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.evaluation.floors import POLICIES, SCHEMA, floors_file
+from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.files import write_json
 from manifeel_ms3.paths import data_dir
@@ -77,7 +77,7 @@ def _measure_task(env_id: str, args: Args, command: str) -> Path:
         numbers = dict(episodes=len(result["episodes"])) | result["success_once"]
         floors[name] = numbers
         log.info("%s, %s: %s", spec.env_id, name, numbers)
-        about = dict(schema=SCHEMA, env_id=spec.env_id, revision=spec.revision, git_commit=result["git_commit"])
+        about = dict(schema=FLOORS_SCHEMA, env_id=spec.env_id, revision=spec.revision, git_commit=result["git_commit"])
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about | dict(command=command, floors={known: floors[known] for known in POLICIES if known in floors}))
     return path

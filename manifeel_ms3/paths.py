@@ -14,6 +14,9 @@ CACHE_DIR = "MANIFEEL_CACHE_DIR"
 """Environment variable that names the folder of derived assets."""
 _PACKAGE = Path(__file__).resolve().parent
 
+CHECKPOINTS = "checkpoints"
+"""Name of the folder of checkpoints, in the folder of a training run and beside a published result."""
+
 
 def data_dir() -> Path:
     """Folder of the data that ships with the package: `manifeel_ms3/data` in a wheel, `data` in a clone."""

@@ -1,6 +1,5 @@
 """Shared fixtures. Tests run on the real simulator; those that need a picture are skipped only where no renderer can be had."""
 
-import os
 from collections import Counter
 
 import gymnasium as gym
@@ -8,14 +7,10 @@ import pytest
 import torch
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.rendering.backend import available_render_backend
+from tests.tasks_and_marks import PEG
 
 torch.set_num_threads(1)
-PEG = "ManiFeel-PegInsertion-v1"
 LONG = ("test_studies", "test_extending", "test_end_to_end", "test_doctor", "test_page")  # few tests of minutes each
-needs_renderer = pytest.mark.skipif(
-    available_render_backend() == "none" and not os.environ.get("CI"), reason="no Vulkan renderer on this machine"
-)
 
 
 def pytest_collection_modifyitems(items):

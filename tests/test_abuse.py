@@ -16,7 +16,7 @@ from manifeel_ms3 import cli
 from manifeel_ms3.arguments import is_number
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.tasks.placement import REACH_XY
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 
 def bad(examples: int):

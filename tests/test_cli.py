@@ -21,8 +21,8 @@ from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
 from manifeel_ms3.demonstrations.recording import next_step
 from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG
 from tests.sample import observed_sample, states_sample
+from tests.tasks_and_marks import PEG
 
 
 def test_all_commands_are_listed(capsys):

@@ -20,9 +20,9 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.tactile_representations.t3 import T3
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
-from tests.conftest import PEG, needs_renderer
 from tests.links import dead_links, missing_targets
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG, needs_renderer
 from tests.third_party import install, own_sensor
 from tests.tiny_study import TINY
 

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from manifeel_ms3 import doctor
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 
 @needs_renderer

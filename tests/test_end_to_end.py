@@ -11,7 +11,7 @@ from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation import evaluate, report
 from manifeel_ms3.evaluation.result import ResultError
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 TASK_ARGS = json.dumps(dict(fit="paper", randomization=dict(socket_xy=0.01), max_episode_steps=75))
 

@@ -16,8 +16,8 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.sensors import pad_pose
 from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.wrappers import PadsAsCamerasWrapper
-from tests.conftest import PEG, needs_renderer
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG, needs_renderer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 

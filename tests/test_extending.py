@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 from tests.third_party import install
 
 REPOSITORY = Path(__file__).parents[1]

@@ -13,8 +13,8 @@ from manifeel_ms3.films import layout
 from manifeel_ms3.films.__main__ import read_source
 from manifeel_ms3.films.film_file import END_SECONDS, write_film
 from manifeel_ms3.films.shots import Shot, Take, shown_steps
-from tests.conftest import PEG, needs_renderer
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG, needs_renderer
 
 FILE = states_sample(PEG)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 NOTEBOOK = Path(__file__).parents[1] / "examples/quickstart.ipynb"
 SMALLER = {

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 STEPS = 8
 PATIENCE = 120  # s

@@ -6,7 +6,7 @@ import sys
 import pytest
 import torch
 
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 STEP_WITH_IMAGES = f"""
 import gymnasium as gym, manifeel_ms3

@@ -9,7 +9,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper, PadsAsCamerasWrapper
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 SMALL = dict(sensor_configs=dict(width=64, height=64))
 TOUCH = dict(obs_mode="state+tacff", render_backend="none")

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from mani_skill.utils import common
 
-from manifeel_ms3.evaluation.policy import Ask, Question
+from manifeel_ms3.evaluation.policy import Ask, PolicyRequest
 
 from .observation import ObservationSpec, prepare
 
@@ -48,7 +48,7 @@ class ActionChunks:
         if not self._actions:
             window = [self._window[0]] * (self.obs_horizon - len(self._window)) + list(self._window)
             observation = {key: np.stack([step[key] for step in window]) for key in window[0]}
-            self._actions.extend(self._ask(Question(self._seed, self._step, observation)))
+            self._actions.extend(self._ask(PolicyRequest(self._seed, self._step, observation)))
         self._step += 1
         return self._actions.popleft().clip(-1.0, 1.0)
 

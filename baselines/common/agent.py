@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
-from manifeel_ms3.evaluation.policy import Question
+from manifeel_ms3.evaluation.policy import PolicyRequest
 
 from .action_chunks import ActionChunks
 from .checkpoint import WEIGHTS, load_weights, read_tensors, require_fit
@@ -132,7 +132,7 @@ class PolicyAgent:
 
     # ------------------------------------------------------------ as the policy of many
 
-    def answer(self, questions: list[Question]) -> list[np.ndarray]:
+    def answer(self, questions: list[PolicyRequest]) -> list[np.ndarray]:
         """The actions (action_horizon, A) to execute next, for each question."""
         answers: dict[int, np.ndarray] = {}
         left = list(range(len(questions)))
@@ -146,7 +146,7 @@ class PolicyAgent:
         return [answers[index] for index in range(len(questions))]
 
     @torch.inference_mode()
-    def _predict(self, questions: dict[int, Question]) -> np.ndarray:
+    def _predict(self, questions: dict[int, PolicyRequest]) -> np.ndarray:
         """Actions (batch_size, action_horizon, A), of which those at the places of questions count."""
         filling = next(iter(questions.values()))
         rows = [questions.get(place, filling) for place in range(self.batch_size)]

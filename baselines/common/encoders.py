@@ -54,17 +54,21 @@ class SpatialSoftmax(nn.Module):
         return torch.cat([(weight.sum(2) * x).sum(-1), (weight.sum(3) * y).sum(-1)], dim=1)
 
 
+RESNET18_WIDTHS, RESNET18_DEPTHS = (64, 128, 256, 512), (2, 2, 2, 2)
+"""Channels and number of blocks of each stage of ResNet-18 (He et al. 2016, table 1)."""
+
+
 class ResNet18(nn.Module):
     """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy: batch statistics and an EMA do not go together."""
 
-    out_channels = 512
+    out_channels = RESNET18_WIDTHS[-1]
 
     def __init__(self):
         from transformers import ResNetConfig, ResNetModel  # here, because it takes seconds
 
         super().__init__()
-        widths = [64, 128, 256, self.out_channels]
-        config = ResNetConfig(depths=[2, 2, 2, 2], layer_type="basic", hidden_sizes=widths, embedding_size=widths[0])
+        widths, depths = list(RESNET18_WIDTHS), list(RESNET18_DEPTHS)
+        config = ResNetConfig(depths=depths, layer_type="basic", hidden_sizes=widths, embedding_size=widths[0])
         self.net = _with_group_norm(ResNetModel(config))
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
@@ -84,6 +88,17 @@ def _with_group_norm(module: nn.Module) -> nn.Module:
     return module
 
 
+NORM_GROUPS = 8
+"""Groups of GroupNorm in the small networks."""
+SMALL_STRIDE, SMALL_WIDTHS, SMALL_KERNEL, SMALL_PLACE_CHANNELS = 8, (24, 48, 64, 64), 5, 16
+"""Total stride of `SmallCNN`, channels of its convolutions, kernel of the first, and channels at each place of its last layer;
+chosen for training on a CPU."""
+FINE_STRIDE, FINE_WIDTHS, FINE_KERNEL, FINE_PLACE_CHANNELS = 16, (32, 48, 48, 64), 7, 8
+"""The same of `FineCNN`."""
+FIELD_WIDTH = 32
+"""Channels of the convolutions of `SmallFieldNet`; chosen for training on a CPU."""
+
+
 class SmallCNN(nn.Sequential):
     """A small image network for a CPU: four convolutions with a total stride of 8, then one layer over all places.
 
@@ -91,13 +106,14 @@ class SmallCNN(nn.Sequential):
     """
 
     def __init__(self, size: int, features: int):
-        places = math.ceil(size / 8) ** 2
+        places = math.ceil(size / SMALL_STRIDE) ** 2
+        first, second, third, fourth = SMALL_WIDTHS
         super().__init__(
-            *_conv(3, 24, kernel_size=5, stride=2),
-            *_conv(24, 48, stride=2),
-            *_conv(48, 64, stride=2),
-            *_conv(64, 64),
-            *_over_places(64, 16, places, features),
+            *_conv(3, first, kernel_size=SMALL_KERNEL, stride=2),
+            *_conv(first, second, stride=2),
+            *_conv(second, third, stride=2),
+            *_conv(third, fourth),
+            *_over_places(fourth, SMALL_PLACE_CHANNELS, places, features),
         )
 
 
@@ -108,18 +124,19 @@ class FineCNN(nn.Sequential):
     """
 
     def __init__(self, size: int, features: int):
-        places = math.ceil(size / 16) ** 2
+        places = math.ceil(size / FINE_STRIDE) ** 2
+        first, second, third, fourth = FINE_WIDTHS
         super().__init__(
-            *_conv(3, 32, kernel_size=7, stride=4),
-            *_conv(32, 48, stride=2),
-            *_conv(48, 48),
-            *_conv(48, 64, stride=2),
-            *_over_places(64, 8, places, features),
+            *_conv(3, first, kernel_size=FINE_KERNEL, stride=4),
+            *_conv(first, second, stride=2),
+            *_conv(second, third),
+            *_conv(third, fourth, stride=2),
+            *_over_places(fourth, FINE_PLACE_CHANNELS, places, features),
         )
 
 
 def _conv(inputs: int, outputs: int, kernel_size: int = 3, stride: int = 1) -> list[nn.Module]:
-    return [nn.Conv2d(inputs, outputs, kernel_size, stride, kernel_size // 2), nn.GroupNorm(8, outputs), nn.SiLU()]
+    return [nn.Conv2d(inputs, outputs, kernel_size, stride, kernel_size // 2), nn.GroupNorm(NORM_GROUPS, outputs), nn.SiLU()]
 
 
 def _over_places(inputs: int, channels: int, places: int, features: int) -> list[nn.Module]:
@@ -134,10 +151,10 @@ class SmallFieldNet(nn.Module):
         super().__init__()
         rows, columns = (math.ceil(side / 2) for side in taxel_shape)
         self.net = nn.Sequential(
-            *_conv(3, 32),
-            *_conv(32, 32, stride=2),
+            *_conv(3, FIELD_WIDTH),
+            *_conv(FIELD_WIDTH, FIELD_WIDTH, stride=2),
             nn.Flatten(),
-            nn.Linear(32 * rows * columns, features),
+            nn.Linear(FIELD_WIDTH * rows * columns, features),
             nn.SiLU(),
         )
 

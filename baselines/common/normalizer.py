@@ -66,10 +66,10 @@ class Normalizer(nn.Module):
 
 
 class ActionNormalizer(Normalizer):
-    """Map of actions to [-1, 1], in which small actions can be given more room.
+    """Map of actions to [-1, 1], which can enlarge small actions relative to large ones.
 
-    Where parts touch, demonstrators move by a few percent of their largest action. On a linear scale such motions count for
-    next to nothing in a squared error, although contact depends on them. On the scale "root", each action is first replaced by
+    Where parts touch, a demonstrator's actions are a few percent of its largest action. On a linear scale such actions hardly
+    change a squared error, although contact depends on them. On the scale "root", each action is first replaced by
     its square root with its sign, so that 4 % of the largest action becomes 20 %.
 
     Args:

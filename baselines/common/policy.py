@@ -47,7 +47,7 @@ class PolicyConfig:
     diffusion_step_embed_dim: int = 128
     """Size of the embedding of the diffusion step (or of the flow's time)."""
     pose_noise: float = 0.0
-    """Standard deviation of the noise that training adds to the normalised tool pose, but for its height. Without noise, a
+    """Standard deviation of the noise that training adds to the normalised tool pose, except to its height. Without noise, a
     policy trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart,
     and says how far the work has come."""
     noise_draws: int = 1

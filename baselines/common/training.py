@@ -19,6 +19,7 @@ from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
 
@@ -49,8 +50,8 @@ from .run_log import RunLog, wandb_run_of
 from .train_args import FREE_ON_RESUME, TrainArgs, check_run, default_exp_name, default_steps
 
 log = logging.getLogger(__name__)
-CHECKPOINTS, EVALUATIONS = "checkpoints", "evaluations"
-"""Folders of the checkpoints and of their evaluations in the folder of a run."""
+EVALUATIONS = "evaluations"
+"""Folder of the checkpoints' evaluations in the folder of a run."""
 RANK_SEED_STRIDE = 1_000_003
 """Distance of the noise seeds of processes: a prime that is larger than usual seeds and numbers of steps."""
 

@@ -10,6 +10,13 @@ from .groups import ORDER, FieldNorm, GroupConv, halve, pooled, representation
 
 CHANNELS_PER_GROUP = 16
 """Channels that a block of the small network normalises together."""
+LIFT_KERNEL = 5
+"""Kernel of the first convolution, as in the paper's public code."""
+RESNET_DIVISORS = (16, 16, 8, 4, 2, 1, 1)
+"""What the number of fields of the features is divided by after the first convolution and after each block, as in the paper's
+public code."""
+KEY_POINT_DIVISORS = (32, 16, 8, 4)
+"""The same of the small network; chosen for training on a CPU."""
 
 
 class GroupBlock(nn.Module):
@@ -49,8 +56,8 @@ class EquivariantResNet(nn.Module):
 
     def __init__(self, fields: int):
         super().__init__()
-        widths = [max(fields // k, 1) for k in (16, 16, 8, 4, 2, 1, 1)]
-        self.lift = nn.Sequential(GroupConv(3, widths[0], 5, lifting=True, padded=False), nn.ReLU())
+        widths = [max(fields // k, 1) for k in RESNET_DIVISORS]
+        self.lift = nn.Sequential(GroupConv(3, widths[0], LIFT_KERNEL, lifting=True, padded=False), nn.ReLU())
         self.blocks = nn.ModuleList(GroupBlock(i, o, normalised=False) for i, o in pairwise(widths))
         self.last = nn.Sequential(GroupConv(fields, fields, 3), nn.ReLU())
 
@@ -72,8 +79,8 @@ class EquivariantKeyPoints(nn.Module):
 
     def __init__(self, fields: int):
         super().__init__()
-        widths = [max(fields // k, 1) for k in (32, 16, 8, 4)]
-        self.lift = nn.Sequential(GroupConv(3, widths[0], 5, lifting=True), FieldNorm(1, widths[0]), nn.ReLU())
+        widths = [max(fields // k, 1) for k in KEY_POINT_DIVISORS]
+        self.lift = nn.Sequential(GroupConv(3, widths[0], LIFT_KERNEL, lifting=True), FieldNorm(1, widths[0]), nn.ReLU())
         self.blocks = nn.ModuleList(GroupBlock(i, o, normalised=True) for i, o in pairwise(widths))
         self.score = GroupConv(widths[-1], fields // 2, 1)
         self.register_buffer("axes", representation(2, ((0, 1),)), persistent=False)

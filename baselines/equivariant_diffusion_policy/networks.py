@@ -17,7 +17,7 @@ ACTION_PAIRS = {
     6: ((0, 1), (3, 4)),  # position, rotation vector
     7: ((0, 1), (3, 4)),  # position, rotation vector, gripper
 }
-"""Indices of x and y, which turn, in the positions and rotation vectors of actions, by the number of an action's numbers."""
+"""Indices of x and y, which turn, in the positions and rotation vectors of actions, by the size of an action."""
 HAND_CAMERAS = ("sensor_data/wrist/rgb",)
 """Images of cameras that the hand carries."""
 
@@ -36,7 +36,7 @@ class EquivariantObservationEncoder(nn.Module):
         obs_horizon: Number of time steps in a window.
 
     Raises:
-        InvalidArgumentError: It is not known how the pose in this form turns.
+        InvalidArgumentError: The policy cannot rotate poses in this form.
         UnknownNameError: No network has a configured name.
     """
 
@@ -45,7 +45,7 @@ class EquivariantObservationEncoder(nn.Module):
     def __init__(self, config: EncoderConfig, spec: ObservationSpec, fields: int, obs_horizon: int):
         super().__init__()
         if spec.pose != "rotation_6d":
-            raise InvalidArgumentError(f"pose={spec.pose!r}: this policy turns poses as vectors; give --pose rotation_6d")
+            raise InvalidArgumentError(f"pose={spec.pose!r}: this policy rotates poses as vectors; give --pose rotation_6d")
         self.crop, self.spec = config.crop, spec
         self.cameras = [key for key in spec.images if not is_tactile(key)]
         self.pads = [key for key in spec.images if is_tactile(key)]
@@ -101,7 +101,7 @@ class EquivariantActionNetwork(nn.Module):
         network: Network from fields (B, T, fields), steps (B,) and the condition in a frame (B, C) to fields (B, T, fields).
 
     Raises:
-        InvalidArgumentError: It is not known how actions of so many numbers turn.
+        InvalidArgumentError: `ACTION_PAIRS` does not say how actions of this size rotate.
     """
 
     turns: torch.Tensor
@@ -110,7 +110,7 @@ class EquivariantActionNetwork(nn.Module):
         super().__init__()
         if action_dim not in ACTION_PAIRS:
             raise InvalidArgumentError(
-                f"action_dim={action_dim}: it is only known how actions of {sorted(ACTION_PAIRS)} numbers turn; add yours to "
+                f"action_dim={action_dim}: this policy can rotate actions of {sorted(ACTION_PAIRS)} numbers only; add yours to "
                 "ACTION_PAIRS"
             )
         self.embed = nn.Sequential(nn.Linear(action_dim, fields), nn.ReLU())

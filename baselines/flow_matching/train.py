@@ -21,7 +21,7 @@ from manifeel_ms3.command_line import run
 
 @dataclass
 class Args(TrainArgs):
-    """Settings of a training run; the defaults are those of the paper's public code, but for its start noise."""
+    """Settings of a training run; the defaults are those of the paper's public code, except for its start noise."""
 
     policy: FlowConfig = field(default_factory=FlowConfig)
     inference_steps: int = 100

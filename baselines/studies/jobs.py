@@ -18,7 +18,6 @@ import psutil
 import tyro
 
 from baselines.common.checkpoint import save_in_half_precision, saved_checkpoints
-from baselines.common.training import CHECKPOINTS
 from baselines.registry import policy_spec
 from baselines.tactile_representations import pretrain
 from manifeel_ms3.demonstrations import record
@@ -29,6 +28,7 @@ from manifeel_ms3.evaluation.journal import OtherEvaluationError
 from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.provenance import machine
 
 from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of

@@ -10,11 +10,11 @@ from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.paper import DP, training_demos
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
-from manifeel_ms3.evaluation.entries import ABOUT, CHECKPOINTS
+from manifeel_ms3.evaluation.entries import ABOUT
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.files import atomic_folder, read_json, write_json
 from manifeel_ms3.ownership import owned
-from manifeel_ms3.paths import data_dir
+from manifeel_ms3.paths import CHECKPOINTS, data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
 from .jobs import is_done

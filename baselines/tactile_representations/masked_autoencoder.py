@@ -5,7 +5,7 @@ import torch.nn as nn
 import torch.nn.functional as F  # noqa: N812
 
 from .representation import TokenRepresentation
-from .vit import EPS, Block
+from .vit import EPS, POSITION_STD, Block
 
 WIDTH, DEPTH, HEADS = 256, 2, 8
 """Size of the decoder, which only pretraining needs."""
@@ -29,7 +29,7 @@ class MaskedAutoencoder(nn.Module):
         self.representation, self.masked = representation, masked
         patches = (size // representation.patch) ** 2
         self.narrow, self.mask_token = nn.Linear(representation.width, WIDTH), nn.Parameter(torch.zeros(1, 1, WIDTH))
-        self.pos_embed = nn.Parameter(0.02 * torch.randn(1, patches, WIDTH))
+        self.pos_embed = nn.Parameter(POSITION_STD * torch.randn(1, patches, WIDTH))
         self.decoder = nn.Sequential(*(Block(WIDTH, HEADS) for _ in range(DEPTH)), nn.LayerNorm(WIDTH, EPS))
         self.out = nn.Linear(WIDTH, 3 * representation.patch**2)
 

@@ -206,12 +206,18 @@ class VqganTraining:
         return error.detach()
 
 
-def patch_discriminator(width: int = 64) -> nn.Sequential:
+DISCRIMINATOR_WIDTH, DISCRIMINATOR_KERNEL, DISCRIMINATOR_SLOPE = 64, 4, 0.2
+"""Channels of the discriminator's first layer, kernel of its convolutions, and slope of its activations for negative inputs
+(Isola et al. 2017, section 6.1)."""
+
+
+def patch_discriminator() -> nn.Sequential:
     """A network that judges patches of 70 x 70 pixels, each as real or reconstructed (Isola et al. 2017)."""
-    layers: list[nn.Module] = [nn.Conv2d(3, width, 4, 2, 1), nn.LeakyReLU(0.2)]
+    width, kernel, slope = DISCRIMINATOR_WIDTH, DISCRIMINATOR_KERNEL, DISCRIMINATOR_SLOPE
+    layers: list[nn.Module] = [nn.Conv2d(3, width, kernel, 2, 1), nn.LeakyReLU(slope)]
     for inputs, outputs, stride in ((width, 2 * width, 2), (2 * width, 4 * width, 2), (4 * width, 8 * width, 1)):
-        layers += [nn.Conv2d(inputs, outputs, 4, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(0.2)]
-    return nn.Sequential(*layers, nn.Conv2d(8 * width, 1, 4, 1, 1))
+        layers += [nn.Conv2d(inputs, outputs, kernel, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.LeakyReLU(slope)]
+    return nn.Sequential(*layers, nn.Conv2d(8 * width, 1, kernel, 1, 1))
 
 
 def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:

@@ -131,6 +131,10 @@ class TokenRepresentation(Representation):
         return self.pool(self.encode(self.embed(self.prepare(image))))
 
 
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+"""Mean and standard deviation of ImageNet's colours, as torchvision documents them."""
+
+
 class ColourNormalisation(nn.Module):
     """Images in [-1, 1], normalised by the mean and standard deviation of each colour, at first those of ImageNet."""
 
@@ -139,8 +143,8 @@ class ColourNormalisation(nn.Module):
 
     def __init__(self):
         super().__init__()
-        self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]))  # as torchvision documents them
-        self.register_buffer("std", torch.tensor([0.229, 0.224, 0.225]))
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN))
+        self.register_buffer("std", torch.tensor(IMAGENET_STD))
 
     def fit(self, images: Iterable[torch.Tensor]) -> None:
         """Take mean and standard deviation of all pixels of images uint8 (N, H, W, 3)."""

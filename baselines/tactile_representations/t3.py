@@ -13,7 +13,7 @@ import torch.nn as nn
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
 from .representation import ColourNormalisation, TokenRepresentation
-from .vit import EPS, Block, PatchEmbed, interpolate_pos_embed
+from .vit import EPS, POSITION_STD, Block, PatchEmbed, interpolate_pos_embed
 
 SENSORS = ("mini", "gs_green", "gs_black", "gs_tag", "gs_360_v2", "digit", "wedge", "finray")
 """Names of the released encoders; the paper's public code takes that of the GelSight Mini."""
@@ -25,7 +25,7 @@ class _Encoder(nn.Module):
     def __init__(self, width: int, depth: int, heads: int, patch: int, size: int):
         super().__init__()
         self.cls_token = nn.Parameter(torch.zeros(1, 1, width))
-        self.pos_embed = nn.Parameter(0.02 * torch.randn(1, (size // patch) ** 2 + 1, width))
+        self.pos_embed = nn.Parameter(POSITION_STD * torch.randn(1, (size // patch) ** 2 + 1, width))
         self.patch_embed = PatchEmbed(3, width, patch)
         self.blocks = nn.ModuleList(Block(width, heads, EPS) for _ in range(depth))
 

@@ -20,6 +20,10 @@ CHANNELS = (128, 128, 256, 512)
 """Channels from the finest to the coarsest scale, as in the released checkpoint."""
 HEAD_CHANNELS = (128, 256, 512)
 """Channels of the head's convolutions, as in both public codes (ZhengtongXu/UniT and purdue-mars/manifeel)."""
+HEAD_SLOPE = 0.01
+"""Slope of the head's activations for negative inputs, torch's default."""
+RELEASED_SIZE, SIZE = 128, 256
+"""Height of the images, in pixels, of the released checkpoint and of the paper ManiFeel."""
 HEAD_HIDDEN = 512
 """Features of the head's two hidden layers, as in ManiFeel's public code."""
 DIFFUSERS_ATTENTION = {"norm": "group_norm", "q": "to_q", "k": "to_k", "v": "to_v", "proj_out": "to_out.0"}
@@ -42,7 +46,7 @@ class UniT(Representation):
         from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (here, because it takes seconds)
 
         super().__init__()
-        self.size = 128 if attention else 256
+        self.size = RELEASED_SIZE if attention else SIZE
         coarsest = "Attn" if attention else ""
         finer = len(channels) - 1
         self.vqgan = VQModel(
@@ -60,7 +64,7 @@ class UniT(Representation):
     def head(self, features):
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise((LATENT_CHANNELS, *HEAD_CHANNELS)):
-            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), ChannelNorm(outputs), nn.LeakyReLU(0.01)]
+            layers += [nn.Conv2d(inputs, outputs, 3, padding=1), ChannelNorm(outputs), nn.LeakyReLU(HEAD_SLOPE)]
         layers += [nn.AdaptiveAvgPool2d(1), nn.Flatten()]
         layers += [nn.Linear(HEAD_CHANNELS[-1], HEAD_HIDDEN), nn.ReLU(), nn.Linear(HEAD_HIDDEN, HEAD_HIDDEN), nn.ReLU()]
         return nn.Sequential(*layers, nn.Linear(HEAD_HIDDEN, features))

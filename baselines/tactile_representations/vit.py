@@ -10,6 +10,8 @@ import torch.nn.functional as F  # noqa: N812
 
 EPS = 1e-6
 """Epsilon of the layer norms, as in timm."""
+POSITION_STD = 0.02
+"""Standard deviation of position embeddings before training, as in timm."""
 
 
 class Attention(nn.Module):

@@ -10,7 +10,7 @@ from .condition import Condition
 from .estimates import difference
 from .matching import Found, answering
 from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
-from .presets import Setup
+from .presets import TrainingSettings
 
 SIGNIFICANCE = 0.05
 """Value of p below which a gain is not called a matter of chance; the field's convention, as the intervals of 95 %."""
@@ -40,7 +40,7 @@ def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
 
 def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
     """A paragraph for each set-up in which a task was run with vision alone and with touch."""
-    by_setup: dict[Setup, dict[str, Condition]] = {}
+    by_setup: dict[TrainingSettings, dict[str, Condition]] = {}
     for mode in MODES:
         for setup, condition in answering(paper_condition(task, mode), found).items():
             by_setup.setdefault(setup, {})[mode] = condition

@@ -2,7 +2,7 @@
 
 Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
 holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. Both
-conditions have the same settings and, but for the claim on their number, equally many demonstrations: the paper's.
+conditions have the same settings and the paper's number of demonstrations, except in the claim about that number.
 """
 
 import logging
@@ -22,7 +22,7 @@ from .estimates import Estimate, difference
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper_claims import Comparison, comparisons
-from .presets import Setup
+from .presets import TrainingSettings
 from .protocol import collect, of_the_protocol
 
 log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class ClaimResult:
     p_value: float
     """Probability of such a difference if there is none."""
     verdict: Verdict
-    setup: Setup
+    setup: TrainingSettings
     """Settings that both conditions were run with."""
 
 

@@ -8,7 +8,7 @@ from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper import ENCODERS, TACRGB, paper_condition, tasks_in_table
 from .paper_claims import NO_ENCODER_IS_BEST
-from .presets import Setup
+from .presets import TrainingSettings
 from .protocol import ConditionResults
 
 
@@ -37,9 +37,9 @@ class EncoderRanking:
         return any(gap.low > 0 for (_, worse), gap in self.gaps.items() if worse == encoder)
 
 
-def rankings(found: Found) -> dict[Setup, list[EncoderRanking]]:
+def rankings(found: Found) -> dict[TrainingSettings, list[EncoderRanking]]:
     """The rankings of all tasks of Table III on which every encoder was run, by set-up."""
-    ranked: dict[Setup, list[EncoderRanking]] = {}
+    ranked: dict[TrainingSettings, list[EncoderRanking]] = {}
     for task in tasks_in_table("III"):
         names = tuple(ENCODERS[task])
         wanted = [paper_condition(task, TACRGB, encoder=name) for name in names]

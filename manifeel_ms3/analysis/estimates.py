@@ -20,6 +20,8 @@ RESAMPLES = 4000
 """Number of resamples of a bootstrap; the ends of intervals then vary by less than half a point."""
 TAILS = (0.025, 0.975)
 """Quantiles at the ends of an interval of 95 %."""
+NO_SPREAD = 1e-12
+"""Range of resampled rates below which they differ only by rounding."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def _resampled_means(rates: np.ndarray, starts: np.ndarray, rng: np.random.Gener
 
 
 def _estimate(value: float, drawn: np.ndarray, of: Sequence[ConditionResults], lowest: float) -> Estimate:
-    if np.ptp(drawn) < 1e-12:  # nothing varies, so that a bootstrap has nothing to draw from:
+    if np.ptp(drawn) < NO_SPREAD:  # nothing varies, so that a bootstrap has nothing to draw from:
         fewest = min(len(results.episode_seeds) for results in of)
         unseen = wilson_interval(0, fewest)[1]  # the rate that an outcome may have which none of so many episodes has shown
         return Estimate(value, max(value - unseen, lowest), min(value + unseen, 1.0))

@@ -11,11 +11,10 @@ from manifeel_ms3.evaluation.gentle import success_under_force
 from .condition import Condition
 from .matching import Found
 from .paper import MODALITIES, MODES
-from .paper_tables import COLOURS, HEADINGS, table_one
+from .paper_tables import COLOURS, DPI, HEADINGS, table_one
 from .protocol import ConditionResults
+from .success_curves import PANEL
 
-PANEL, DPI = (5.0, 3.4), 110
-"""Width and height of a panel in inches, and resolution in pixels per inch."""
 COLUMNS = 3
 """Largest number of panels side by side."""
 FORCES = 200

@@ -11,13 +11,13 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition
 from .paper import SCRATCH
-from .presets import PAPER, Setup, has_presets_encoder, setup_of
+from .presets import PAPER, TrainingSettings, has_presets_encoder, training_settings_of
 from .protocol import ConditionResults
 
 Found = Mapping[Condition, ConditionResults]
 
 
-def answering(wanted: Condition, found: Found) -> dict[Setup, Condition]:
+def answering(wanted: Condition, found: Found) -> dict[TrainingSettings, Condition]:
     """The conditions that answer for one of the paper, one for each set-up.
 
     Args:
@@ -27,10 +27,10 @@ def answering(wanted: Condition, found: Found) -> dict[Setup, Condition]:
     Raises:
         ResultError: Two conditions answer in one set-up, such as encoders that start from different weights.
     """
-    answers: dict[Setup, Condition] = {}
+    answers: dict[TrainingSettings, Condition] = {}
     for condition in found:
         if as_the_paper_says(condition) == wanted:
-            other = answers.setdefault(setup_of(condition), condition)
+            other = answers.setdefault(training_settings_of(condition), condition)
             if other != condition:
                 apart = sorted({name for name, _ in set(condition.settings) ^ set(other.settings)})
                 raise ResultError(
@@ -40,7 +40,7 @@ def answering(wanted: Condition, found: Found) -> dict[Setup, Condition]:
     return answers
 
 
-def answering_all(wanted: Sequence[Condition], found: Found) -> dict[Setup, list[Condition]]:
+def answering_all(wanted: Sequence[Condition], found: Found) -> dict[TrainingSettings, list[Condition]]:
     """The conditions that answer for several of the paper, in each set-up that has all of them; the paper's preset is first."""
     answers = [answering(condition, found) for condition in wanted]
     common = set.intersection(*(set(one) for one in answers))

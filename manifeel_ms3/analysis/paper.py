@@ -1,7 +1,7 @@
 """The paper's conditions and the numbers that it reports of them.
 
 A success rate is the mean over the last 10 checkpoints, 50 evaluation episodes and 3 training seeds. Which tasks a table
-reports stands in the tasks themselves (`TaskSpec.paper_tables`); the numbers are here, by the tasks' short names.
+reports is given by the tasks themselves (`TaskSpec.paper_tables`); the numbers are here, by the tasks' short names.
 
 The paper contradicts itself on ball sorting. Its list of set-ups has dim light alone for Tables I to III, and its text on Table
 II speaks of "dimly lit sorting"; but Tables I and II report different rates for the same policies, 57, 72 and 60 % in Table I

@@ -61,7 +61,7 @@ def _picture_claims() -> Iterator[Comparison]:
     """What TacRGB does where its pictures do not matter."""
     for task in tasks_in_table("I", "insertion", "screwing"):
         if task != "PegInsertion":  # there, the paper found a gain of seven points
-            claim = "3. TacRGB is no gain over vision in insertion and screwing, but for the peg"
+            claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg"
             yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION), gain=False)
     for policy in ("diffusion_policy", EQUIDP, FM):
         with_picture, without = (paper_condition("GearAssembly", mode, policy) for mode in (TACRGB, VISION))

@@ -13,7 +13,7 @@ from .estimates import Estimate, mean_success
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import DP, ENCODERS, MODALITIES, MODES, POLICIES, Rate, paper_condition, tasks_in_table
-from .presets import PAPER, Setup
+from .presets import PAPER, TrainingSettings
 
 TEXT = """
 ## The paper's tables
@@ -75,7 +75,7 @@ def _with_floors(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return markdown_table((*names, "floor"), [(*row, floor) for row, floor in zip(rows, floors, strict=True)])
 
 
-def _setups(found: Found) -> list[Setup]:
+def _setups(found: Found) -> list[TrainingSettings]:
     """The set-ups of conditions of Tables I to III, the paper's preset first."""
     wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
     wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
@@ -87,7 +87,7 @@ Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
 
 
 def _rows_by_sensing(
-    found: Found, files: Mapping[Condition, str], setup: Setup, rows: Rows
+    found: Found, files: Mapping[Condition, str], setup: TrainingSettings, rows: Rows
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
     """Task and policy, and a cell for each observation mode; only rows in which something was run."""
     for (task, policy), rates in rows.items():
@@ -97,7 +97,7 @@ def _rows_by_sensing(
             yield (task, policy), cells
 
 
-def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: Setup) -> Iterator[list[str]]:
+def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: TrainingSettings) -> Iterator[list[str]]:
     for task in tasks_in_table("III"):
         wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
         answers = {name: answering(condition, found).get(setup) for name, condition in wanted.items()}
@@ -119,7 +119,7 @@ def linked(success: Estimate, file: str | None) -> str:
     return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
 
 
-def table_one(found: Found) -> tuple[Setup, dict[tuple[str, str], Condition]] | None:
+def table_one(found: Found) -> tuple[TrainingSettings, dict[tuple[str, str], Condition]] | None:
     """The conditions of Table I, by task and observation mode, in the set-up in which most of them were run.
 
     None if none was run.
@@ -127,7 +127,7 @@ def table_one(found: Found) -> tuple[Setup, dict[tuple[str, str], Condition]] | 
     Args:
         found: The results that enter comparisons.
     """
-    by_setup: dict[Setup, dict[tuple[str, str], Condition]] = {}
+    by_setup: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
     for task in MODALITIES:
         for mode in MODES:
             for setup, condition in answering(paper_condition(task, mode), found).items():

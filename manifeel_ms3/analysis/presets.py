@@ -25,10 +25,10 @@ PRETRAINED = ("unit", "t3", "anytouch")
 
 
 @dataclass(frozen=True)
-class Setup:
-    """The settings of a condition, apart from those that its encoder of TacRGB needs as the paper has it.
+class TrainingSettings:
+    """Settings of a condition's training, without those that the paper gives to its encoder of TacRGB.
 
-    Conditions with the same set-up can be compared: they differ in nothing but what their other fields say.
+    Conditions with the same training settings can be compared: they differ only in their other fields.
     """
 
     preset: str
@@ -42,8 +42,8 @@ class Setup:
 
 
 @cache
-def setup_of(condition: Condition) -> Setup:
-    """The set-up of a condition.
+def training_settings_of(condition: Condition) -> TrainingSettings:
+    """The training settings of a condition.
 
     Raises:
         PluginError: The condition's policy is registered, but cannot be imported.
@@ -52,14 +52,14 @@ def setup_of(condition: Condition) -> Setup:
     known = _presets(condition.policy) if settings else {}
     changes = {name: _changes(condition, settings, args) for name, args in known.items()}
     if not changes:
-        return Setup("", condition.settings)
+        return TrainingSettings("", condition.settings)
     nearest = min(changes, key=lambda name: len(changes[name]))
-    return Setup(nearest, changes[nearest])
+    return TrainingSettings(nearest, changes[nearest])
 
 
 def has_presets_encoder(condition: Condition) -> bool:
     """Whether the encoder of TacRGB is the preset's own, which is trained from scratch."""
-    preset = _presets(condition.policy).get(setup_of(condition).preset)
+    preset = _presets(condition.policy).get(training_settings_of(condition).preset)
     return preset is not None and condition.encoder == preset.policy.encoder.tacrgb
 
 

@@ -20,7 +20,7 @@ from .estimates import TAILS, Estimate, resampled_success
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import reported
-from .presets import PAPER, Setup
+from .presets import PAPER, TrainingSettings
 from .protocol import ConditionResults
 
 FEWEST = 3
@@ -120,9 +120,9 @@ def _with_interval(measure: Callable[[np.ndarray], float], ours: np.ndarray, dra
     return Agreement(value, min(float(low), value), max(float(high), value))
 
 
-def _ranked_by_table(found: Found) -> Iterator[tuple[str, Setup, list[Ranked]]]:
+def _ranked_by_table(found: Found) -> Iterator[tuple[str, TrainingSettings, list[Ranked]]]:
     """The conditions of each table that were run, by their set-up; the paper's preset is first."""
-    by_table: dict[str, dict[Setup, list[Ranked]]] = {}
+    by_table: dict[str, dict[TrainingSettings, list[Ranked]]] = {}
     for table, wanted, rate in reported():
         for setup, condition in answering(wanted, found).items():
             by_table.setdefault(table, {}).setdefault(setup, []).append(Ranked(condition, rate.mean, found[condition]))

@@ -30,17 +30,13 @@ from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
 from .paper_beside import runtime_table, similarity_table
 from .paper_tables import draw_sensing_by_task, linked, tables_of_the_paper
-from .presets import setup_of
+from .presets import training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
 from .rank_agreement import rank_table
-from .success_curves import write_curves
+from .success_curves import DPI, PANEL, write_curves
 
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
-PANEL = (5.0, 3.4)
-"""Width and height of a panel with learning curves, in inches."""
-DPI = 130
-"""Resolution of figures, in pixels per inch."""
 SECONDS_PER_HOUR = 3600
 HEAD = """# Results
 
@@ -238,7 +234,7 @@ def _table_of_conditions(
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
         success = linked(mean_success(here), files.get(condition))
         measured = (success, _floor(condition), _deviation(here), gentle_cell(here), here.size, note)
-        rows.append((*what, setup_of(condition), f"`{condition.key}`", *measured, cost, machines))
+        rows.append((*what, training_settings_of(condition), f"`{condition.key}`", *measured, cost, machines))
     names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
     return markdown_table((*names, "success", "floor", "std", "gentle success", "of", "note", "cost", "on"), rows)
 

@@ -16,7 +16,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition, condition_of
 from .estimates import Estimate, mean_success
-from .presets import setup_of
+from .presets import training_settings_of
 from .protocol import collect
 
 PANEL, DPI = (5.0, 3.4), 130
@@ -73,7 +73,14 @@ def curve_table(curves: dict[Condition, list[Point]]) -> str:
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow((*COLUMNS, *MEASURES))
     for condition, points in curves.items():
-        what = (condition.task, condition.variant, condition.sensing, condition.policy, str(setup_of(condition)), condition.key)
+        what = (
+            condition.task,
+            condition.variant,
+            condition.sensing,
+            condition.policy,
+            str(training_settings_of(condition)),
+            condition.key,
+        )
         for point in points:
             success = [round(number, 4) for number in (point.success.value, point.success.low, point.success.high)]
             amount = (point.gradient_steps, point.environment_steps)
@@ -121,7 +128,9 @@ def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -
 
 def _draw(ax: Any, condition: Condition, points: list[Point]) -> None:
     seen = [point.environment_steps for point in points]
-    label = ", ".join(filter(None, (condition.variant, condition.sensing, condition.policy, str(setup_of(condition)))))
+    label = ", ".join(
+        filter(None, (condition.variant, condition.sensing, condition.policy, str(training_settings_of(condition))))
+    )
     (line,) = ax.plot(seen, [point.success.value for point in points], label=label, lw=1.5, marker=".")
     lows, highs = zip(*((point.success.low, point.success.high) for point in points), strict=True) if points else ((), ())
     ax.fill_between(seen, lows, highs, color=line.get_color(), alpha=0.15, lw=0)

@@ -1,8 +1,8 @@
-"""Conversion of actions to another controller: an episode commands the same joints again, in other words.
+"""Conversion of actions to another controller: an episode commands the same joint motions in another form.
 
 At each step the recorded action is run in an environment with its own controller, and the joint targets that it commands are
 expressed as an action of the other controller. With a controller that accepts any joint target, such as `pd_joint_pos`, the
-robot then moves as before, but for rounding, which contacts can amplify to a millimetre.
+robot then moves as before, except for rounding errors, which contacts can amplify to a millimetre.
 """
 
 # pyright: reportAttributeAccessIssue=false, reportOperatorIssue=false

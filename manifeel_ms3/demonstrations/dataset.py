@@ -30,7 +30,7 @@ from . import record, render_observations
 from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header
 from .recording import STATES_FILE, trajectory_name
 
-SCHEMA = "manifeel-demonstrations-1"
+DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
 """Name and version of the manifest's form."""
 MANIFEST_FILE = "manifest.json"
 """Name of the manifest in its folder."""
@@ -130,7 +130,7 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
 def write_manifest(folder: Path) -> None:
     """Write `manifest.json` for the trajectory files under a folder."""
     files = {path.relative_to(folder).as_posix(): describe(path) for path in sorted(folder.glob("*/*.h5"))}
-    write_json(folder / MANIFEST_FILE, dict(schema=SCHEMA, version=version("manifeel-ms3"), files=files))
+    write_json(folder / MANIFEST_FILE, dict(schema=DEMONSTRATIONS_SCHEMA, version=version("manifeel-ms3"), files=files))
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -174,8 +174,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         manifest = read_json(path, MANIFEST, "a manifest")
     except InvalidFileError as error:
         raise DemonstrationError(str(error)) from error
-    if (found := manifest["schema"]) != SCHEMA:
-        raise DemonstrationError(f"{path} has the schema {found!r}, this version reads {SCHEMA!r}; update manifeel-ms3")
+    if (found := manifest["schema"]) != DEMONSTRATIONS_SCHEMA:
+        raise DemonstrationError(
+            f"{path} has the schema {found!r}, this version reads {DEMONSTRATIONS_SCHEMA!r}; update manifeel-ms3"
+        )
     return manifest
 
 

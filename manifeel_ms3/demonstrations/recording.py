@@ -37,7 +37,7 @@ SESSION = "session-"
 
 
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
-    """The json of a trajectory file, but for its episodes.
+    """The json of a trajectory file, without its episodes.
 
     The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import the module that registers it. The
     render backend is left out, because it is a choice of the machine at hand.
@@ -99,7 +99,7 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
 
     Args:
         path: The trajectory file, which need not exist.
-        header: The json of the file, but for its episodes. `failed_seeds` is kept up to date if it is among the fields.
+        header: The json of the file, without its episodes. `failed_seeds` is kept up to date if it is among the fields.
         order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
 
     Raises:
@@ -119,7 +119,7 @@ class Recording:
 
     Args:
         path: The trajectory file.
-        header: The json of the file, but for its episodes.
+        header: The json of the file, without its episodes.
         order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
     """
 
@@ -243,7 +243,7 @@ class Recording:
             remove_recording(self.path)
 
     def _fields(self) -> dict[str, Any]:
-        """The json of the file as it is now, but for its episodes."""
+        """The json of the file as it is now, without its episodes."""
         failed = dict(failed_seeds=sorted(self.failed)) if "failed_seeds" in self._header else {}
         return self._header | failed
 

@@ -124,7 +124,7 @@ def _warn(recording: Recording) -> None:
 
 
 def _env_kwargs(args: Args, source: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of the environment that renders: those of the recording, but for what is asked for."""
+    """Arguments of the environment that renders: those of the recording, with the changes that are asked for."""
     sensing = dict(obs_mode=args.obs_mode, cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     asked: dict[str, Any] = {} if args.control_mode is None else dict(control_mode=args.control_mode)
     if args.image_size is not None:

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError, UnknownNameError
-from manifeel_ms3.paths import leaderboard_dir
+from manifeel_ms3.paths import CHECKPOINTS, leaderboard_dir
 
 from .agreement import differences
 from .checkpoint_config import checkpoint_sha256
 from .result import read_result
 from .rollout import EpisodeOutcome
 
-CHECKPOINTS = "checkpoints"
-"""Folder beside a result that holds its checkpoint."""
 ABOUT = "submission.json"
 """File that names the checkpoints' hashes."""
 

@@ -38,7 +38,7 @@ from .policy import BATCH_SIZES, PolicySource, checked_device
 from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
-from .starts import read_seeds
+from .seed_list import read_seeds
 
 log = logging.getLogger(__name__)
 SENSING = ("obs_mode", "cameras", "tactile_sensors")
@@ -82,7 +82,7 @@ class Args:
     episodes: Annotated[int, tyro.conf.arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     seeds: Path | None = None
-    """Text file with the seeds of the episodes, one a line, which replaces --num-eval-episodes: a private list of initial
+    """Text file with the seeds of the episodes, one per line, which replaces --num-eval-episodes: a private list of initial
     states, to which no policy can have been fitted. The result holds the seeds, too."""
     workers: Annotated[int, tyro.conf.arg(name="num-eval-envs", aliases=["--workers"])] = 1
     """Number of processes that simulate episodes side by side; one more process holds the policy of a checkpoint."""

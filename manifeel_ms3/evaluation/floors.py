@@ -12,7 +12,7 @@ from typing import Any
 from manifeel_ms3.files import read_json
 from manifeel_ms3.paths import data_dir
 
-SCHEMA = "manifeel-floors-1"
+FLOORS_SCHEMA = "manifeel-floors-1"
 """Version of the form of the files."""
 POLICIES = {
     "random": "uniformly random actions",
@@ -25,7 +25,7 @@ FORM = {
     "type": "object",
     "required": ["schema", "env_id", "revision", "git_commit", "command", "floors"],
     "properties": {
-        "schema": {"const": SCHEMA},
+        "schema": {"const": FLOORS_SCHEMA},
         "env_id": {"type": "string"},
         "revision": {"type": "integer", "minimum": 1},
         "git_commit": {"type": ["string", "null"]},

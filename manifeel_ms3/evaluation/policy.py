@@ -37,7 +37,7 @@ class Policy(Protocol):
 
 
 @dataclass(frozen=True)
-class Question:
+class PolicyRequest:
     """What one episode asks of a policy that answers several episodes at once."""
 
     seed: int
@@ -48,7 +48,7 @@ class Question:
     """Arrays by name, as the policy takes them."""
 
 
-Ask = Callable[[Question], np.ndarray]
+Ask = Callable[[PolicyRequest], np.ndarray]
 """Function that returns the answer to a question; what an answer is, the policy and its part beside the episode agree on."""
 
 
@@ -64,7 +64,7 @@ class BatchPolicy(Protocol):
     batch_size: int
     """Number of questions that are answered together."""
 
-    def answer(self, questions: list[Question]) -> list[np.ndarray]:
+    def answer(self, questions: list[PolicyRequest]) -> list[np.ndarray]:
         """One answer for each question; it depends on the question alone, not on those beside it."""
         ...
 

@@ -1,8 +1,8 @@
 """One process that holds a policy and answers all episodes in batches, whichever processes simulate them.
 
-    simulating processes                    main process                     policy's process
-    SharedPolicy.act  --- Question --->  PolicyProcess (a thread)  --- batch --->  answer_batches
-                      <--- answer ---                             <--- answers ---
+    simulating processes                         main process                     policy's process
+    SharedPolicy.act  --- PolicyRequest --->  PolicyProcess (a thread)  --- batch --->  answer_batches
+                      <------ answer -------                            <-- answers ---
 
 The main process passes questions on, so that it knows which of them a policy that crashes or hangs was busy with. These are
 asked again one by one in a new process, and only the question that ends it alone fails its episode.
@@ -28,7 +28,7 @@ import torch
 from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.workers import SafeSpawnContext, end_with_parent
 
-from .policy import Policy, PolicySource, PolicyUnavailableError, Question
+from .policy import Policy, PolicyRequest, PolicySource, PolicyUnavailableError
 from .rollout import PolicyFault, begin_episode
 
 FIRST_ANSWER = 120.0
@@ -36,6 +36,8 @@ FIRST_ANSWER = 120.0
 ENDED = "the process that holds the policy has ended; run the command again"
 LONGEST_FOLDER = 60
 """Number of characters of the folder for temporary files beyond which /tmp is used: the path of a socket has 107 at most."""
+BACKLOG = 128
+"""Simulating processes that may wait to be connected; more than any machine runs at once."""
 LEAST_WAIT = 0.05
 """Time in s between two looks at a limit."""
 
@@ -57,7 +59,7 @@ class _Caller:
     connection: Connection
     knows_policy: bool = False
     """Whether it has been sent the policy's description."""
-    question: Question | None = None
+    question: PolicyRequest | None = None
     """The question that waits for its answer."""
     asked_at: float = 0.0
     alone: bool = False
@@ -89,7 +91,7 @@ class PolicyProcess:
     def __enter__(self) -> "PolicyProcess":
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(self.address)
-        self._listener.listen(128)
+        self._listener.listen(BACKLOG)
         self._start()
         self._thread = threading.Thread(target=self._serve, daemon=True)
         with _without_ctrl_c():
@@ -285,7 +287,7 @@ class SharedPolicy:
         self.waited = 0.0
         return self._part.act(obs)
 
-    def _ask(self, question: Question) -> np.ndarray:
+    def _ask(self, question: PolicyRequest) -> np.ndarray:
         """The policy's answer to a question.
 
         Raises:
@@ -330,7 +332,7 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
             connection.send(_answers(policy, connection.recv()))
 
 
-def _answers(policy: Any, questions: list[Question]) -> list[np.ndarray | Exception]:
+def _answers(policy: Any, questions: list[PolicyRequest]) -> list[np.ndarray | Exception]:
     try:
         answers = policy.answer(questions)
         if len(answers) != len(questions):

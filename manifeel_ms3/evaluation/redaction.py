@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 MARK = "(redacted)"
-"""What stands in the place of a secret."""
+"""Mark that replaces a secret."""
 SHORTEST_SECRET = 4
 """Number of characters from which on a secret is also searched for in messages; shorter ones occur by chance."""
 _WORDS = (
@@ -29,7 +29,7 @@ _VALUES = re.compile(
 
 
 def redacted(value: Any) -> Any:
-    """A copy of a json value in which a mark stands in the place of every secret.
+    """A copy of a json value in which a mark replaces every secret.
 
     Args:
         value: Any value that json knows; tuples may stand for lists.
@@ -55,7 +55,7 @@ def secrets_in(value: Any) -> Iterator[str]:
 
 
 def without_secrets(text: str, secrets: list[str]) -> str:
-    """A text, such as an error message, in which a mark stands in the place of some secrets and of all that looks like one."""
+    """A text, such as an error message, in which a mark replaces some secrets and everything that looks like one."""
     for secret in sorted(set(secrets), key=len, reverse=True):
         if len(secret) >= SHORTEST_SECRET:
             text = text.replace(secret, MARK)

@@ -38,6 +38,8 @@ STRIP_SIDE = 160
 """Width and height of an image in the strip, in pixels; report.html.j2 has the same height for the names of the rows."""
 CURVE_HEIGHT = 340
 """Height of a figure, in pixels."""
+CURVE_MARGINS = dict(l=60, r=20, t=20, b=50)
+"""Left, right, upper and lower margin of a figure, in pixels."""
 FORCE_MARGIN, FORCE_POINTS = 1.2, 601
 """End of the axis of forces over the largest force on it, and number of its points."""
 RATES = {
@@ -92,7 +94,7 @@ def force_curve(result: dict[str, Any]) -> str:
         yaxis_title="success, %",
         yaxis_range=[0, 100],
         height=CURVE_HEIGHT,
-        margin=dict(l=60, r=20, t=20, b=50),
+        margin=CURVE_MARGINS,
     )
     return figure.to_html(full_html=False, include_plotlyjs=True)
 
@@ -106,7 +108,7 @@ def training_curve(log_file: Path) -> str:
         yaxis_title="loss",
         yaxis_type="log",
         height=CURVE_HEIGHT,
-        margin=dict(l=60, r=20, t=20, b=50),
+        margin=CURVE_MARGINS,
     )
     return figure.to_html(full_html=False, include_plotlyjs=False)
 

@@ -19,7 +19,7 @@ from .redaction import redacted
 from .rollout import ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
 from .statistics import wilson_interval
 
-SCHEMA = "manifeel-evaluation-3"
+RESULT_SCHEMA = "manifeel-evaluation-3"
 """Version of the form of result files; data/evaluation_schema.json defines it."""
 EARLIER = {
     "manifeel-evaluation-1": "does not say the revision of the task",
@@ -70,7 +70,7 @@ def result_of(
     """
     config, episodes = published_config(config), [outcome_as_json(outcome) for outcome in outcomes]
     return dict(
-        schema=SCHEMA,
+        schema=RESULT_SCHEMA,
         env_id=env_id,
         env_kwargs=env_kwargs,
         obs_mode=config["obs_mode"],
@@ -181,12 +181,12 @@ def check_result(result: Any, source: Path) -> None:
     given = result.get("schema") if isinstance(result, dict) else None
     if isinstance(given, str) and given in EARLIER:
         raise ResultError(
-            f"{source} has the schema {given!r}, which {EARLIER[given]}; this version reads {SCHEMA!r}: evaluate the policy "
-            "again, after training it again if its checkpoint is refused, too"
+            f"{source} has the schema {given!r}, which {EARLIER[given]}; this version reads {RESULT_SCHEMA!r}: evaluate "
+            "the policy again, after training it again if its checkpoint is refused, too"
         )
-    if given != SCHEMA:
+    if given != RESULT_SCHEMA:
         raise ResultError(
-            f"{source} has the schema {given!r}, this version reads {SCHEMA!r}; evaluate the policy again, or update "
+            f"{source} has the schema {given!r}, this version reads {RESULT_SCHEMA!r}; evaluate the policy again, or update "
             "manifeel-ms3"
         )
     for error in jsonschema.Draft202012Validator(result_schema()).iter_errors(result):

@@ -12,6 +12,9 @@ from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position
 
+STREAM = 13
+"""Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
+
 
 @dataclass(frozen=True)
 class BallSortingExpertConfig:
@@ -64,7 +67,7 @@ class BallSortingExpert:
 
     def __init__(self, env: BallSortingEnv, seed: int):
         self.env = env
-        rng = np.random.default_rng([seed, 13])
+        rng = np.random.default_rng([seed, STREAM])
         self.skills = Skills(env)
         self.skills.gripper = 1.0
         self.stand = perceived_position(env.stand, rng)

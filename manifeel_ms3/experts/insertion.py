@@ -10,6 +10,8 @@ from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
 STRAIGHT = Rotation.identity()
+STREAM = 7
+"""Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,7 @@ class InsertionExpertConfig:
 
 
 class InsertionExpert:
-    """Knows the parts, sees roughly where the socket is, and goes by what it feels.
+    """Knows the parts' geometry and roughly the socket's position, and decides by the forces that the pads feel.
 
     Two things are read from the simulator instead of from images: the socket's position, with an error of up to
     `SkillConfig.sight_error`, and the plug's pose in the hand, with an error of its pitch of up to `grasp_error`.
@@ -91,7 +93,7 @@ class InsertionExpert:
     config = InsertionExpertConfig()
 
     def __init__(self, env: InsertionEnv, seed: int):
-        self._rng = np.random.default_rng([seed, 7])
+        self._rng = np.random.default_rng([seed, STREAM])
         self.env, self.fit = env, env.fit
         self.skills = Skills(env)
         self._pitch_error = Rotation.from_euler("y", self._rng.uniform(-1, 1) * self.config.grasp_error)
@@ -162,7 +164,7 @@ class InsertionExpert:
         raise NotImplementedError
 
     def _disturb(self) -> np.ndarray:
-        """Addition (6,) to the action: now and then, while the plug is free, a push of the hand to some side."""
+        """Disturbance (6,) that is added to the action: while the plug is free, an occasional push in a random direction."""
         config = self.config
         if self._disturbed_steps == 0:
             free = self._place(self._end)[2] > self._rim + config.free_height
@@ -175,7 +177,7 @@ class InsertionExpert:
         return self._disturbance
 
     def _press(self) -> Actions:
-        """Press down and comply with sideways forces and tilts; where the plug sticks, wriggle.
+        """Press down and yield to sideways forces and tilts; wriggle where the plug sticks.
 
         It ends only when the plug has not entered the hole, or slides about on top.
         """
@@ -202,7 +204,7 @@ class InsertionExpert:
             yield skills.command(command + move, skills.towards(facing, config.turn_rate))
 
     def _press_force(self, stuck: int) -> float:
-        """Downward force, in N, on a plug that has been stuck for so many steps."""
+        """Downward force, in N, on a plug that has not advanced for `stuck` steps."""
         return self.config.press_force
 
     def _is_on_top(self) -> bool:
@@ -220,6 +222,6 @@ class InsertionExpert:
         return bool(astray or (stuck > self.config.patience and self._is_on_top()))
 
     def _twisted(self, stuck: int) -> Rotation:
-        """Rotation about the vertical of a plug that has been stuck for so many steps."""
+        """Rotation about the vertical that a plug is given when it has not advanced for `stuck` steps."""
         swing = self.config.twist * min(1 + stuck / self.config.twist_growth, 2.0)
         return Rotation.from_euler("z", swing * np.sin(self.config.twist_rate * stuck))

@@ -11,6 +11,9 @@ from manifeel_ms3.tasks.screwing.bulb_installation import BulbInstallationEnv
 
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
+STREAM = 17
+"""Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
+
 
 @dataclass(frozen=True)
 class ScrewingExpertConfig:
@@ -96,7 +99,7 @@ class ScrewingExpert:
         self._closed = self.skills.grip_action(self.screw.grip_width, self.screw.grip_force)
         self._open = self.skills.finger_action(self.screw.grip_width / 2 + self.config.open_by)
         self.skills.gripper = self._closed
-        self.axis = perceived_position(env.fixed, np.random.default_rng([seed, 17]))
+        self.axis = perceived_position(env.fixed, np.random.default_rng([seed, STREAM]))
         self.yaw = WOUND_UP
 
     def _facing(self) -> Rotation:

@@ -21,6 +21,20 @@ SIZE = (SCENE_SIZE + NARROW + WIDE + 2 * GAP, BAR + 2 * TILE + GAP)
 """Width and height of a film, in pixels."""
 MARGINS = (14, 34, 14, 14)
 """Left, upper, right and lower margin of the curve in its tile, in pixels."""
+TITLE_SIZE, TIME_SIZE, CAPTION_SIZE, LIMIT_SIZE = 19, 17, 14, 12
+"""Sizes of the text, in points."""
+TITLE_INSET, SUCCESS_INSET = 12, 90
+"""Distance of the title and the time from the film's sides, and of the word "success" from the right side, in pixels."""
+CAPTION_AT = (8, 6)
+"""Place of a caption in its tile, in pixels."""
+CAPTION_PADDING = (5, 4)
+"""Width of the dark ground around a caption at its sides, and above and below it, in pixels."""
+LIMIT_LIFT = 3
+"""Distance of its text above the line of the limit, in pixels."""
+POINT_RADIUS = 3
+"""Radius of the point at the end of the curve, in pixels."""
+HEADROOM = 1.1
+"""Upper end of the axis of forces, as a multiple of the largest force."""
 SMALLEST_AXIS = 5.0
 """Smallest end of the axis of forces, in N: less is noise of the contacts."""
 GROUND, PAPER, INK, FAINT = (18, 20, 24), (30, 33, 39), (236, 238, 242), (128, 134, 146)
@@ -52,11 +66,11 @@ def film_frame(take: Take, shot: Shot) -> Image.Image:
 
 def _draw_title(draw: ImageDraw.ImageDraw, take: Take, step: int) -> None:
     middle = BAR // 2
-    draw.text((12, middle), take.title, INK, _font(19), anchor="lm")
+    draw.text((TITLE_INSET, middle), take.title, INK, _font(TITLE_SIZE), anchor="lm")
     time = f"{step / CONTROL_FREQ:.1f} s"
-    draw.text((SIZE[0] - 12, middle), time, FAINT, _font(17), anchor="rm")
+    draw.text((SIZE[0] - TITLE_INSET, middle), time, FAINT, _font(TIME_SIZE), anchor="rm")
     if take.successes[step]:
-        draw.text((SIZE[0] - 90, middle), "success", SUCCESS, _font(19), anchor="rm")
+        draw.text((SIZE[0] - SUCCESS_INSET, middle), "success", SUCCESS, _font(TITLE_SIZE), anchor="rm")
 
 
 def _fitted(image: np.ndarray, width: int, height: int) -> Image.Image:
@@ -70,10 +84,11 @@ def _fitted(image: np.ndarray, width: int, height: int) -> Image.Image:
 
 
 def _draw_caption(draw: ImageDraw.ImageDraw, caption: str) -> None:
-    font = _font(14)
-    box = draw.textbbox((8, 6), caption, font)
-    draw.rectangle((box[0] - 5, box[1] - 4, box[2] + 5, box[3] + 4), fill=GROUND)
-    draw.text((8, 6), caption, INK, font)
+    font = _font(CAPTION_SIZE)
+    left, top, right, bottom = draw.textbbox(CAPTION_AT, caption, font)
+    beside, above = CAPTION_PADDING
+    draw.rectangle((left - beside, top - above, right + beside, bottom + above), fill=GROUND)
+    draw.text(CAPTION_AT, caption, INK, font)
 
 
 def _force_curve(take: Take, step: int) -> Image.Image:
@@ -81,20 +96,21 @@ def _force_curve(take: Take, step: int) -> Image.Image:
     tile = Image.new("RGB", (NARROW, TILE), PAPER)
     draw = ImageDraw.Draw(tile)
     left, top, right, bottom = MARGINS[0], MARGINS[1], NARROW - MARGINS[2], TILE - MARGINS[3]
-    largest = max(*take.forces, take.force_limit or 0.0, SMALLEST_AXIS) * 1.1
+    largest = max(*take.forces, take.force_limit or 0.0, SMALLEST_AXIS) * HEADROOM
     across = np.linspace(left, right, max(len(take.forces), 2))
     down = bottom - (bottom - top) * np.asarray(take.forces) / largest
     draw.line((left, bottom, right, bottom), FAINT)
     if take.force_limit:
         height = bottom - (bottom - top) * take.force_limit / largest
         draw.line((left, height, right, height), LIMIT)
-        draw.text((right, height - 3), f"gentle: up to {take.force_limit:g} N", LIMIT, _font(12), anchor="rs")
+        gentle = f"gentle: up to {take.force_limit:g} N"
+        draw.text((right, height - LIMIT_LIFT), gentle, LIMIT, _font(LIMIT_SIZE), anchor="rs")
     points = list(zip(across.tolist(), down.tolist(), strict=False))[: step + 1]
     if len(points) > 1:
         draw.line(points, CURVE, width=2, joint="curve")
     x, y = points[-1]
-    draw.ellipse((x - 3, y - 3, x + 3, y + 3), fill=CURVE)
-    draw.text((8, 6), f"contact force: {take.forces[step]:.1f} N", INK, _font(14))
+    draw.ellipse((x - POINT_RADIUS, y - POINT_RADIUS, x + POINT_RADIUS, y + POINT_RADIUS), fill=CURVE)
+    draw.text(CAPTION_AT, f"contact force: {take.forces[step]:.1f} N", INK, _font(CAPTION_SIZE))
     return tile
 
 

@@ -10,6 +10,7 @@ CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004
 CONTAINER_FLOOR = 0.004  # m, thickness
 BATTERY_SIZE = 0.025  # m
 TERMINAL_HEIGHT = 0.001  # m
+BATTERY_LOOK = Look((0.05, 0.25, 0.10))  # green, chosen by eye
 BATTERY_DENSITY = 2000.0  # kg/m^3: an alkaline block 6LR61 has 45 g in 48.5 x 26.5 x 17.5 mm (data sheets)
 BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010  # m, inside; the floor's thickness
 BOWL_WALL, BOWL_WEDGES = 0.005, 16  # m; number of convex pieces of the round wall
@@ -45,7 +46,7 @@ def battery() -> Part:
     return Part(
         "battery",
         (Box((size, size, size)), terminal),
-        Look((0.05, 0.25, 0.10)),
+        BATTERY_LOOK,
         density=BATTERY_DENSITY,
         other_looks={1: BRASS},
     )

@@ -20,6 +20,7 @@ SHAFT_HEIGHT = 0.018  # m
 RING_HEIGHT = 0.005  # m, between the medium gear and its handle
 BASE_SIZE = (0.15, 0.075, 0.025)  # m
 HANDLE_SIZE = (0.020, 0.030, 0.040)  # m; narrower than a pad, so that touch sees its edges
+GRIP = -0.004  # m, from the handle's middle
 WEDGES = 16  # number of convex pieces of the ring around the bore
 DEDENDUM = 1.25  # modules, from the pitch circle to the root (ISO 53)
 RING_OVERLAP = 2e-4  # m, of the ring and the teeth, so that no gap is between them
@@ -41,7 +42,7 @@ LOOKS = {"small": Look((0.62, 0.10, 0.05)), "medium": Look((0.85, 0.55, 0.05)), 
 
 @dataclass(frozen=True)
 class ShaftSizes:
-    """Radii of the shafts and of the gears' bores, in m."""
+    """Sizes of the shafts and of the gears' bores, in m."""
 
     shaft: float
     """Radius of a shaft."""
@@ -49,11 +50,13 @@ class ShaftSizes:
     """Radius of a shaft's end, to which it narrows at 45 degrees."""
     bore: float
     """Radius of a gear's bore."""
+    clearance: float
+    """Largest distance from the shaft's axis at which the gear counts as on it; chosen by hand."""
 
 
 SHAFTS = {
-    "paper": ShaftSizes(0.0045, 0.0038, 0.0050),  # measured in the meshes of the public code
-    "tight": ShaftSizes(0.0050, 0.0050, 0.00515),
+    "paper": ShaftSizes(0.0045, 0.0038, 0.0050, 1e-3),  # measured in the meshes of the public code
+    "tight": ShaftSizes(0.0050, 0.0050, 0.00515, 5e-4),
 }
 
 
@@ -119,14 +122,14 @@ def gear_fit(fit: str = "paper") -> Fit:
         ),
         socket=gear_base(fit),
         reach=reach,
-        grip=-0.004,
+        grip=GRIP,
         grip_width=HANDLE_SIZE[1],
         rim=BASE_SIZE[2] + SHAFT_HEIGHT,
         floor=BASE_SIZE[2],
         corner=(-diagonal * sizes.bore,) * 2,
         aim=(-diagonal * (sizes.shaft + BESIDE),) * 2,
         lean=LEAN,
-        clearance=5e-4 if fit == "tight" else 1e-3,
+        clearance=sizes.clearance,
         goes_in_upright=fit == "paper",
         leads=(Lead(ABOVE_RIM, is_pin_below=True),),
     )

@@ -61,19 +61,21 @@ def peg_fit(fit: str = "paper") -> Fit:
 
 REORIENTATION_PEG = (0.016, 0.010, 0.050)  # m
 REORIENTATION_GAP, RIM_DEPTH, RIM_BOTTOM = 2e-4, 0.015, 0.005  # m
+RIM_SIZE = (0.03, 0.03)  # m, outside
+REORIENTATION_GRIP = -0.018  # m, from the peg's middle; the fingers stay clear of the rim at 30 degrees
 
 
 def reorientation_fit() -> Fit:
     """Peg 16 x 10 x 50 mm and a rim 15 mm deep around its place, 0.2 mm wider on each side."""
     x, y, z = REORIENTATION_PEG
     hole = (x + 2 * REORIENTATION_GAP, y + 2 * REORIENTATION_GAP)
-    base = Box((0.03, 0.03, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
-    rim = block_with_holes((0.03, 0.03), RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
+    base = Box((*RIM_SIZE, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))
+    rim = block_with_holes(RIM_SIZE, RIM_DEPTH, [(hole, (0.0, 0.0))], bottom=RIM_BOTTOM)
     return Fit(
         plug=Part("peg", (Box(REORIENTATION_PEG),), look=BRASS, density=materials.BRASS),
         socket=Part("rim", (base, *rim), look=BLUE_PLASTIC),
         reach=z / 2,
-        grip=-0.018,  # the fingers stay clear of the rim at 30 degrees
+        grip=REORIENTATION_GRIP,
         grip_width=y,
         rim=RIM_BOTTOM + RIM_DEPTH,
         floor=RIM_BOTTOM,

@@ -117,6 +117,14 @@ E27_GAP, GUIDE = 2.0e-4, 1.0e-3  # m, radial: between the threads, and of the sm
 GLASS_RADIUS = 0.030
 CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
 CAP_RIDGE, CAP_TURNS = -0.056, 1.5
+RIDGE_OVERLAP = 5e-4  # m, by which the cap's ridge reaches into its core, so that no gap is between them
+NECK_RADIUS, NECK_TOP = 0.018, -0.024  # m; where the neck meets the glass's sphere, from its middle
+FOOT_RADIUS = 0.005  # m: the insulator narrows to it
+TIP_RADIUS, TIP_HEIGHT = 0.004, 0.003  # m: the contact at the foot
+TIP_OVERHANG = 0.001  # m, by which the contact stands out of the insulator
+CONE_CORNERS = 24  # of the convex pieces of neck, cap and foot
+HOLDER_SECTIONS = 64  # straight sides of the holder's round wall
+THREAD_OVERLAP = 1e-4  # m, by which the holder's thread reaches into its wall, so that no gap is between them
 HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
 CONTACT_HEIGHT = 0.012  # m, over the underside
 BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's chamfer
@@ -130,10 +138,10 @@ BULB_SEATED = CONTACT_HEIGHT - CAP_TIP
 BULB_TRAVEL = 0.0034  # m down from where the ridge's lower end just passes under the bore's crest
 
 
-def _cone(radii: tuple[float, float], heights: tuple[float, float], corners: int = 24) -> np.ndarray:
-    angle = 2 * np.pi * np.arange(corners) / corners
+def _cone(radii: tuple[float, float], heights: tuple[float, float]) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(CONE_CORNERS) / CONE_CORNERS
     return np.concatenate(
-        [np.c_[r * np.cos(angle), r * np.sin(angle), np.full(corners, z)] for r, z in zip(radii, heights, strict=True)]
+        [np.c_[r * np.cos(angle), r * np.sin(angle), np.full(CONE_CORNERS, z)] for r, z in zip(radii, heights, strict=True)]
     )
 
 
@@ -150,12 +158,12 @@ def e27_bulb() -> Part:
     """Light bulb: glass, neck, and a cap with one and a half turns of thread, an insulator and a contact at its foot."""
     core = E27.minor_radius
     crest = np.array([(radius, height) for height, radius in E27.profile if abs(height) < E27.pitch / 3])
-    section = np.r_[crest, [[core - 5e-4, side * E27.pitch / 4] for side in (-1, 1)]]
+    section = np.r_[crest, [[core - RIDGE_OVERLAP, side * E27.pitch / 4] for side in (-1, 1)]]
     section[:, 1] += CAP_RIDGE
-    neck = _cone((0.018, core), (-0.024, CAP_TOP))
+    neck = _cone((NECK_RADIUS, core), (NECK_TOP, CAP_TOP))
     cap = (_cone((core, core), (CAP_TOP, CAP_FOOT)), *ridge(section, E27.pitch, CAP_TURNS, PIECES_PER_TURN, lead_in=LEAD_IN))
-    foot = _cone((core, 0.005), (CAP_FOOT, CAP_TIP + 0.001))
-    tip = Cylinder(0.004, 0.003, (0.0, 0.0, CAP_TIP + 0.0015))
+    foot = _cone((core, FOOT_RADIUS), (CAP_FOOT, CAP_TIP + TIP_OVERHANG))
+    tip = Cylinder(TIP_RADIUS, TIP_HEIGHT, (0.0, 0.0, CAP_TIP + TIP_HEIGHT / 2))
     return Part(
         "bulb",
         (Ball(GLASS_RADIUS), Hulls((neck,)), Hulls(cap), Hulls((foot,)), tip),
@@ -170,11 +178,11 @@ def e27_holder() -> Part:
     """Lampholder with an inner thread below its rim, and a contact at the bottom."""
     bore = E27.wider(E27_GAP)
     mouth = bore.major_radius + GUIDE
-    thread = internal_mesh(bore, BORE[1] - BORE[0], mouth + 1e-4)
+    thread = internal_mesh(bore, BORE[1] - BORE[0], mouth + THREAD_OVERLAP)
     thread.apply_transform(trimesh.transformations.rotation_matrix(BORE_TURN, [0, 0, 1]))
     thread.apply_translation([0, 0, BORE[0]])
 
-    shell = trimesh.creation.annulus(mouth, HOLDER_RADIUS, HOLDER_HEIGHT, sections=64)
+    shell = trimesh.creation.annulus(mouth, HOLDER_RADIUS, HOLDER_HEIGHT, sections=HOLDER_SECTIONS)
     shell.apply_translation([0, 0, HOLDER_HEIGHT / 2])
     contact = Cylinder(mouth, CONTACT_HEIGHT, (0.0, 0.0, CONTACT_HEIGHT / 2))
     return Part(

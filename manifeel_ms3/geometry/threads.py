@@ -10,6 +10,8 @@ import trimesh
 
 FLANK = np.tan(np.deg2rad(30.0))
 """Slope of a flank: half of the thread angle of 60 degrees (ISO 68-1)."""
+MERGED_DIGITS = 9
+"""Decimals, in m, to which vertices must agree to be merged: a nanometre, below which only rounding differs."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,7 @@ def _skin(rim: np.ndarray, per_pitch: int) -> tuple[np.ndarray, list[list[int]]]
 
 def _clean(vertices: np.ndarray, faces) -> trimesh.Trimesh:
     mesh = trimesh.Trimesh(vertices, faces, process=False)
-    mesh.merge_vertices(digits_vertex=9)
+    mesh.merge_vertices(digits_vertex=MERGED_DIGITS)
     mesh.update_faces(mesh.nondegenerate_faces())
     mesh.remove_unreferenced_vertices()
     return mesh

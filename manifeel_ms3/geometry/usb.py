@@ -10,6 +10,7 @@ from .part import Box, Part, Piece, block_with_holes
 
 HANDLE = (0.012, 0.030, 0.070)  # m; narrower than a pad, so that touch sees its edges
 GRIP = -0.012  # m, from the handle's middle
+ABOVE_TONGUE = 0.0005  # m over the tongue's end, from which on the plug may meet it; chosen by hand
 BLOCK, RIM = (0.066, 0.066), 0.037  # m: the port's block, and its height
 
 
@@ -97,7 +98,7 @@ def usb_fit(fit: str = "paper") -> Fit:
         goes_in_upright=fit == "paper",
         leads=(
             Lead(ABOVE_RIM),
-            Lead(sizes.recess - 0.0005, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
+            Lead(sizes.recess - ABOVE_TONGUE, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
         ),
         **Fit.into_hole((prong[0] / 2, prong[1] / 2), (hole[0] / 2, hole[1] / 2)),
     )

@@ -15,7 +15,7 @@ import numpy as np
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.estimates import Estimate, mean_success
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.presets import setup_of
+from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
@@ -136,7 +136,7 @@ def leaderboard_table(rows: list[Row]) -> str:
         name = markdown_text(about.name)
         task = f"{condition.task} {condition.variant}".strip()
         gentle = "" if row.gentle is None else f"{row.gentle:.0%}"
-        what = (task, condition.sensing, condition.policy, str(setup_of(condition)), condition.encoder)
+        what = (task, condition.sensing, condition.policy, str(training_settings_of(condition)), condition.encoder)
         success = (row.success, row.deviation_text, row.floor or "", gentle)
         numbers = (condition.num_demos, *success, row.results.size, row.rerun_text)
         cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
@@ -163,7 +163,7 @@ def _for_page(row: Row) -> dict[str, Any]:
         sensing=condition.obs_mode,
         cameras=", ".join(condition.cameras),
         policy=condition.policy,
-        setup=str(setup_of(condition)),
+        setup=str(training_settings_of(condition)),
         encoder=condition.encoder,
         name=about.name,
         authors=about.authors,

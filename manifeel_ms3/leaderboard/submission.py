@@ -13,10 +13,11 @@ import jsonschema
 
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.result import check_result
+from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.paths import data_dir
 
 from .text import is_safe_link
-from .untrusted import SHOWN_LENGTH, FolderReader, UntrustedFileError, parse_json, quoted
+from .untrusted import FolderReader, UntrustedFileError, parse_json, quoted
 
 ABOUT, RERUN = Path("submission.json"), Path("rerun.json")
 """What the submission is, by its authors; and which episodes the leaderboard ran again."""

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import SHOWN_LENGTH
+from manifeel_ms3.paths import CHECKPOINTS
 
-CHECKPOINTS = "checkpoints"
-"""Name of folders that are not read: maintainers keep the checkpoints of an entry beside its results."""
 LARGEST = {".json": 2**20, ".mp4": 16 * 2**20}
 """Largest size of a file in bytes, by the endings that are read; a result of 50 episodes has 13 kB."""
 LARGEST_TOTAL = 128 * 2**20
@@ -26,8 +26,6 @@ DEEPEST_FOLDER = 8
 DEEPEST_JSON = 32
 """Largest number of lists and objects inside each other; a result has 5."""
 LARGEST_INTEGER = 2**63 - 1
-SHOWN_LENGTH = 200
-"""Number of characters of a reason that an error message shows."""
 
 
 class UntrustedFileError(InvalidFileError):
@@ -50,6 +48,7 @@ class FolderReader:
             return
         try:
             for place, folders, files, descriptor in os.fwalk(folder, onerror=_reraise):
+                # not read: maintainers keep the checkpoints of an entry beside its results
                 folders[:] = [name for name in folders if name != CHECKPOINTS]
                 self._read_level(Path(place).relative_to(folder), folders, files, descriptor)
         except UntrustedFileError as error:
@@ -110,7 +109,7 @@ def parse_json(content: bytes, path: Path) -> Any:
 
 
 def quoted(path: Path) -> str:
-    """The path as a message may show it: a name with line breaks or control characters stands in quotes, with escapes."""
+    """The path as a message may show it: a name with line breaks or control characters appears in quotes, with escapes."""
     text = str(path)
     return text if text.isprintable() else ascii(text)
 

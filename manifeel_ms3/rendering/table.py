@@ -1,6 +1,7 @@
 """The table top of wooden boards: its texture, painted here, and its mesh with the texture's coordinates."""
 
 import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,42 @@ ROWS = 8
 """Number of rows of boards across a tile."""
 WOOD = (0.68, 0.59, 0.49)
 """Mean colour of the boards, sRGB in [0, 1]."""
-ROUGHNESS = 0.5
+ROUGHNESS, SPECULAR = 0.5, 0.5
+"""Roughness and specular reflection of the surface, in [0, 1]; chosen by eye."""
+
+
+@dataclass(frozen=True)
+class BoardsConfig:
+    """How the boards are painted; all values are chosen by eye."""
+
+    fine_grain: tuple[float, float] = (60, 1.0)
+    """Length and width, in pixels, over which the fine grain is smooth."""
+    broad_grain: tuple[float, float] = (250, 9.0)
+    """Length and width, in pixels, over which the growth rings are smooth."""
+    end_jitter: int = 100
+    """Largest shift, in pixels, of one end of a board from half a tile beyond the other end."""
+    ring_turns: float = 1.3
+    """Growth rings that one standard deviation of the broad grain makes."""
+    ring_phases: float = 3.0
+    """Number of rings by which those of one board may be shifted against those of another."""
+    board_contrast: float = 0.055
+    """Standard deviation of the boards' brightness, as a share of the mean."""
+    ring_contrast: float = 0.035
+    """Amplitude of the rings' brightness, as a share of the mean."""
+    grain_contrast: float = 0.035
+    """Standard deviation of the fine grain's brightness, as a share of the mean."""
+    channel_powers: tuple[float, float, float] = (0.8, 1.0, 1.25)
+    """Powers of the brightness in red, green and blue: dark wood is redder."""
+    seam_darkness: float = 0.35
+    """Share by which the seams between the boards are darker."""
+
+
+BOARDS = BoardsConfig()
 
 
 def wood() -> RenderMaterial:
     """Surface of the table; only where there is a renderer."""
-    material = RenderMaterial(roughness=ROUGHNESS, specular=0.5)
+    material = RenderMaterial(roughness=ROUGHNESS, specular=SPECULAR)
     material.base_color_texture = wood_texture(0)
     return material
 
@@ -36,21 +67,25 @@ def wood_texture(seed: int) -> RenderTexture2D:
 def boards(seed: int) -> np.ndarray:
     """Image uint8 (PIXELS, PIXELS, 3) of boards along its rows, which continues on the opposite side."""
     rng = np.random.default_rng(seed)
-    fine, broad = _streaks(rng, 60, 1.0), _streaks(rng, 250, 9.0)
+    fine, broad = _streaks(rng, *BOARDS.fine_grain), _streaks(rng, *BOARDS.broad_grain)
     brightness = np.empty((PIXELS, PIXELS))
     seams = np.zeros((PIXELS, PIXELS))
     height = PIXELS // ROWS
     for row in range(ROWS):
         rows = slice(row * height, (row + 1) * height)
-        ends = (rng.integers(PIXELS) + np.array([0, PIXELS // 2 + rng.integers(-100, 100)])) % PIXELS
+        jitter = BOARDS.end_jitter
+        ends = (rng.integers(PIXELS) + np.array([0, PIXELS // 2 + rng.integers(-jitter, jitter)])) % PIXELS
         for start, stop in ((ends[0], ends[1]), (ends[1], ends[0])):
             columns = np.arange(start, stop if stop > start else stop + PIXELS) % PIXELS
-            rings = np.sin(2 * np.pi * (1.3 * np.roll(broad, rng.integers(PIXELS), 1)[rows, columns] + 3 * rng.random()))
+            turns = BOARDS.ring_turns * np.roll(broad, rng.integers(PIXELS), 1)[rows, columns]
+            rings = np.sin(2 * np.pi * (turns + BOARDS.ring_phases * rng.random()))
             grain = np.roll(fine, rng.integers(PIXELS), 1)[rows, columns]
-            brightness[rows, columns] = 1 + 0.055 * rng.standard_normal() + 0.035 * rings + 0.035 * grain
+            board = 1 + BOARDS.board_contrast * rng.standard_normal()
+            brightness[rows, columns] = board + BOARDS.ring_contrast * rings + BOARDS.grain_contrast * grain
             seams[rows, columns[0]] = 1
         seams[row * height] = 1
-    image = np.array(WOOD) * brightness[..., None] ** np.array([0.8, 1.0, 1.25]) * (1 - 0.35 * seams[..., None])
+    tint = brightness[..., None] ** np.array(BOARDS.channel_powers)
+    image = np.array(WOOD) * tint * (1 - BOARDS.seam_darkness * seams[..., None])
     return (255 * image.clip(0, 1)).astype(np.uint8)
 
 

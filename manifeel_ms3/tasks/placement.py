@@ -9,6 +9,10 @@ REACH_XY = 0.19
 """Half range, in m, on each axis around (0.5, 0) that is within the robot's reach."""
 HIGHEST = 0.35
 """Largest height of the tool, in m, that is within the robot's reach."""
+BUILT_AT = (0.5, 0.0, 0.3)
+"""Position at which the held parts are built, in m, clear of all others; every reset moves them into the hand."""
+POINTING_DOWN = (0.0, 1.0, 0.0, 0.0)
+"""Quaternion, w first, of a tool or a plug that points straight down: half a turn about x."""
 OUT_OF_REACH = "further out it is out of the robot's reach"
 
 
@@ -45,7 +49,7 @@ def start_pose(
 def random_downward(n: int, rotation: float | torch.Tensor) -> torch.Tensor:
     """Quaternions (n, 4) of a tool that points down with its x along the base's, turned by +- `rotation` about each axis."""
     turn = axis_angle_to_quaternion(uniform_in(rotation, n, 3))
-    return quaternion_multiply(turn, torch.tensor([0.0, 1.0, 0.0, 0.0]).expand(n, 4))
+    return quaternion_multiply(turn, torch.tensor(POINTING_DOWN).expand(n, 4))
 
 
 def height_range(start: float, lowest: float) -> float:

@@ -41,6 +41,8 @@ HOLD_SECONDS = 0.5
 """Time for which a goal must hold until the episode is a success, in s."""
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s."""
+MAX_CONTACTS, MAX_PATCHES = 2**21, 2**19
+"""Contacts and contact patches that the engine reserves memory for on a GPU: many environments with threads and teeth."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
@@ -248,7 +250,7 @@ class VisuotactileEnv(SceneryEnv):
         return SimConfig(
             sim_freq=self.physics_rate,
             control_freq=CONTROL_FREQ,
-            gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=2**21, max_rigid_patch_count=2**19),
+            gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=MAX_CONTACTS, max_rigid_patch_count=MAX_PATCHES),
             scene_config=SceneConfig(**self.contacts),
         )
 

@@ -31,6 +31,15 @@ DEPTH_LOADS = (1.0, 3.0, 10.0)
 """Loads, in N, of a ball whose depth is compared with the law of the gel layer."""
 MOST_SLIDING = 2e-3
 """Distance, in m, from which an object counts as having slid off: the load then no longer acts where it was put."""
+HOUSING_SHARE = 0.9
+"""Share of the gel's protrusion to which an object may press the gel in: beyond, the housing would carry
+a part of the load. Chosen."""
+FLAT_CONTACT_POINTS = 4
+"""Contact points of PhysX between the gel and a shape that is no ball."""
+LOOP_SECONDS = 0.05
+"""Time that each load of the loop acts, in s."""
+LAYER_POINTS = 401
+"""Points on each side of the grid over which the law of the layer is summed."""
 CLEARANCE = 2e-4
 """Height over the pad at which an object begins, in m."""
 SHAPES: dict[str, tuple[dict[str, Any], float]] = {
@@ -153,8 +162,9 @@ def _is_ball(name: str) -> bool:
 
 def largest_load(press: Press, name: str) -> float:
     """Largest load, N, that the engine's gel carries: a ball has one contact point, and would reach the housing."""
-    stiffness = GEL_STIFFNESS / 2 * (1 if _is_ball(name) else 4)  # PhysX averages it with the other body's 0
-    return 0.9 * stiffness * press.sensor.config.housing.protrusion
+    points = 1 if _is_ball(name) else FLAT_CONTACT_POINTS
+    stiffness = GEL_STIFFNESS / 2 * points  # PhysX averages it with the other body's 0
+    return HOUSING_SHARE * stiffness * press.sensor.config.housing.protrusion
 
 
 def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...], left_out: list[str]) -> Iterator[Reading]:
@@ -190,7 +200,7 @@ def _loop(press: Press, touching: float) -> np.ndarray:
     press.place(touching + CLEARANCE, *PLACE)
     points = [(0.0, 0.0)]
     for load in (*LOOP_LOADS, *LOOP_LOADS[-2::-1], 0.0):
-        press.push(load, seconds=0.05)
+        press.push(load, seconds=LOOP_SECONDS)
         points.append((load, press.sums[0]))
     return np.array(points)
 
@@ -209,7 +219,7 @@ def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
 
     The pressure is `gel.normal_stiffness` times the penetration, summed over a finer grid than the sensor's.
     """
-    sides = [np.linspace(-extent / 2, extent / 2, 401) for extent in gel.size]
+    sides = [np.linspace(-extent / 2, extent / 2, LAYER_POINTS) for extent in gel.size]
     x, y = np.meshgrid(*sides, indexing="ij")
     area = np.prod([side[1] - side[0] for side in sides])
     r2 = x**2 + y**2

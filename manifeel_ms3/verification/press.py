@@ -97,7 +97,7 @@ def indenter(name: str, rotation: np.ndarray | None = None, **shape) -> Callable
 
 
 class Press:
-    """A bench whose object hangs free, but for its tilt, locked if `upright`, and is pushed with what `push` says.
+    """A bench with an object that moves freely, or without tilting if `upright`, and to which `push` applies a load.
 
     The right pad's normal is the world's y axis, so that locking the turns about x and z leaves the twist about the normal.
 

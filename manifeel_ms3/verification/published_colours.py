@@ -1,5 +1,6 @@
 """The published calibration of the GelSight R1.5, read with interpolation, and how similar the sensor's images are to it."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,43 @@ DIMPLE_PITCH, DIMPLE_RADIUS, DIMPLE_DEPTH = 3.6e-3, 1.7e-3, 2.5e-4
 """Distance of neighbouring dimples of a golf ball, radius of a dimple's rim, and its depth, in m."""
 SSIM_WINDOW = 1.5
 """Standard deviation of the windows of the structural similarity, in pixels (Wang et al. 2004)."""
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+"""Constants K1 and K2 of the structural similarity, as shares of the range (Wang et al. 2004)."""
+LAST_BIN_MARGIN = 1e-3
+"""Distance, in bins, that a slope keeps from the table's last bin, which has no next one to interpolate to."""
+
+
+@dataclass(frozen=True)
+class PressedShapes:
+    """Sizes of the shapes that are pressed, in m; chosen by hand."""
+
+    round_radius: float = 0.004
+    """Radius of the ball and the rod."""
+    ball_depth: float = 6e-4
+    """Depth of the ball."""
+    rod_depth: float = 5e-4
+    """Depth of the rod."""
+    rod_half_length: float = 0.008
+    """Half length of the rod."""
+    plate_half_size: tuple[float, float] = (0.004, 0.005)
+    """Half sizes of the tilted plate along rows and columns."""
+    plate_depth: float = 4e-4
+    """Depth of the tilted plate at its middle."""
+    plate_slope: float = 0.02
+    """Slope of the tilted plate, m/m."""
+    wedge_depth: float = 5e-4
+    """Depth of the wedge's edge."""
+    wedge_slope: float = 0.5
+    """Slope of the wedge's two sides, m/m."""
+    half_length: float = 0.007
+    """Half length of the wedge, and half size of the plate with dimples."""
+    dimpled_depth: float = 4e-4
+    """Depth of the plate with dimples."""
+    apart: float = -1.0
+    """Height beside a shape, where it does not touch: any negative one."""
+
+
+PRESSED = PressedShapes()
 
 
 def published_table(path: Path = CALIBRATION) -> np.ndarray:
@@ -48,7 +86,7 @@ def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> n
     last = table.shape[1] - 1
     change = table - table[:, :1, last // 2 + 1 : last // 2 + 2]
     change[:, 0] = 0.0
-    u = np.clip(slope / (np.pi / 2 / last) - 0.5, 0, last - 1e-3)
+    u = np.clip(slope / (np.pi / 2 / last) - 0.5, 0, last - LAST_BIN_MARGIN)
     v = ((phi + np.pi) / (2 * np.pi / last) - 0.5) % last
     i, j = u.astype(int), v.astype(int)
     shape = (surface.shape[0], surface.shape[1])
@@ -64,7 +102,7 @@ def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> n
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """Structural similarity (Wang et al. 2004) of two pictures (H, W, 3), with the range of the second."""
     span = b.max() - b.min()
-    c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
+    c1, c2 = (SSIM_K1 * span) ** 2, (SSIM_K2 * span) ** 2
 
     def mean(picture: np.ndarray) -> np.ndarray:
         return gaussian_filter(picture, SSIM_WINDOW, axes=(0, 1))
@@ -85,12 +123,16 @@ def dimples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def pressed_shapes(config: TactileSensorConfig) -> dict[str, np.ndarray]:
     """Heights (H, W), m, of shapes over the untouched face, into it."""
     x, y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * config.pixel_size for n in config.image_shape), indexing="ij")
+    p, far_x, far_y = PRESSED, np.abs(x), np.abs(y)
+    radius, on_plate = p.round_radius, (far_x < p.plate_half_size[0]) & (far_y < p.plate_half_size[1])
+    on_dimples = (far_x < p.half_length) & (far_y < p.half_length)
+    rod = np.sqrt(np.maximum(radius**2 - x**2, 0)) - radius + p.rod_depth
     return {
-        "ball": np.sqrt(np.maximum(0.004**2 - x**2 - y**2, 0)) - 0.004 + 6e-4,
-        "rod": np.where(np.abs(y) < 0.008, np.sqrt(np.maximum(0.004**2 - x**2, 0)) - 0.004 + 5e-4, -1),
-        "tilted plate": np.where((np.abs(x) < 0.004) & (np.abs(y) < 0.005), 4e-4 + 0.02 * x, -1),
-        "wedge": np.where(np.abs(y) < 0.007, 5e-4 - 0.5 * np.abs(x), -1),
-        "dimples": np.where((np.abs(x) < 0.007) & (np.abs(y) < 0.007), 4e-4 - dimples(x, y), -1),
+        "ball": np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0)) - radius + p.ball_depth,
+        "rod": np.where(far_y < p.rod_half_length, rod, p.apart),
+        "tilted plate": np.where(on_plate, p.plate_depth + p.plate_slope * x, p.apart),
+        "wedge": np.where(far_y < p.half_length, p.wedge_depth - p.wedge_slope * far_x, p.apart),
+        "dimples": np.where(on_dimples, p.dimpled_depth - dimples(x, y), p.apart),
     }
 
 

@@ -13,7 +13,7 @@ from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.protocol import collect, of_the_protocol
 from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 from .made_up import write_run
 

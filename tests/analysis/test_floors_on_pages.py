@@ -4,7 +4,7 @@ from manifeel_ms3.analysis import results_page
 from manifeel_ms3.analysis.paper import VISION
 from manifeel_ms3.evaluation.floors import floors_of, highest_floor
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 from .made_up import write_run
 

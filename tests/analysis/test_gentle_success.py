@@ -11,7 +11,7 @@ from manifeel_ms3.analysis.paper import TACFF, VISION
 from manifeel_ms3.analysis.protocol import collect
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 from .made_up import write_run
 

@@ -11,8 +11,8 @@ from manifeel_ms3.analysis.estimates import difference, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG
 from tests.outcomes import made_up
+from tests.tasks_and_marks import PEG
 
 from .made_up import config_of
 

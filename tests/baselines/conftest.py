@@ -5,7 +5,7 @@ import json
 import pytest
 
 from manifeel_ms3.demonstrations import record
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 
 @pytest.fixture(scope="session")

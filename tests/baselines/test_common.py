@@ -15,8 +15,8 @@ from baselines.common.policy import PolicyConfig, make_action_network
 from baselines.common.unet import ConditionalUnet1D
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 SPEC = observation_spec("tacff", (), ("right",), 64)
 FIELD = SPEC.force_fields[0]

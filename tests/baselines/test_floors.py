@@ -8,9 +8,9 @@ import pytest
 from baselines import floors
 from baselines.references import RandomActions
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.evaluation.floors import POLICIES, SCHEMA, floors_file, floors_of, highest_floor
+from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file, floors_of, highest_floor
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 NUT, SEARCH = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-ObjectSearch-v1"
 
@@ -31,7 +31,7 @@ def test_random_actions_are_drawn_by_the_seed_of_the_episode():
 def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
     """Random fingers let go of the nut in the first steps."""
     spec, mean = task_spec(NUT), dict(episodes=7, rate=0.5, low=0.25, high=0.75)
-    about = dict(schema=SCHEMA, env_id=NUT, revision=spec.revision, git_commit=None, command="made up")
+    about = dict(schema=FLOORS_SCHEMA, env_id=NUT, revision=spec.revision, git_commit=None, command="made up")
     floors_file(NUT, tmp_path).write_text(json.dumps(about | dict(floors={"mean action": mean})))
     (path,) = floors.main(floors.Args((NUT,), ("random",), episodes=1, out=tmp_path))
     found = floors_of(NUT, spec.revision, tmp_path)

@@ -10,7 +10,7 @@ from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation.rollout import evaluate_episode
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 pytestmark = [pytest.mark.slow, needs_renderer]
 TASK = "ManiFeel-BallSorting-v1"

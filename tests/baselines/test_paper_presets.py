@@ -16,8 +16,8 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from manifeel_ms3.demonstrations import read_demonstrations
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 SPECS = pytest.mark.parametrize("spec", [diffusion.SPEC, equivariant.SPEC, flow.SPEC], ids=lambda spec: spec.name)
 SAMPLE = observed_sample(PEG)

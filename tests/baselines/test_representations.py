@@ -24,7 +24,7 @@ from baselines.tactile_representations.unit import UniT
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 from .released_encoders import stand_ins
 

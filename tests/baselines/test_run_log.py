@@ -15,7 +15,7 @@ from wandb.proto import wandb_internal_pb2
 from baselines.common.run_log import GLOBAL_STEP, RunLog, wandb_run_of
 from baselines.diffusion_policy.train import PRESETS
 from manifeel_ms3.evaluation.video import Frame, encode_video
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 ARGS = replace(
     PRESETS["cpu"].args, track=True, exp_name="peg-night", wandb_project_name="Pegs", obs_mode="rgb+tacff", env_id=PEG

@@ -32,7 +32,7 @@ from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.matching import as_the_paper_says
 from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
-from manifeel_ms3.analysis.presets import setup_of
+from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.errors import InvalidFileError, MachineError, UnknownNameError
 from manifeel_ms3.evaluation import evaluate as evaluation
 from manifeel_ms3.evaluation.result import results_in
@@ -158,7 +158,7 @@ def _condition_planned(job: Job) -> Condition:
         env_id=args.env_id, env_kwargs=kwargs, obs_mode=args.obs_mode, policy=policy, config=config, revision=revision
     )
     condition = condition_of(result)
-    assert str(setup_of(condition)) in ("paper", "paper, precision bf16"), condition
+    assert str(training_settings_of(condition)) in ("paper", "paper, precision bf16"), condition
     return as_the_paper_says(condition)
 
 

@@ -24,7 +24,7 @@ from baselines.references import MeanAction, Untrained
 from baselines.registry import PolicySpec
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
 POLICIES["consistency"] = (flow, dict(consistency=True))

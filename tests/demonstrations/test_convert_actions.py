@@ -10,8 +10,8 @@ from mani_skill.trajectory import replay_trajectory
 
 from manifeel_ms3.demonstrations import render_observations
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
-from tests.conftest import PEG, needs_renderer
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG, needs_renderer
 
 TASK = "ManiFeel-BallSorting-v1"
 BARE = dict(obs_mode="none", cameras=(), tactile_sensors=("right",), num=1)

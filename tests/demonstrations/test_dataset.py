@@ -14,7 +14,7 @@ from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import MachineError
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 SEARCH = "ManiFeel-ObjectSearch-v1"
 STATES, OBSERVED = "trajectory.h5", "trajectory.tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"

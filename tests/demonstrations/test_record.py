@@ -23,7 +23,7 @@ from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 EASY = dict(fit="paper", render_backend="none")
 KEYS = ["sensor_data/tactile_right/force_field", "extra/tcp_pose"]

@@ -11,8 +11,8 @@ from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 SAMPLE = observed_sample(PEG)
 

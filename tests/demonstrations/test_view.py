@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, view
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 FILE = observed_sample(PEG)
 

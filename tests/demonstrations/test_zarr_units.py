@@ -12,8 +12,8 @@ from manifeel_ms3.demonstrations import DemonstrationError, export
 from manifeel_ms3.demonstrations.formats.diffusion_policy_zarr import recorded_arguments
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 zarr = pytest.importorskip("zarr")

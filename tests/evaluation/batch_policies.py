@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manifeel_ms3.evaluation.policy import PolicySource, Question
+from manifeel_ms3.evaluation.policy import PolicyRequest, PolicySource
 
 FINE, RAISES, CRASHES, HANGS, MISCOUNTS = 10, 20, 30, 40, 50
 """Seeds of episodes from each of which on the policy behaves so."""
@@ -23,7 +23,7 @@ class Part:
 
     def act(self, obs):
         self.step += 1
-        return self.ask(Question(self.seed, self.step - 1, dict(pose=np.array([self.step]))))
+        return self.ask(PolicyRequest(self.seed, self.step - 1, dict(pose=np.array([self.step]))))
 
 
 class Moody:

@@ -21,11 +21,10 @@ from baselines.diffusion_policy.train import SPEC
 from manifeel_ms3.errors import MachineError, WorkFailedError
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.evaluate import Args, evaluation_from_args
-from manifeel_ms3.evaluation.policy import PolicyError, PolicySource, PolicyUnavailableError, Question
+from manifeel_ms3.evaluation.policy import PolicyError, PolicyRequest, PolicySource, PolicyUnavailableError
 from manifeel_ms3.evaluation.policy_process import PolicyProcess, SharedPolicy
 from manifeel_ms3.evaluation.rollout import PolicyFault, evaluate_episode
 from manifeel_ms3.evaluation.vector import make_eval_envs
-from tests.conftest import PEG, needs_renderer
 from tests.evaluation.batch_policies import (
     CRASHES,
     FINE,
@@ -38,6 +37,7 @@ from tests.evaluation.batch_policies import (
     Single,
     source_of,
 )
+from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trust.running_evaluations import alive, wait_for_episodes
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
@@ -128,10 +128,10 @@ def checkpoint(tmp_path_factory):
     return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "00000001")
 
 
-def questions(count: int) -> list[Question]:
+def questions(count: int) -> list[PolicyRequest]:
     chance = np.random.default_rng(0)
     return [
-        Question(
+        PolicyRequest(
             100_000 + k,
             2 * k,
             {

@@ -17,7 +17,7 @@ from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result
 from manifeel_ms3.tasks.registry import evaluation_seeds
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=12))
 SERVER = Path(__file__).parents[2] / "examples/policy_server.py"

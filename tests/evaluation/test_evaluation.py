@@ -20,9 +20,9 @@ from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
-from tests.conftest import PEG
 from tests.outcomes import made_up
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG
 
 
 class ExpertPolicy:

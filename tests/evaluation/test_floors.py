@@ -5,15 +5,15 @@ import json
 import pytest
 
 from manifeel_ms3.errors import InvalidFileError
-from manifeel_ms3.evaluation.floors import POLICIES, SCHEMA, floors_file, floors_of, highest_floor
+from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file, floors_of, highest_floor
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 
 def write(folder, revision=2, **floors) -> None:
     measured = {name: dict(episodes=20, rate=rate, low=rate, high=rate + 0.1) for name, rate in floors.items()}
-    about = dict(schema=SCHEMA, env_id=PEG, revision=revision, git_commit=None, command="made up")
+    about = dict(schema=FLOORS_SCHEMA, env_id=PEG, revision=revision, git_commit=None, command="made up")
     floors_file(PEG, folder).write_text(json.dumps(about | dict(floors=measured)))
 
 

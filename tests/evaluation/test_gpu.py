@@ -8,7 +8,7 @@ import torch
 
 from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.result import read_result
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=6))

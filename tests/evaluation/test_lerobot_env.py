@@ -13,7 +13,7 @@ import pytest
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.evaluation.lerobot_env import GYM_ID, LeRobotEnv, make_env
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 SMALL = dict(sensor_configs=dict(width=32, height=32))
 HAS_LEROBOT = importlib.util.find_spec("lerobot") is not None

@@ -7,8 +7,8 @@ import pytest
 from manifeel_ms3.evaluation.result import ResultError, read_result, result_of, write_result
 from manifeel_ms3.provenance import git_commit, machine, package_versions
 from manifeel_ms3.tasks.registry import task_spec
-from tests.conftest import PEG
 from tests.outcomes import made_up
+from tests.tasks_and_marks import PEG
 
 
 @pytest.fixture

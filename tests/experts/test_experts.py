@@ -7,7 +7,7 @@ from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import BallSortingExpert, make_expert
 from manifeel_ms3.sensors.depth.surfaces import RELIEF
 from manifeel_ms3.tasks.registry import all_tasks
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 LONG_TASKS = ("ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1")  # demonstrations of about 400 steps
 

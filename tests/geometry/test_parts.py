@@ -24,7 +24,7 @@ from manifeel_ms3.geometry.containers import battery, bowl, container
 from manifeel_ms3.geometry.gears import neighbour_gear
 from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.verification.press import PadBench
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 PARTS = [
     *(part for fit in (*(make(name) for make in (peg_fit, usb_fit, power_fit, gear_fit) for name in FITS), reorientation_fit())

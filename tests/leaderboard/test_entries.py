@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.entries import find_entry
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.submission import read_submission
 from manifeel_ms3.provenance import machine
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 BOARD = Path(__file__).parents[2] / "leaderboard"
 ENTRY = "cpu/PegInsertion/rgb+tacff"

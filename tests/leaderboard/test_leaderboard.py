@@ -18,8 +18,8 @@ from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.page import rows_on
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from tests.browser import browser_program
-from tests.conftest import PEG
 from tests.leaderboard.made_up import made_up
+from tests.tasks_and_marks import PEG
 
 BROWSER = browser_program()
 POLICY = "tests.evaluation.policies:StandStill"

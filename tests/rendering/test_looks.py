@@ -11,7 +11,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.rendering.table import PIXELS, boards, table_mesh
 from manifeel_ms3.sensors.depth.surfaces import scene_surfaces
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 GROUND = ("table", "floor")
 

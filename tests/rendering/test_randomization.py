@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 EVERYTHING = dict(
     light_direction=0.5,

@@ -12,7 +12,7 @@ from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.sensors import TactileSensor, sensor_config
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from manifeel_ms3.verification.press import PadBench
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 from . import shapes
 

@@ -9,8 +9,8 @@ import trimesh
 from manifeel_ms3.sensors.mechanics.contact import depth_below_face, solve_indentation
 from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.verification.press import PadBench, Press, indenter
-from tests.conftest import needs_renderer
 from tests.sensors.shapes import thread_mesh
+from tests.tasks_and_marks import needs_renderer
 
 QUARTER_TURN = trimesh.transformations.rotation_matrix(np.pi / 4, [1, 0, 0])
 BALL = 0.010  # m

@@ -7,7 +7,7 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
 

@@ -16,7 +16,7 @@ from manifeel_ms3.geometry.part import Cylinder, Hulls
 from manifeel_ms3.geometry.plugs import PEG_SOCKETS
 from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 FITS = {
     PEG: peg_fit,

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Pose
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
-from tests.conftest import needs_renderer
+from tests.tasks_and_marks import needs_renderer
 
 
 @needs_renderer

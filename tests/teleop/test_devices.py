@@ -13,7 +13,7 @@ import pytest
 
 from manifeel_ms3.teleop.devices import DEVICES, DeviceError, Reading, follow, gamepad, spacemouse
 from manifeel_ms3.teleop.operator import Operator
-from tests.teleop.test_session import AXES
+from tests.teleop.axes import AXES
 
 FULL = 350  # counts of a SpaceMouse pushed all the way
 

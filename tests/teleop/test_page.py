@@ -13,7 +13,7 @@ import pytest
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.replay import replay
 from tests.browser import Browser, browser_program, wait_until
-from tests.conftest import PEG, needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 pytest.importorskip("viser")
 pytestmark = [needs_renderer, pytest.mark.skipif(browser_program() is None, reason="no browser on this machine")]

@@ -16,10 +16,10 @@ from manifeel_ms3.teleop import session as module
 from manifeel_ms3.teleop.operator import HOLD, EpisodeCommand, Mode, Operator, steerable_axes
 from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
+from tests.teleop.axes import AXES
 
 KWARGS = dict(obs_mode="tacff", render_backend="none", sim_backend="physx_cpu", cameras=[], tactile_sensors=["right"])
-AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 
 
 class Notes:

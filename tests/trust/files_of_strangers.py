@@ -4,8 +4,8 @@ import json
 import os
 from pathlib import Path
 
-from tests.conftest import PEG
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 REPOSITORY = Path(__file__).parents[2]
 SAMPLE = observed_sample(PEG)

@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 FILE_EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir")
 """Python's audit events before each of which a child can be killed."""

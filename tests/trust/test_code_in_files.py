@@ -18,8 +18,8 @@ from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.policy import PolicySource, load_policy
-from tests.conftest import PEG
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG
 
 from .files_of_strangers import EXECUTED, REPOSITORY, SAMPLE, rewrite_json
 

@@ -27,9 +27,9 @@ from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.files import FileWriteError
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import evaluation_seeds
-from tests.conftest import PEG
 from tests.evaluation.policies import STUCK
 from tests.outcomes import made_up
+from tests.tasks_and_marks import PEG
 from tests.trust.running_evaluations import PATIENCE, alive, wait_for_episodes
 
 REPOSITORY = Path(__file__).parents[2]

@@ -36,9 +36,9 @@ from manifeel_ms3.evaluation.journal import Journal
 from manifeel_ms3.evaluation.policy import load_policy
 from manifeel_ms3.evaluation.remote_policy import read_action
 from manifeel_ms3.evaluation.result import read_result
-from tests.conftest import PEG
 from tests.outcomes import made_up
 from tests.sample import observed_sample
+from tests.tasks_and_marks import PEG
 
 from .tiny_checkpoint import save_tiny_checkpoint
 

@@ -16,8 +16,8 @@ import psutil
 import pytest
 
 from tests.browser import wait_until
-from tests.conftest import PEG
 from tests.sample import states_sample
+from tests.tasks_and_marks import PEG
 
 REPOSITORY = Path(__file__).parents[2]
 SAMPLE = states_sample(PEG)

@@ -24,7 +24,7 @@ from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.policy import PolicyUnavailableError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy
 from manifeel_ms3.evaluation.result import read_result
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 
 REPOSITORY = Path(__file__).parents[2]
 EXAMPLE = REPOSITORY / "examples/policy_server.py"

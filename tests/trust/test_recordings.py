@@ -24,7 +24,7 @@ from manifeel_ms3.files import remove_folder
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.teleop.operator import Operator
 from manifeel_ms3.teleop.session import Session
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 from tests.trust.kills import PATIENCE, forked, recorded, start_recording
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])

@@ -24,7 +24,7 @@ from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import full_id, task_spec
-from tests.conftest import PEG
+from tests.tasks_and_marks import PEG
 from tests.tiny_study import TINY
 from tests.trust.tiny_training import tiny_args, train
 

@@ -113,7 +113,7 @@ def write_index(path: Path, header: dict[str, Any], infos: dict[int, dict[str, A
 
     Args:
         path: The trajectory file.
-        header: The json but for its episodes.
+        header: The json of the file, without its episodes.
         infos: Json entries of the episodes by seed, in the order that they shall have.
     """
     folder = episode_folder(path)

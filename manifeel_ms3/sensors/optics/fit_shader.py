@@ -1,8 +1,8 @@
 """Fit the compact shader to a sensor: `python -m manifeel_ms3.sensors.optics.fit_shader {table,presses,pack} ...`.
 
-It is fitted to a table in Taxim's format, or to images of presses of a ball of known radius: a folder with `background.png`
-(untouched gel), the images, and `presses.csv`, which has the columns `file,row,col,radius` (the contact circle in pixels); or a
-file with such images, `dataPack.npz` in Taxim's format.
+The input is either a table in Taxim's format, or images of a ball of known radius that is pressed into the gel. The images come
+as a folder with `background.png` (the untouched gel) and `presses.csv` (columns `file,row,col,radius`: the contact circle in
+pixels), or as one file in Taxim's format, `dataPack.npz`.
 """
 
 import csv
@@ -34,7 +34,7 @@ class Table:
     out: Path
     """Path of the shader file that is written."""
     image_shape: tuple[int, int] = (240, 320)
-    """Rows and columns of the sensor's image: the table's image, laid on its side."""
+    """Rows and columns of the sensor's image, which is the table's image turned by a quarter."""
 
 
 @dataclass(kw_only=True)

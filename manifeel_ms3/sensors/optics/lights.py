@@ -16,6 +16,7 @@ from manifeel_ms3.sensors.config import GelConfig, LightsConfig
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 
 PLACES = 9  # along each side of the image, at which the levels are computed; the fit has 6 terms over them
+GRADIENT_STEP = 1e-6  # m: half of the step of the central differences of the face's depth
 DIRECTIONS = 16  # of the gradient; the fit has 5 terms over them
 
 
@@ -52,7 +53,8 @@ def lamp_shader(
 def _levels(lights: LightsConfig, gel: GelConfig, x: np.ndarray, y: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Irradiance (P, S, 3) at P places of the untouched face whose gradient, into the gel, is increased by S steps (S, 2)."""
     depth = gel.sag(x, y)
-    own = np.stack([gel.sag(x + 1e-6, y) - gel.sag(x - 1e-6, y), gel.sag(x, y + 1e-6) - gel.sag(x, y - 1e-6)], axis=-1) / 2e-6
+    h = GRADIENT_STEP
+    own = np.stack([gel.sag(x + h, y) - gel.sag(x - h, y), gel.sag(x, y + h) - gel.sag(x, y - h)], axis=-1) / (2 * h)
     gradient = own[:, None] + steps  # (P, S, 2)
     # the skin lies at z = -depth; its normal towards the lamps, which are behind it, points to -z
     normal = np.concatenate([-gradient, -np.ones((*gradient.shape[:2], 1))], axis=-1)

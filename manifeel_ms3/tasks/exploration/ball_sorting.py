@@ -29,6 +29,8 @@ BOWLS = {
     "golf": ((0.40, 0.19), Look((0.85, 0.25, 0.03))),
     "tennis": ((0.40, -0.19), Look((0.03, 0.12, 0.60))),
 }  # xy, m; orange, blue
+GOLF_BUILT_AT, TENNIS_BUILT_AT = (0.45, 0.0, 0.1), (0.55, 0.0, 0.1)
+"""Positions at which the balls are built, in m, clear of each other; every reset moves them to their seats."""
 GOALS = ("lift", "bowls")
 
 
@@ -113,8 +115,8 @@ class BallSortingEnv(VisuotactileEnv):
             for name, ((x, y), look) in BOWLS.items():
                 bowl(f"{name}_bowl", look).build(self.scene, "static", sapien.Pose([x, y, 0]))
         self.stand = ball_stand().build(self.scene, "kinematic", sapien.Pose([*STAND_XY, 0]))
-        self.golf = golf_ball().build(self.scene, "dynamic", sapien.Pose([0.45, 0, 0.1]))
-        self.tennis = tennis_ball().build(self.scene, "dynamic", sapien.Pose([0.55, 0, 0.1]))
+        self.golf = golf_ball().build(self.scene, "dynamic", sapien.Pose(GOLF_BUILT_AT))
+        self.tennis = tennis_ball().build(self.scene, "dynamic", sapien.Pose(TENNIS_BUILT_AT))
         self.swapped = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
 
     def _initialize_task(self, env_idx: torch.Tensor):

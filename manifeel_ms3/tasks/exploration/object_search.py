@@ -19,6 +19,8 @@ HAND = 0.08
 """Half of the hand's width, in m."""
 LOWEST = 0.055
 """Smallest height of the tool over the table at the start, in m: the fingertips are clear of the battery."""
+BUILT_HEIGHT = 0.05
+"""Height over the table at which the battery is built, in m; every reset moves it to its place."""
 LIFTED = 0.10
 """Height of the battery over the container's floor, in m, at success."""
 OUTSIDE = 0.17
@@ -103,7 +105,7 @@ class ObjectSearchEnv(VisuotactileEnv):
 
     def _load_task(self):
         self.container = container(self.occlusion).build(self.scene, "static", sapien.Pose([*CONTAINER_XY, 0]))
-        self.battery = battery().build(self.scene, "dynamic", sapien.Pose([*CONTAINER_XY, 0.05]))
+        self.battery = battery().build(self.scene, "dynamic", sapien.Pose([*CONTAINER_XY, BUILT_HEIGHT]))
         self.place = torch.zeros(self.num_envs, dtype=torch.int64, device=self.device)
 
     def _initialize_task(self, env_idx: torch.Tensor):

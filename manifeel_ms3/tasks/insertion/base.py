@@ -11,7 +11,16 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import FITS, Fit
-from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, turned_about, uniform_in
+from manifeel_ms3.tasks.placement import (
+    BUILT_AT,
+    OUT_OF_REACH,
+    POINTING_DOWN,
+    REACH_XY,
+    height_range,
+    start_pose,
+    turned_about,
+    uniform_in,
+)
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
 SOCKET_XY = (0.5, 0.0)  # m, nominal
@@ -111,7 +120,7 @@ class InsertionEnv(VisuotactileEnv):
         )
 
     def _load_task(self):
-        self.plug = self.fit.plug.build(self.scene, "dynamic", sapien.Pose([0.5, 0, 0.3], [0, 1, 0, 0]))
+        self.plug = self.fit.plug.build(self.scene, "dynamic", sapien.Pose(BUILT_AT, POINTING_DOWN))
         self.socket = self.fit.socket.build(self.scene, "kinematic", sapien.Pose([*SOCKET_XY, 0]))
 
     def _initialize_task(self, env_idx: torch.Tensor):

@@ -9,7 +9,7 @@ from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quatern
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Screw
-from manifeel_ms3.tasks.placement import height_range, start_pose, uniform_in
+from manifeel_ms3.tasks.placement import BUILT_AT, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS, VisuotactileEnv
 
 FIXED_XY = (0.5, 0.0)  # m, nominal
@@ -77,7 +77,7 @@ class ScrewingEnv(VisuotactileEnv):
         )
 
     def _load_task(self):
-        self.held = self.screw.held.build(self.scene, "dynamic", sapien.Pose([0.5, 0, 0.3]))
+        self.held = self.screw.held.build(self.scene, "dynamic", sapien.Pose(BUILT_AT))
         self.fixed = self.screw.fixed.build(self.scene, "kinematic", sapien.Pose([*FIXED_XY, 0]))
 
     def _initialize_task(self, env_idx: torch.Tensor):

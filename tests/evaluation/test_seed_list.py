@@ -7,8 +7,8 @@ import pytest
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.evaluation.starts import read_seeds
-from tests.conftest import PEG
+from manifeel_ms3.evaluation.seed_list import read_seeds
+from tests.tasks_and_marks import PEG
 
 
 def test_a_list_is_read_with_comments(tmp_path):
