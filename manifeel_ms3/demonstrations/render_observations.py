@@ -18,7 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import h5py
 import numpy as np
 import tyro
 
@@ -155,8 +154,12 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
     return recorder.write(episode)
 
 
-def _deviation(recorded: h5py.Group, replayed: dict[str, np.ndarray]) -> float:
+def _deviation(recorded: Any, replayed: dict[str, np.ndarray]) -> float:
     """Largest difference of any actor's pose at any step, in m or in a quaternion's components; 0 where all are the same.
+
+    Args:
+        recorded: Group of the file that holds the states (T + 1, 13) of the actors.
+        replayed: The states of the replay by actor.
 
     Raises:
         DemonstrationError: The recording has states of other actors, or of another number of steps.
