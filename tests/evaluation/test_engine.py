@@ -158,7 +158,7 @@ def test_batch_sizes_differ_by_rounding_alone(checkpoint):
     asked = questions(6)
     answers = [np.stack(SPEC.load(checkpoint, batch_size=size).answer(asked)) for size in (1, 3, 4)]
     for other in answers[1:]:
-        np.testing.assert_allclose(other, answers[0], atol=1e-5)
+        np.testing.assert_allclose(other, answers[0], atol=5e-5)  # of actions in [-1, 1], after 20 steps of inference
 
 
 def test_noise_depends_on_the_seed_of_the_episode_and_on_the_step(checkpoint):

@@ -3,6 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+import torch
+
 from baselines.common.checkpoint import as_json, save_checkpoint
 from baselines.common.encoders import EncoderConfig
 from baselines.common.observation import observation_spec
@@ -20,7 +22,9 @@ def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[s
     )
     observed = dict(obs_mode=obs_mode, cameras=list(cameras), tactile_sensors=["right"], image_size=32)
     observed |= dict(tactile_image_size=32, pose="quaternion")
-    policy = SPEC.policy_class(config, observation_spec(obs_mode, cameras, ("right",), 32), 6)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        policy = SPEC.policy_class(config, observation_spec(obs_mode, cameras, ("right",), 32), 6)
     about = dict(policy_name=SPEC.name, policy=as_json(config), action_dim=6, inference_steps=20, step=1) | observed
     save_checkpoint(folder, about, policy.state_dict(), {})
     return folder
