@@ -141,16 +141,16 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
     name = f"traj_{recorded['episode_id']}"
     with open_trajectories(path) as file:
         actions = file[name]["actions"][()]
-    if recorder.source is not None:
-        source = recorder.source
-        episode = run_episode(recorder.env, seed, lambda: converted(actions, seed, source, recorder.env))
-        return recorder.write(episode) if episode.info["success"] >= recorded["success"] else None
-    episode = run_episode(recorder.env, seed, lambda: actions)
+    source = recorder.source
+    episode = run_episode(
+        recorder.env, seed, lambda: actions if source is None else converted(actions, seed, source, recorder.env)
+    )
     if episode.info["success"] < recorded["success"]:
         return None
-    with open_trajectories(path) as file:
-        if deviation := _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"]):
-            episode.info[DEVIATION] = deviation
+    if source is None:
+        with open_trajectories(path) as file:
+            if deviation := _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"]):
+                episode.info[DEVIATION] = deviation
     return recorder.write(episode)
 
 
