@@ -1,8 +1,8 @@
 """Measure the failure floors of tasks: `python -m baselines.floors ManiFeel-PegInsertion-v1 --num-eval-episodes 20`.
 
 Three policies that have learnt nothing are evaluated on the first evaluation seeds: random actions, the mean action of
-demonstrations, and the network of Diffusion Policy's preset `cpu` before training. An episode ends at success, and where it
-can no longer be won, which takes less time and leaves its success as it is. Tables of results show the floors
+demonstrations, and the network of Diffusion Policy's preset `cpu` before training. An episode ends at success, or
+when it can no longer succeed, which saves time and changes no rate of success. Tables of results show the floors
 (`manifeel_ms3.evaluation.floors`).
 """
 
@@ -52,7 +52,8 @@ class Args:
     """Folder with trajectory files in a folder for each task, from which the mean action and the ranges of the network's inputs
     are taken; the sample of the package if not given."""
     out: Path | None = None
-    """Folder of the files, one for each task; that of the package if not given. Policies that are not measured keep theirs."""
+    """Folder of the files, one for each task; that of the package if not given. Floors of policies that are not measured
+    stay."""
 
 
 def main(args: Args) -> list[Path]:
@@ -97,7 +98,7 @@ def _observed_demonstrations(folder: Path) -> Path:
 
 
 def _earlier(path: Path, revision: int) -> dict[str, Any]:
-    """The floors that a file holds of this revision of the task."""
+    """The floors of this revision of the task that a file holds."""
     if not path.is_file():
         return {}
     content = json.loads(path.read_text(encoding="utf-8"))
@@ -119,7 +120,7 @@ def _evaluate(name: str, env_id: str, demos: Path, folder: Path, args: Args) -> 
 
 
 def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
-    """The evaluation of a network that one gradient step has made a checkpoint of; its first weights are drawn again."""
+    """Arguments that evaluate an untrained network: a checkpoint after one gradient step, whose first weights are drawn again."""
     cameras = read_header(demos)["env_info"]["env_kwargs"]["cameras"]
     policy = policy_spec("diffusion_policy")
     sensing = ["--env-id", env_id, "--obs-mode", OBS_MODE, "--cameras", *cameras]

@@ -6,7 +6,7 @@
     --policy baselines.references:MeanAction --policy-kwargs '{"demos": "peg.h5"}'
     --policy baselines.references:Untrained --policy-kwargs '{"checkpoint": "runs/peg/checkpoints/last"}'
 
-and with `--env-id` and `--obs-mode`, because neither has a checkpoint that says them.
+Each also needs `--env-id` and `--obs-mode`, which evaluation otherwise reads from a checkpoint.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ from .registry import policy_spec
 
 
 class RandomActions:
-    """Actions that are drawn uniformly from [-1, 1], each component apart, and anew in each step.
+    """Actions that are drawn uniformly from [-1, 1], independently for each component and each step.
 
     Args:
         env_id: Id of the task.
@@ -41,7 +41,7 @@ class RandomActions:
         self.begin_episode(0)
 
     def begin_episode(self, seed: int) -> None:
-        """Begin an episode, whose seed draws the actions."""
+        """Begin an episode, whose seed determines the actions."""
         self._rng = np.random.default_rng(seed)
 
     def act(self, _obs: dict[str, Any]) -> np.ndarray:

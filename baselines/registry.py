@@ -21,11 +21,12 @@ from .common.train_args import TrainArgs
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of a training run to begin from."""
+    """Named settings of a training run, from which a user can start."""
 
     about: str
     """What the settings are for, in a few words."""
     args: TrainArgs
+    """The settings."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class PolicySpec:
 
     def train(self, args: TrainArgs) -> Path:
         """Train, and return the last checkpoint."""
-        from .common.training import train  # here, because it takes seconds
+        from .common.training import train  # imported here, because it takes seconds
 
         return train(args, self.policy_class)
 
@@ -59,8 +60,8 @@ def all_policies() -> dict[str, PolicySpec]:
     """Every registered policy that these baselines can train, by its name.
 
     Raises:
-        PluginError: A plug-in does not import, is registered under another name than its own, or shares its class of arguments
-            with another policy.
+        PluginError: A plug-in cannot be imported, is registered under another name than its own, or shares its class of
+            arguments with another policy.
     """
     plugged = {name: plugins.load(plugins.POLICIES, name) for name in plugins.registered(plugins.POLICIES)}
     specs = {name: spec for name, spec in plugged.items() if isinstance(spec, PolicySpec)}

@@ -33,7 +33,7 @@ def check_arguments(arguments: list[str]) -> None:
         arguments: The command line after `manifeel train`.
 
     Raises:
-        InvalidArgumentError: It is not.
+        InvalidArgumentError: The name of the preset is missing.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
     spec = all_policies().get(policy)

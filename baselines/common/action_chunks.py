@@ -1,4 +1,4 @@
-"""What runs beside an episode of a policy that predicts several actions at once: past observations, and the actions to come."""
+"""State of an episode whose policy predicts several actions at once: past observations, and actions still to execute."""
 
 from collections import deque
 from typing import Any
@@ -12,13 +12,13 @@ from .observation import ObservationSpec, prepare
 
 
 class ActionChunks:
-    """Executes the actions of a prediction, then asks for the next from the last `obs_horizon` observations.
+    """Executes the actions of a prediction one by one, then asks for the next from the last `obs_horizon` observations.
 
-    This module loads no network, so that a process that simulates starts quickly.
+    This module imports no network, so that a process that simulates starts quickly.
 
     Args:
         spec: Observations of the policy.
-        obs_horizon: Number of observations of a prediction.
+        obs_horizon: Number of observations that condition a prediction.
         ask: Function that returns the actions (n, A) of a prediction.
     """
 
@@ -36,7 +36,7 @@ class ActionChunks:
         self.begin_episode(0)
 
     def begin_episode(self, seed: int) -> None:
-        """Begin an episode."""
+        """Begin the episode of a seed."""
         self._seed, self._step = seed, 0
         self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.obs_horizon)
         self._actions: deque[np.ndarray] = deque()

@@ -19,26 +19,28 @@ from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec
 from .policy import VisuotactilePolicy
 
 MAX_SETTING = 1_000_000
-"""Largest number that a policy's settings may hold; the paper's largest is 2048, so that a checkpoint's config asks for no
-tables of any size."""
+"""Largest number that the settings of a policy may hold, so that the config of a stranger's checkpoint cannot ask for networks
+of any size; the largest number in the paper's settings is 2048."""
 
 TRIAL_STEPS = 3
-"""Number of generation steps, and of calls, in which the trace of a network must agree with the network."""
+"""Number of generation steps of a trial, and number of trials, in which a traced network must agree with the original; set
+once, not tuned."""
 ROUNDING = 1e-4
-"""Largest difference of their actions, whose range is 2; convolutions that were optimised round differently, by 1e-6."""
+"""Largest difference of an action, within [-1, 1], between the traced and the original network. Optimised convolutions round
+differently, which makes a difference of about 1e-6."""
 
 
 def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
     """The policy of a checkpoint's config, with untrained weights.
 
     Raises:
-        CheckpointError: The config is not one of this policy.
+        CheckpointError: The config does not describe this policy.
     """
     try:
         return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
-    except Exception as error:  # the config is anybody's
+    except Exception as error:  # the config may come from a stranger
         raise CheckpointError(
-            f"config is not one of the policy {policy_class.name!r} ({error!r}); evaluate it with the code it was trained with"
+            f"config does not describe the policy {policy_class.name!r} ({error!r}); evaluate it with the code that trained it"
         ) from error
 
 
@@ -47,11 +49,11 @@ def _from_json(cls: type, value: Any) -> Any:
     if is_dataclass(cls):
         types = typing.get_type_hints(cls)
         if unknown := set(value) - {f.name for f in fields(cls)}:
-            raise TypeError(f"{cls.__name__} has no {sorted(unknown)}")
+            raise TypeError(f"{cls.__name__} has no fields {sorted(unknown)}")
         return cls(**{name: _from_json(types[name], part) for name, part in value.items()})
     numbers = value if isinstance(value, list) else [value]
     if any(isinstance(number, int | float) and not abs(number) <= MAX_SETTING for number in numbers):
-        raise ValueError(f"{value} is beyond {MAX_SETTING}")
+        raise ValueError(f"{value} is larger than {MAX_SETTING}")
     return tuple(value) if typing.get_origin(cls) is tuple else value
 
 
@@ -123,7 +125,7 @@ class PolicyAgent:
         self._part.reset()
 
     def begin_episode(self, seed: int) -> None:
-        """Begin an episode."""
+        """Begin the episode of a seed."""
         self._part.begin_episode(seed)
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
@@ -161,9 +163,9 @@ class PolicyAgent:
         return self.policy.sample(batch, self.inference_steps, generators).cpu().numpy()
 
     def _compile(self, batch: dict[str, torch.Tensor]) -> None:
-        """Replace the network over actions by its trace: on a CPU, half of the time of a small network is Python's.
+        """Replace the network over actions by its trace, because a small network on a CPU spends half of its time in Python.
 
-        The trace is used where it computes the same actions.
+        The trace is used only if it computes the same actions.
         """
         if self.device.type != "cpu":
             return
@@ -190,6 +192,6 @@ class PolicyAgent:
 
 
 def _generator_of(*numbers: int) -> torch.Generator:
-    """A generator on the CPU, whose noise is the same on every device, seeded by some numbers."""
+    """A generator that some numbers seed; it is on the CPU, so that its noise is the same for every device."""
     (state,) = np.random.SeedSequence(numbers).generate_state(1, np.uint64)
     return torch.Generator().manual_seed(int(state) % 2**63)

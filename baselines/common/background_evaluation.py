@@ -16,7 +16,7 @@ RATES = ("success_once", "success_at_end", "fail_once", "fail_at_end", "gentle_s
 SUCCESS = "eval/success_once"
 """Scalar that every evaluation logs."""
 NOT_FROM_HERE = ["-P"] if sys.version_info >= (3, 11) else []
-"""Option of Python with which `-m` does not put the current folder, where anybody's torch.py may lie, on the path."""
+"""Option of Python that keeps `-m` from searching the current folder for modules, where a stranger's torch.py may lie."""
 
 
 class BackgroundEvaluation:
@@ -27,7 +27,7 @@ class BackgroundEvaluation:
         episodes: Number of episodes for each checkpoint.
         workers: Number of processes of an evaluation.
         env_kwargs: Arguments of the task, as a json object.
-        device: Device of the policy; a GPU if there is one and this is not given.
+        device: Device of the policy; if not given, a GPU where there is one.
         video: Whether the first episode is recorded as a video, videos/<step>.mp4 in the folder.
     """
 
@@ -57,7 +57,7 @@ class BackgroundEvaluation:
             wait: Whether to wait until all queued checkpoints have been evaluated.
 
         Returns:
-            For each checkpoint its "step", and its rates and means with ManiSkill's names, such as "eval/success_once".
+            For each checkpoint its "step", and its rates and means under ManiSkill's names, such as "eval/success_once".
         """
         rates: list[dict[str, float]] = []
         while self._running or self._waiting:
@@ -74,10 +74,10 @@ class BackgroundEvaluation:
         self.folder.mkdir(parents=True, exist_ok=True)
         result = self._result(checkpoint).absolute()
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
-        # --overwrite: what an interrupted run evaluated of another checkpoint of this step is of no use
+        # --overwrite, because an interrupted run may have evaluated another checkpoint of this step
         command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite", *self._arguments]
-        folder = None if NOT_FROM_HERE else self.folder  # without the option, one in which only we have written
-        environment = os.environ | dict(PYTHONSAFEPATH="1")  # its workers are started by Python, too
+        folder = None if NOT_FROM_HERE else self.folder  # a folder that only this package writes into
+        environment = os.environ | dict(PYTHONSAFEPATH="1")  # the same for the processes that the evaluation starts
         with result.with_suffix(".log").open("w") as output:
             return checkpoint, subprocess.Popen(command, cwd=folder, env=environment, stdout=output, stderr=output)
 

@@ -16,17 +16,17 @@ from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
 """Files of a checkpoint: the policy's weights, the state of training, the settings."""
 LAST = "last"
-"""Name of the link to the checkpoint from which training goes on; it always names a whole one."""
+"""Name of the link to the checkpoint from which training continues; it always leads to a complete one."""
 
 
 def save_checkpoint(
     folder: Path, config: dict[str, Any], weights: dict[str, torch.Tensor], training: dict[str, torch.Tensor]
 ) -> None:
-    """Write a checkpoint; its folder appears complete or not at all, whenever the process is killed.
+    """Write a checkpoint; its folder appears complete or not at all, even if the process is killed.
 
     Args:
         folder: Folder of the checkpoint, which must not exist.
-        config: Everything that is needed to build the policy, and "step", in types that json knows.
+        config: Everything that is needed to build the policy, and "step", in types that json can hold.
         weights: The (EMA) weights of the policy.
         training: The state of training that only resuming needs, from `pack`.
 
@@ -37,7 +37,7 @@ def save_checkpoint(
         for name, tensors in ((WEIGHTS, weights), (TRAINING, training)):
             try:
                 save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, partial / name)
-            except SafetensorError as error:  # its error where the disk is full
+            except SafetensorError as error:  # raised if the disk is full
                 raise OSError(str(error)) from error
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
@@ -68,7 +68,7 @@ def make_last(folder: Path) -> None:
         FileWriteError: The link cannot be written.
     """
     with atomic_write(folder.with_name(LAST)) as partial:
-        partial.unlink(missing_ok=True)  # of a process that was killed here
+        partial.unlink(missing_ok=True)  # left by a process that was killed here
         partial.symlink_to(folder.name)
 
 
@@ -78,9 +78,9 @@ def saved_checkpoints(checkpoints: Path) -> list[Path]:
 
 
 def newest_checkpoint(checkpoints: Path) -> Path:
-    """The checkpoint of the last step; the link `last` falls behind it where a process was killed between the two.
+    """The checkpoint of the last step; `last` leads to an older one if a process was killed before it moved the link.
 
-    Where there is no checkpoint, it is the path that `last` would have.
+    If there is no checkpoint, the path that the link `last` would have.
     """
     return (saved_checkpoints(checkpoints) or [checkpoints / LAST])[-1]
 
@@ -110,7 +110,7 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         CheckpointError: The file is missing or broken.
     """
     try:
-        if not Path(path).is_file():  # a pipe would be waited for
+        if not Path(path).is_file():  # opening a named pipe would wait forever
             raise FileNotFoundError("no such file")
         return load_file(path)
     except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
@@ -219,5 +219,5 @@ def _restore_optimizer(packed: dict[str, torch.Tensor], optimizer: torch.optim.O
 
 
 def as_json(config: Any) -> dict[str, Any]:
-    """A dataclass as a dict of types that json knows."""
+    """A dataclass as a dict of types that json can hold."""
     return json.loads(json.dumps(dataclasses.asdict(config), default=str))

@@ -1,4 +1,4 @@
-"""Demonstrations in memory, and sequences of their steps by index arithmetic."""
+"""Demonstrations in memory, and the sequences of their steps that training draws."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -52,9 +52,10 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
 
 
 def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
-    """The arguments of the task with which demonstrations were recorded, such as its lighting or fit, by which evaluation goes.
+    """The arguments of the task with which demonstrations were recorded, such as its lighting or fit; evaluation uses them.
 
-    LeRobot datasets of other sources do not hold them. Zarr stores of the paper's own data stand for the paper's units.
+    LeRobot datasets of other sources hold no such arguments. For zarr stores of the paper's own data, they are the paper's
+    units.
 
     Raises:
         DemonstrationError: Two files were recorded with different arguments.
@@ -77,12 +78,12 @@ def _of_task(recorded: dict[str, Any]) -> dict[str, Any]:
 
 
 class SequenceDataset:
-    """All frames of all episodes on one device, images as uint8; a sample is an index into them.
+    """All frames of all episodes on one device, images as uint8; a sample is an index into these frames.
 
     A sample at step t holds the observations t - obs_horizon + 1 to t, and the `pred_horizon` actions that begin with the first
-    of them. Before the start of an episode its first step is repeated, after the end its last. Samples end where an executed
-    action would be such a repetition, as in the paper's public code: an episode of T steps has T - action_horizon + 1 samples.
-    An episode that is shorter than `action_horizon` has one sample.
+    of them. Before the start of an episode its first step is repeated, after its end the last step. No sample begins so late
+    that an executed action would be such a repetition, as in the paper's public code: an episode of T steps has T -
+    action_horizon + 1 samples. An episode that is shorter than `action_horizon` has one sample.
 
     Args:
         episodes: Episodes from `read_episodes`.

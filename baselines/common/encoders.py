@@ -26,8 +26,8 @@ class EncoderConfig:
     freeze_tacrgb: bool = False
     """Keep the weights of a pretrained TacRGB network as they were loaded, and train only the layers after it."""
     tacrgb_sensor: str | None = None
-    """Sensor whose published weights the TacRGB network uses, if it has some for each sensor (t3: "mini", "gs_green", ...;
-    anytouch: "gelsight", "gelsight_mini", ...); if not given, the first, which the paper's public code uses."""
+    """Sensor whose published weights the TacRGB network uses, if every sensor has weights of its own (t3: "mini", "gs_green",
+    ...; anytouch: "gelsight", "gelsight_mini", ...); if not given, the first, which the paper's public code uses."""
     force_field: str = "resnet18"
     """Network of each TacFF force field, by its name in `FIELD_ENCODERS`."""
     image_features: int = 512
@@ -37,7 +37,7 @@ class EncoderConfig:
     """Number of features of each TacRGB image and of each TacFF force field; 512 as in the paper's public code."""
     crop: int = 0
     """Side of the square crops of camera images, pixels: random in training, central in evaluation; whole images if 0. TacRGB
-    is not cropped: where the gel is pressed has a meaning."""
+    is not cropped, because it matters where the gel is pressed."""
 
 
 class SpatialSoftmax(nn.Module):
@@ -59,12 +59,12 @@ RESNET18_WIDTHS, RESNET18_DEPTHS = (64, 128, 256, 512), (2, 2, 2, 2)
 
 
 class ResNet18(nn.Module):
-    """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy: batch statistics and an EMA do not go together."""
+    """ResNet-18 from scratch with GroupNorm, as in Diffusion Policy: batch statistics conflict with an EMA of the weights."""
 
     out_channels = RESNET18_WIDTHS[-1]
 
     def __init__(self):
-        from transformers import ResNetConfig, ResNetModel  # here, because it takes seconds
+        from transformers import ResNetConfig, ResNetModel  # imported here, because it takes seconds
 
         super().__init__()
         widths, depths = list(RESNET18_WIDTHS), list(RESNET18_DEPTHS)
@@ -76,7 +76,7 @@ class ResNet18(nn.Module):
 
 
 CHANNELS_PER_GROUP = 16
-"""Channels that GroupNorm normalises together in ResNet-18, as in the public code of Diffusion Policy."""
+"""Number of channels that GroupNorm normalises together in ResNet-18, as in the public code of Diffusion Policy."""
 
 
 def _with_group_norm(module: nn.Module) -> nn.Module:
@@ -89,14 +89,16 @@ def _with_group_norm(module: nn.Module) -> nn.Module:
 
 
 NORM_GROUPS = 8
-"""Groups of GroupNorm in the small networks."""
+"""Number of groups of GroupNorm in the small networks; set once, not tuned."""
 SMALL_STRIDE, SMALL_WIDTHS, SMALL_KERNEL, SMALL_PLACE_CHANNELS = 8, (24, 48, 64, 64), 5, 16
-"""Total stride of `SmallCNN`, channels of its convolutions, kernel of the first, and channels at each place of its last layer;
-chosen for training on a CPU."""
+"""Total stride of `SmallCNN`, channels of its convolutions, kernel size of the first one, and channels at each place that its
+last layer reads; chosen for training on a CPU."""
 FINE_STRIDE, FINE_WIDTHS, FINE_KERNEL, FINE_PLACE_CHANNELS = 16, (32, 48, 48, 64), 7, 8
-"""The same of `FineCNN`."""
+"""The same sizes of `FineCNN`, chosen for training on a CPU, too."""
+FINE_FIRST_STRIDE = 4
+"""Stride of the first convolution of `FineCNN`, so that images of 160 pixels cost what `SmallCNN` needs for 80."""
 FIELD_WIDTH = 32
-"""Channels of the convolutions of `SmallFieldNet`; chosen for training on a CPU."""
+"""Number of channels of the convolutions of `SmallFieldNet`; chosen for training on a CPU."""
 
 
 class SmallCNN(nn.Sequential):
@@ -118,16 +120,13 @@ class SmallCNN(nn.Sequential):
 
 
 class FineCNN(nn.Sequential):
-    """A small image network for a CPU that sees fine detail.
-
-    Its first convolution has a stride of 4, so that images of 160 pixels cost what `SmallCNN` needs for 80.
-    """
+    """A small image network for a CPU that sees fine detail, by a large kernel and stride in its first convolution."""
 
     def __init__(self, size: int, features: int):
         places = math.ceil(size / FINE_STRIDE) ** 2
         first, second, third, fourth = FINE_WIDTHS
         super().__init__(
-            *_conv(3, first, kernel_size=FINE_KERNEL, stride=4),
+            *_conv(3, first, kernel_size=FINE_KERNEL, stride=FINE_FIRST_STRIDE),
             *_conv(first, second, stride=2),
             *_conv(second, third),
             *_conv(third, fourth, stride=2),
@@ -145,7 +144,7 @@ def _over_places(inputs: int, channels: int, places: int, features: int) -> list
 
 
 class SmallFieldNet(nn.Module):
-    """A small force field network: two convolutions, then one layer over all places, because places carry meaning."""
+    """A small force field network: two convolutions, then one layer over all places, because the place matters."""
 
     def __init__(self, taxel_shape: tuple[int, int], features: int):
         super().__init__()
@@ -163,7 +162,7 @@ class SmallFieldNet(nn.Module):
 
 
 class PretrainedEncoder(nn.Module):
-    """An image encoder with a part that is pretrained. Subclasses define all methods."""
+    """An image encoder with a pretrained part. Subclasses define all methods."""
 
     def freeze(self) -> None:
         """Exclude the pretrained part from training."""
@@ -202,13 +201,13 @@ def load_pretrained(policy: nn.Module, weights: Path) -> None:
 def _key_points(_size: int, features: int) -> nn.Module:
     if features % 2:
         raise InvalidArgumentError(
-            f"{features} features are no pairs of coordinates; 'resnet18_keypoints' needs an even number"
+            f"{features} features cannot be pairs of coordinates; 'resnet18_keypoints' needs an even number"
         )
     return nn.Sequential(ResNet18(), SpatialSoftmax(ResNet18.out_channels, features // 2))
 
 
 def _pooled(_shape: int | tuple[int, int], features: int) -> nn.Module:
-    """The mean of ResNet-18's features over all places, and a layer where another number of features is asked for."""
+    """The mean of ResNet-18's features over all places, with a further layer if another number of features is asked for."""
     pooled = [ResNet18(), nn.AdaptiveAvgPool2d(1), nn.Flatten()]
     if features == ResNet18.out_channels:
         return nn.Sequential(*pooled)
@@ -227,7 +226,7 @@ IMAGE_ENCODERS: dict[str, MakeImageEncoder] = {
 TACRGB_ENCODERS: dict[str, MakeImageEncoder] = dict(IMAGE_ENCODERS)
 """Networks over TacRGB images; other packages add theirs with `register_tacrgb_encoder`."""
 FIELD_ENCODERS: dict[str, Callable[[tuple[int, int], int], nn.Module]] = {
-    "resnet18": _pooled,  # the paper's: the force field as a small image, which ResNet-18 shrinks to a single place
+    "resnet18": _pooled,  # as in the paper: the force field is a small image, which ResNet-18 shrinks to a single place
     "small": SmallFieldNet,
 }
 """Functions from the rows and columns of taxels and a number of features to a network (B, 3, rows, columns) -> (B,
@@ -263,7 +262,7 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     if config.freeze_tacrgb or config.tacrgb_sensor:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(
-                f"{config.tacrgb!r} is no representation that could be loaded; leave out freeze_tacrgb and tacrgb_sensor"
+                f"{config.tacrgb!r} has no pretrained weights; leave out freeze_tacrgb and tacrgb_sensor"
             )
         if config.freeze_tacrgb:
             encoder.freeze()
@@ -287,10 +286,10 @@ def field_encoder(config: EncoderConfig, spec: ObservationSpec) -> nn.Module:
 
 
 def by_name(table: dict[str, Callable], name: str) -> Callable:
-    """The function that makes the network of a name.
+    """The function of a table that makes the network of this name.
 
     Raises:
-        UnknownNameError: No network has this name; the message lists those that there are.
+        UnknownNameError: No network has this name; the message lists the known names.
     """
     if name not in table:
         raise UnknownNameError(f"encoder {name!r} is unknown; choose from {sorted(table)}")

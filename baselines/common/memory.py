@@ -26,7 +26,10 @@ def keep_freed_memory(device: torch.device | str) -> None:
 
 
 def lay_out_channels_last(module: nn.Module) -> None:
-    """Store the weights of two-dimensional convolutions channels last, which is faster; before the optimiser is made."""
+    """Store the weights of two-dimensional convolutions channels last, which is faster.
+
+    It must be called before the optimiser is made.
+    """
     for parameter in module.parameters():
         if parameter.dim() == IMAGE_DIMENSIONS:
             parameter.data = parameter.data.to(memory_format=torch.channels_last)

@@ -1,4 +1,4 @@
-"""A residual MLP over a whole action sequence, conditioned by FiLM: the small policies' network, made for a CPU."""
+"""A residual MLP over a whole action sequence, conditioned by FiLM: the network of the small policies for a CPU."""
 
 import torch
 import torch.nn as nn
@@ -27,8 +27,8 @@ class ConditionalMLP(nn.Module):
     It consists of a few matrix products, which a CPU computes in less time than the convolutions of a U-Net.
 
     Args:
-        action_dim: Numbers of an action, A.
-        condition_dim: Numbers of a condition, C.
+        action_dim: Number of components of an action, A.
+        condition_dim: Number of features of a condition, C.
         pred_horizon: Number of actions, T.
         width: Number of features.
         blocks: Number of residual blocks.

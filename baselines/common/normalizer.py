@@ -6,14 +6,14 @@ import torch
 import torch.nn as nn
 
 MIN_RANGE = 1e-3
-"""Smallest half range that is divided by; values that hardly vary are shifted but not magnified."""
-
-
+"""Smallest half range by which data are divided, in their own unit, so that values that hardly vary are shifted but not
+magnified; set once, not tuned."""
 TAXEL_SHARE = 0.05
-"""Smallest half range of a taxel's component that is divided by, as a share of the largest one of that component: a taxel that
-is hardly touched is not magnified to the size of one that carries the grip."""
+"""Smallest half range by which a component of a taxel is divided, as a share of the largest half range of that component over
+all taxels, so that a taxel that is hardly touched is not magnified to the size of one that carries the grip; docs/policies.md
+shows its effect."""
 MIN_TOUCH = 1e-6
-"""Smallest half range of a force field that is divided by, in N, or in m with units="tacsl"."""
+"""Smallest half range by which a force field is divided, in N, or in m with units="tacsl"; set once, not tuned."""
 
 
 class Normalizer(nn.Module):
@@ -21,7 +21,7 @@ class Normalizer(nn.Module):
 
     Args:
         shape: Number of components, or shape of the components: the last dimensions of the data.
-        min_range: Smallest half range that is divided by.
+        min_range: Smallest half range by which data are divided, in their own unit.
         min_share: The same as a share of the largest half range among the components with the same last index.
     """
 
@@ -38,8 +38,8 @@ class Normalizer(nn.Module):
     def of_taxels(cls, taxel_shape: tuple[int, int]) -> "Normalizer":
         """The normaliser of a force field: every component of every taxel has its own range.
 
-        The taxels at the border own the rest of the gel and carry most of a grip. With one range for all taxels they set it,
-        and what changes in the middle of the gel is a small part of it (docs/policies.md).
+        The taxels at the border also stand for the gel beyond them, and carry most of a grip. They would set a range that all
+        taxels share, and changes in the middle of the gel would be a small part of it (docs/policies.md).
         """
         return cls((*taxel_shape, 3), MIN_TOUCH, TAXEL_SHARE)
 
@@ -73,10 +73,10 @@ class ActionNormalizer(Normalizer):
     its square root with its sign, so that 4 % of the largest action becomes 20 %.
 
     Args:
-        action_dim: Numbers of an action.
+        action_dim: Number of components of an action.
         root: Whether actions are replaced by their roots.
-        pairs: Indices of numbers that are the x and y of a vector: the root is that of the vector's length, so that it turns
-            as the vector does.
+        pairs: Indices of components that are the x and y of a vector. Such a vector is divided by the root of its length, so
+            that its direction stays.
     """
 
     def __init__(self, action_dim: int, root: bool = False, pairs: Iterable[tuple[int, int]] = ()):

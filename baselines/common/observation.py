@@ -18,18 +18,18 @@ POSE = "extra/tcp_pose"
 PoseForm = Literal["quaternion", "rotation_6d"]
 """Forms in which networks take the pose: its position with a quaternion, or with two columns of the rotation matrix."""
 POSE_FEATURES: dict[PoseForm, int] = {"quaternion": 7, "rotation_6d": 9}
-"""Number of numbers of a pose, by its form."""
+"""Number of features of a pose, by its form."""
 MIDDLE_QUATERNION = np.array([0.0, np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0])
 """Quaternion (wxyz) of the hand pointing down with its wrist joint in the middle of its range, which is a yaw of 45 degrees."""
 MIN_IMAGE_SIZE = 16
-"""Smallest side of an image that policies take, pixels."""
+"""Smallest side of an image that policies take, pixels; set once, not tuned."""
 TAXEL_SHAPE = TactileSensorConfig.taxel_shape
 """Rows and columns of taxels of the default sensor."""
 CameraView = Literal["whole", "work"]
 """Parts of a camera image that networks take: all of it, or the square in which the work is done."""
 WORK_SQUARES = dict(wrist=(0.28, 0.14, 0.72), front=(0.0, 0.125, 0.75), side=(0.0, 0.125, 0.75))
-"""Top, left and side of the square of each camera's image in which the work is done, as shares of the image's side. Beside it
-the wrist camera sees its own housing, the others the bare table before the work (looked at in demonstrations of all tasks)."""
+"""Top, left and side of the square of each camera's image in which the work is done, as shares of the image's side. Outside
+of it the wrist camera sees its own housing, and the others see bare table (judged by eye in demonstrations of all tasks)."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class ObservationSpec:
 
     @property
     def pose_features(self) -> int:
-        """Number of numbers of the tool's pose."""
+        """Number of features of the tool's pose."""
         return POSE_FEATURES[self.pose]
 
     def size_of(self, key: str) -> int:
@@ -97,7 +97,7 @@ def observation_spec(
     for name, size in (("image_size", image_size), ("tactile_image_size", tactile_image_size)):
         if size < MIN_IMAGE_SIZE:
             raise InvalidArgumentError(
-                f"{name}={size}: images have at least {MIN_IMAGE_SIZE} pixels a side; the paper's have 256"
+                f"{name}={size}: images need at least {MIN_IMAGE_SIZE} pixels on each side; the paper's have 256"
             )
     if pose not in get_args(PoseForm):
         raise InvalidArgumentError(f"pose={pose!r}: the forms of a pose are {list(get_args(PoseForm))}")
@@ -115,7 +115,7 @@ def observation_spec(
 
 
 def is_tactile(key: str) -> bool:
-    """Whether an observation is a tactile sensor's."""
+    """Whether an observation comes from a tactile sensor."""
     return key.startswith(f"sensor_data/{PAD}")
 
 

@@ -11,10 +11,10 @@ from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
 from .mlp import ConditionalMLP
 from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
-from .unet import ConditionalUnet1D
+from .unet import DOWN_DIMS, KERNEL_SIZE, NUM_GROUPS, STEP_EMBED_DIM, ConditionalUnet1D
 
 HEIGHT = 2
-"""Index of the height among the numbers of a pose."""
+"""Index of the height among the features of a pose."""
 
 
 @dataclass
@@ -30,21 +30,21 @@ class PolicyConfig:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
     action_scale: Literal["linear", "root"] = "linear"
-    """Scale of the actions in the loss: "linear" as in the paper, or "root", on which small actions, by which parts are brought
-    together, count for more."""
+    """Scale of the actions in the loss: "linear" as in the paper, or "root", which gives more weight to the small
+    actions with which parts are brought together."""
     action_network: Literal["unet", "mlp"] = "unet"
     """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which takes less time on a CPU."""
     mlp_width: int = 256
     """Number of features of the MLP."""
     mlp_blocks: int = 3
     """Number of residual blocks of the MLP."""
-    down_dims: tuple[int, ...] = (512, 1024, 2048)
+    down_dims: tuple[int, ...] = DOWN_DIMS
     """Channels of the U-Net, from the finest to the coarsest scale."""
-    kernel_size: int = 5
+    kernel_size: int = KERNEL_SIZE
     """Kernel size of the U-Net's convolutions, time steps."""
-    n_groups: int = 8
+    n_groups: int = NUM_GROUPS
     """Number of groups of the U-Net's GroupNorm."""
-    diffusion_step_embed_dim: int = 128
+    diffusion_step_embed_dim: int = STEP_EMBED_DIM
     """Size of the embedding of the diffusion step (or of the flow's time)."""
     pose_noise: float = 0.0
     """Standard deviation of the noise that training adds to the normalised tool pose, except to its height. Without noise, a
@@ -62,10 +62,11 @@ class VisuotactilePolicy(nn.Module):
     Args:
         config: Settings.
         spec: Observations that the policy takes.
-        action_dim: Numbers of an action, A.
+        action_dim: Number of components of an action, A.
 
     Raises:
-        InvalidArgumentError: An encoder's name is unknown, or the encoder does not take images of this size.
+        UnknownNameError: No encoder has a configured name.
+        InvalidArgumentError: An encoder does not take images of this size, or cannot be frozen.
     """
 
     name: ClassVar[str]
@@ -90,7 +91,7 @@ class VisuotactilePolicy(nn.Module):
         return encoder, make_action_network(config, self.action_dim, encoder.out_features)
 
     def action_pairs(self) -> list[tuple[int, int]]:
-        """Indices of those numbers of an action that must be scaled as the x and y of one vector; none by default."""
+        """Indices of the components of an action that must be scaled as the x and y of one vector; none by default."""
         return []
 
     def generation_loss(self, clean: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
@@ -160,8 +161,8 @@ def make_action_network(config: PolicyConfig, action_dim: int, condition_dim: in
 
     Args:
         config: Settings of the policy.
-        action_dim: Numbers of an action.
-        condition_dim: Numbers of a condition.
+        action_dim: Number of components of an action.
+        condition_dim: Number of features of a condition.
     """
     embedding = config.diffusion_step_embed_dim
     if config.action_network == "mlp":

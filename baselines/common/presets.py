@@ -8,7 +8,8 @@ from .train_args import TrainArgs
 
 Args = TypeVar("Args", bound=TrainArgs)
 FINE = EncoderConfig("fine_cnn", "fine_cnn", force_field="small", image_features=64, tactile_features=64, crop=156)
-"""Encoders of the small policies: 160 pixels show a socket 1 mm wide in the wrist camera's square of the work."""
+"""Encoders of the small policies: with 160 pixels for the wrist camera's square of the work, a socket that is 1 mm wide can be
+seen."""
 
 
 def for_cpu(
@@ -28,7 +29,7 @@ def for_cpu(
     """
     small = replace(
         args.policy,
-        action_horizon=4,  # sorting is won more often with 8, where decisions last; insertion with 2, where contact is answered
+        action_horizon=4,  # ball sorting succeeds more often with 8, and insertion, which must react to contact, with 2
         obs_horizon=1,  # with 2, a policy infers the next action from its own motion and ignores the images
         encoder=encoder,
         action_network="mlp",

@@ -20,18 +20,16 @@ LOG = "log.jsonl"
 EVENTS = "events.out.tfevents.*"
 """Files of the log in the folder of a run: json lines, and tensorboard's events."""
 WANDB_TIMEOUT = 30
-"""Longest wait for Weights & Biases, s."""
-
-
+"""Longest wait for Weights & Biases, s; set once, not tuned."""
 GLOBAL_STEP = "global_step"
 """Name of the gradient step in Weights & Biases, over which everything is drawn."""
 TIME = "time/"
-"""Beginning of the names of scalars that are only shown, and not kept in log.jsonl: how long training takes."""
+"""Prefix of the names of scalars that say how long training takes; they are shown, and not kept in log.jsonl."""
 
 
 @dataclass(frozen=True)
 class WandbRun:
-    """What a run is called in Weights & Biases."""
+    """Description of a run in Weights & Biases."""
 
     project: str
     """Name of the project."""
@@ -44,7 +42,7 @@ class WandbRun:
     tags: tuple[str, ...]
     """Tags of the run."""
     config: dict[str, Any]
-    """Settings beside those of the run, such as `eval_env_cfg`."""
+    """Further settings beside those of the run, such as `eval_env_cfg`."""
 
 
 def wandb_run_of(args: TrainArgs, policy: str) -> WandbRun | None:
@@ -65,14 +63,14 @@ def wandb_run_of(args: TrainArgs, policy: str) -> WandbRun | None:
 class RunLog:
     """The log of a training run.
 
-    The entries of a run that is resumed stay up to the checkpoint from which it goes on; the later ones are dropped, because
-    they come again. Tensorboard's events are written anew from the entries that stay, since it can lose those of a process
-    that was killed.
+    The entries of a run that is resumed stay up to the checkpoint from which it goes on; later ones are dropped, because
+    training writes them again. Tensorboard's events are written anew from the entries that stay, since some can be lost when a
+    process is killed.
 
     Args:
         folder: Folder of the run.
         config: Settings of the run, for Weights & Biases.
-        step: Step of the checkpoint from which the run goes on; 0 where it begins, and the log in the folder is replaced.
+        step: Step of the checkpoint from which the run continues; 0 for a new run, which replaces the log in the folder.
         wandb_run: The run in Weights & Biases; it is not used if None.
 
     Raises:
@@ -83,7 +81,7 @@ class RunLog:
     def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_run: WandbRun | None):
         self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
-        """The entries of the log that are kept from before."""
+        """Entries of the earlier log that are kept."""
         write_text(folder / LOG, "".join(map(_line, self.entries)))
         for events in folder.glob(EVENTS):
             events.unlink()
@@ -99,7 +97,8 @@ class RunLog:
             entry: The entry.
             video: Video of the evaluation that the entry is about, for Weights & Biases.
         """
-        kept = {name: value for name, value in entry.items() if not name.startswith(TIME)}  # the same in every run of a seed
+        # without times, the log is the same in every run of a seed
+        kept = {name: value for name, value in entry.items() if not name.startswith(TIME)}
         self._lines.write(_line(kept))
         self._lines.flush()
         self._show(entry)

@@ -18,7 +18,7 @@ from .policy import PolicyConfig
 PUBLIC_CODE_LR = 1e-4
 """Learning rate in the paper's public code, except for Diffusion Policy; the paper's table has 8e-5 for all policies."""
 PAPER_EPOCHS = 50_000
-"""Training epochs of the paper, summed over all demonstrations: with n demonstrations a policy trains 50,000 / n epochs."""
+"""Number of training epochs in the paper times the number of demonstrations: with n demonstrations, 50,000 / n epochs."""
 ON_GPU = torch.cuda.is_available()
 """Whether a GPU is available, which the defaults then use."""
 
@@ -30,7 +30,7 @@ class TrainArgs:
     demos: Annotated[tuple[Path, ...], arg(name="demo-path", aliases=["--demos"])]
     """Trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout."""
     env_id: str = "ManiFeel-PegInsertion-v1"
-    """Environment id of the task that the demonstrations are of."""
+    """Environment id of the task in the demonstrations."""
     obs_mode: str = "rgb+tacff"
     """Modalities that the policy observes: "rgb", "rgb+tacrgb", "rgb+tacff", "rgb+tacrgb+tacff", "tacff", ..."""
     cameras: tuple[str, ...] | None = None
@@ -48,7 +48,7 @@ class TrainArgs:
     """Form of the tool's pose: "quaternion" is the paper's, 7 numbers, with a sign that does not jump while the hand points
     down; "rotation_6d" has 9 numbers, the position and two columns of the rotation matrix."""
     tacrgb_weights: Path | None = None
-    """File of weights with which the tactile representation starts: as its authors released them, or from pretrain.py."""
+    """File of the weights with which the tactile representation starts: from its authors, or from pretrain.py."""
     num_demos: int | None = None
     """Number of training episodes; all of them if not given."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -95,7 +95,7 @@ class TrainArgs:
     num_eval_episodes: Annotated[int, arg(aliases=["--eval-episodes"])] = 0
     """Number of the task's seeds on which a checkpoint is evaluated, in other processes; no evaluation if 0."""
     num_eval_envs: Annotated[int, arg(aliases=["--eval-workers"])] = 1
-    """Number of environments of an evaluation, each in a process."""
+    """Number of environments of an evaluation, each in a process of its own."""
     eval_env_kwargs: str = "{}"
     """Arguments of the task in evaluation, as a json object."""
     capture_video: bool = False
@@ -105,7 +105,7 @@ class TrainArgs:
     resume: bool = False
     """Continue from the last checkpoint in run_dir."""
     overwrite: bool = False
-    """Delete the checkpoints, the log and the evaluations of an earlier run in run_dir, and begin anew."""
+    """Delete the checkpoints, the log and the evaluations of an earlier run in run_dir, and start a new run."""
     track: bool = False
     """Send the log to Weights & Biases, too; WANDB_MODE=offline writes it to disk."""
     wandb_project_name: Annotated[str, arg(aliases=["--wandb-project"])] = "ManiFeel"
@@ -137,7 +137,7 @@ FREE_ON_RESUME = {
 
 
 def check_run(args: TrainArgs) -> None:
-    """Check what the settings say of a run as a whole.
+    """Check that the settings of a run do not contradict each other.
 
     Raises:
         InvalidArgumentError: The run to resume is not named, or is to be overwritten, or evaluations fall between checkpoints.

@@ -53,7 +53,7 @@ log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
 """Folder of the checkpoints' evaluations in the folder of a run."""
 RANK_SEED_STRIDE = 1_000_003
-"""Distance of the noise seeds of processes: a prime that is larger than usual seeds and numbers of steps."""
+"""Difference between the noise seeds of two processes; a prime number that is larger than usual seeds and numbers of steps."""
 
 
 class TrainingError(WorkFailedError):
@@ -68,7 +68,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         policy_class: Class of the policy.
 
     Raises:
-        InvalidArgumentError: The settings do not say which run is meant.
+        InvalidArgumentError: The settings contradict each other (`check_run`).
         FileExistsAlreadyError: The folder of the run has checkpoints, and is neither to be resumed nor to be overwritten.
         InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
@@ -92,7 +92,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
 
 
 class Trainer:
-    """A training run: the data, the policy and all that changes while it learns.
+    """A training run: the data, the policy, and everything that changes while the policy learns.
 
     Args:
         args: Settings of the run, with its folder.
@@ -224,7 +224,7 @@ class Trainer:
         self.begin -= saved["training_seconds"]
 
     def _open_log(self) -> RunLog:
-        """Make the folder of the run ready: what is left of an earlier run stays only where this one continues it."""
+        """Prepare the folder of the run and open its log; files of an earlier run stay only if this run continues it."""
         for folder in (self.run_dir, self.checkpoints):
             remove_leftovers(folder)
         if self.args.overwrite:
@@ -350,7 +350,7 @@ class RecentLosses:
             first = int(wrong[0])
             raise TrainingError(
                 f"the loss of step {step - len(batches) + 1 + first} is {float(losses[first])}, on {names(batches[first])}; "
-                "look at these demonstrations, lower --lr, or train with --precision fp32. Saved checkpoints are from before"
+                "look at these demonstrations, lower --lr, or train with --precision fp32. Saved checkpoints are older"
             )
         self._batches = []
         return float(losses.mean())
@@ -370,8 +370,8 @@ def with_taxel_shape(spec: ObservationSpec, episode: Episode) -> ObservationSpec
 
 
 def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
-    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json knows."""
-    settings = {name: value for name, value in as_json(args).items() if name != "wandb_entity"}  # who it is, is not published
+    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json can hold."""
+    settings = {name: value for name, value in as_json(args).items() if name != "wandb_entity"}  # personal, so not published
     return settings | dict(
         policy_name=policy_class.name,
         action_dim=dataset.actions.shape[1],

@@ -7,6 +7,9 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F  # noqa: N812
 
+DOWN_DIMS, KERNEL_SIZE, NUM_GROUPS, STEP_EMBED_DIM = (512, 1024, 2048), 5, 8, 128
+"""Channels at each scale, kernel size, number of groups of GroupNorm, and size of the embedding of the diffusion step, as in
+the public code of Diffusion Policy."""
 LONGEST_WAVE = 10_000
 """Longest wavelength of the step embedding (Vaswani et al. 2017, section 3.5)."""
 
@@ -29,7 +32,7 @@ class StepEmbedding(nn.Module):
 class SequenceConv(nn.Conv1d):
     """A convolution over a short sequence, computed as one matrix product.
 
-    Its weights are many times larger than its input, for which the convolutions of libraries are not made: with 2048 channels
+    Its weights are many times larger than its input, a case for which library convolutions are not made: with 2048 channels
     over four steps the product takes less than half the time on a CPU (`benchmarks/train_speed.py`).
     """
 
@@ -65,11 +68,11 @@ class ConditionalUnet1D(nn.Module):
     The defaults are those of Diffusion Policy.
 
     Args:
-        action_dim: Numbers of an action, A.
-        condition_dim: Numbers of a condition, C.
+        action_dim: Number of components of an action, A.
+        condition_dim: Number of features of a condition, C.
         down_dims: Channels from the finest to the coarsest scale; T must be divisible by 2 ** (len(down_dims) - 1).
         kernel_size: Kernel size of the convolutions.
-        n_groups: Groups of GroupNorm.
+        n_groups: Number of groups of GroupNorm.
         diffusion_step_embed_dim: Size of the embedding of the diffusion step.
     """
 
@@ -77,10 +80,10 @@ class ConditionalUnet1D(nn.Module):
         self,
         action_dim: int,
         condition_dim: int,
-        down_dims: tuple[int, ...] = (512, 1024, 2048),
-        kernel_size: int = 5,
-        n_groups: int = 8,
-        diffusion_step_embed_dim: int = 128,
+        down_dims: tuple[int, ...] = DOWN_DIMS,
+        kernel_size: int = KERNEL_SIZE,
+        n_groups: int = NUM_GROUPS,
+        diffusion_step_embed_dim: int = STEP_EMBED_DIM,
     ):
         super().__init__()
         self.embed = StepEmbedding(diffusion_step_embed_dim)

@@ -30,7 +30,7 @@ class DiffusionPolicy(VisuotactilePolicy):
     config: DiffusionConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def __init__(self, config: DiffusionConfig, spec: ObservationSpec, action_dim: int):
-        from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # here, because it takes seconds
+        from diffusers.schedulers.scheduling_ddim import DDIMScheduler  # imported here, because it takes seconds
         from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 
         super().__init__(config, spec, action_dim)

@@ -3,7 +3,7 @@
     python baselines/diffusion_policy/train.py paper --demo-path peg.h5 --obs-mode rgb+tacff
     python baselines/diffusion_policy/train.py cpu --demo-path peg.h5 --obs-mode rgb+tacff
 
-The preset `paper` has the settings of the paper's public code, `cpu` a small network that learns on two CPU cores in minutes.
+The preset `paper` has the settings of the paper's public code, `cpu` has a small network that learns on a CPU core in minutes.
 """
 
 import sys
@@ -27,7 +27,8 @@ class Args(TrainArgs):
 
     policy: DiffusionConfig = field(default_factory=DiffusionConfig)
     inference_steps: int = 100
-    """Number of denoising steps in evaluation; with as many as diffusion steps the sampler is DDPM, with fewer DDIM."""
+    """Number of denoising steps in evaluation; the sampler is DDPM if it equals the number of diffusion steps, DDIM if it is
+    less."""
 
     def public_code_lr(self):
         from_scratch = "tacrgb" not in self.obs_mode.split("+") or self.policy.encoder.tacrgb in IMAGE_ENCODERS

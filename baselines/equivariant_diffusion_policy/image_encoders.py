@@ -9,14 +9,16 @@ import torch.nn as nn
 from .groups import ORDER, FieldNorm, GroupConv, halve, pooled, representation
 
 CHANNELS_PER_GROUP = 16
-"""Channels that a block of the small network normalises together."""
+"""Number of regular channels that a block of the small network normalises together; set once, not tuned."""
 LIFT_KERNEL = 5
-"""Kernel of the first convolution, as in the paper's public code."""
+"""Kernel size of the first convolution, as in the paper's public code."""
+LAST_POOLING = 3
+"""Factor by which the last block's pooling shrinks the image, instead of 2, as in the paper's public code."""
 RESNET_DIVISORS = (16, 16, 8, 4, 2, 1, 1)
-"""What the number of fields of the features is divided by after the first convolution and after each block, as in the paper's
-public code."""
+"""Divisors of the number of fields of the features, which give the numbers of fields after the first convolution and after each
+block, as in the paper's public code."""
 KEY_POINT_DIVISORS = (32, 16, 8, 4)
-"""The same of the small network; chosen for training on a CPU."""
+"""The same divisors of the small network; chosen for training on a CPU."""
 
 
 class GroupBlock(nn.Module):
@@ -64,7 +66,7 @@ class EquivariantResNet(nn.Module):
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         fields = self.lift(image)
         for k, block in enumerate(self.blocks, start=1):
-            fields = pooled(block(fields), 2 if k < len(self.blocks) else 3)
+            fields = pooled(block(fields), 2 if k < len(self.blocks) else LAST_POOLING)
         return self.last(fields).mean((2, 3)).unflatten(1, (-1, ORDER))
 
 
@@ -102,5 +104,5 @@ EQUIVARIANT_IMAGE_ENCODERS: dict[str, Callable[[int], nn.Module]] = {
     "resnet18": EquivariantResNet,
     "small_cnn": EquivariantKeyPoints,
 }
-"""Functions from a number of regular fields to a network (B, 3, size, size) -> (B, fields, 8), by the names that other policies
-have for the networks in their place."""
+"""Functions from a number of regular fields to a network (B, 3, size, size) -> (B, fields, 8), by the names of the networks
+that other policies use in their place."""

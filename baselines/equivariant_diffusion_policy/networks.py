@@ -96,7 +96,7 @@ class EquivariantActionNetwork(nn.Module):
     The network sees actions as regular fields, and what it predicts is turned back into actions.
 
     Args:
-        action_dim: Numbers of an action.
+        action_dim: Number of components of an action.
         fields: Number of regular fields for an action.
         network: Network from fields (B, T, fields), steps (B,) and the condition in a frame (B, C) to fields (B, T, fields).
 

@@ -23,8 +23,8 @@ class EquivariantConfig(DiffusionConfig):
     encoder: EncoderConfig = field(
         default_factory=lambda: EncoderConfig(tacrgb="resnet18_keypoints", tactile_features=128, crop=230)
     )
-    """Networks that encode the observations. Of the cameras' networks there are equivariant ones, "resnet18" and "small_cnn",
-    with `hidden` regular fields instead of `image_features`."""
+    """Networks that encode the observations. Those of cameras are equivariant: "resnet18" or "small_cnn", with `hidden` regular
+    fields instead of `image_features`."""
     hidden: int = 128
     """Number of regular fields of each camera's features and of an observation; each has eight numbers, one for every rotation
     of C8."""

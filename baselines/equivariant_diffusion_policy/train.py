@@ -3,7 +3,7 @@
     python baselines/equivariant_diffusion_policy/train.py paper --demo-path peg.h5 --obs-mode rgb+tacff
     python baselines/equivariant_diffusion_policy/train.py cpu --demo-path peg.h5 --obs-mode rgb+tacff
 
-The preset `paper` has the settings of the paper's public code, `cpu` a small network that learns on two CPU cores in minutes.
+The preset `paper` has the settings of the paper's public code, `cpu` has a small network that learns on a CPU core in minutes.
 """
 
 import sys
@@ -30,7 +30,7 @@ class Args(TrainArgs):
 
 
 SMALL = replace(FINE, image="small_cnn", crop=78)
-"""Encoders of the preset `cpu`: the equivariant network over the cameras' images takes larger ones too slowly."""
+"""Encoders of the preset `cpu`; the equivariant network over camera images is too slow for larger images."""
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(

@@ -23,14 +23,14 @@ class FlowConfig(PolicyConfig):
     """Output of the network: the velocity, as in the paper, or the clean actions to which it leads, which a short training
     learns far sooner."""
     consistency: bool = False
-    """Train velocities to agree along a path and to lead to the same end, so that one generation step is as good as many."""
+    """Train velocities to agree along a path and to lead to the same end, so that few generation steps suffice."""
     segments: int = 1
-    """Number of segments of a path, each with an end of its own; generation needs as many steps at least. Only with
-    consistency."""
+    """Number of segments of a path, each with an end of its own; generation needs at least as many steps. Used only
+    with consistency."""
     interval: float = 0.01
     """Time between the two points of a path that must agree; the whole path takes time 1."""
     velocity_weight: float = 1e-5
-    """Weight of the agreement of velocities in the loss. Only with consistency."""
+    """Weight in the loss of the difference between the two velocities. Used only with consistency."""
     public_code: bool = False
     """Reproduce two traits of the paper's public code: generation starts from noise that is uniform in [0, 1], though training
     draws Gaussian noise, and the network is given the time in [0, 1] instead of [0, 100]."""

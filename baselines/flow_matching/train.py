@@ -5,7 +5,7 @@
     python baselines/flow_matching/train.py cpu --demo-path peg.h5 --obs-mode rgb+tacff
 
 The preset `paper` has the settings of the paper's public code, `consistency` trains for generation in one step, and `cpu` has a
-small network that learns on two CPU cores in minutes.
+small network that learns on a CPU core in minutes.
 """
 
 import sys

@@ -36,20 +36,20 @@ from .study import KINDS, Job, Kind, Study, jobs_of, read_study
 
 log = logging.getLogger(__name__)
 RETRIES = 3
-"""How often Ray starts a job again whose worker has died."""
+"""Number of times that Ray starts a job again after its worker has died; set once, not tuned."""
 SHOWN = 8
-"""Number of running jobs in the table."""
+"""Largest number of running jobs in the table; set once, not tuned."""
 POLL_SECONDS = 2
-"""Time between two updates of the table, in s."""
+"""Time between two updates of the table, in s; set once, not tuned."""
 RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
 }
 """Environment variables of a Ray that is started here, unless they are set."""
 FILE_WIDTH = 160
-"""Characters of a line where the output is no terminal."""
+"""Number of characters of a line if the output is not a terminal; wide enough for the tables."""
 LOOPBACK = "127.0.0.1"
-"""Address on which a Ray that is started here listens: no other machine reaches it."""
+"""Address on which a Ray that is started here listens, so that no other machine reaches it."""
 CODE = Path(__file__).parents[2]
 """Folder that these packages are imported from."""
 
@@ -136,7 +136,7 @@ def _require_writable(root: Path) -> None:
 def _start_ray(address: str | None) -> None:
     """Connect to a cluster, or start a Ray on this machine that only its own processes can reach and command.
 
-    Ray puts the current folder on the path of its workers, where anybody's torch.py may lie; so it is started from the
+    Ray lets its workers import from the current folder, where a stranger's torch.py may lie. It is therefore started from the
     folder that this code is imported from.
     """
     settings: dict[str, Any] = {}
@@ -144,8 +144,8 @@ def _start_ray(address: str | None) -> None:
     if address == "local":
         settings = dict(_node_ip_address=LOOPBACK)
         os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"  # for the processes that Ray starts
-        ray_constants.ENABLE_RAY_CLUSTER = False  # else it takes this machine's outer address for 127.0.0.1, but on macOS
-        os.environ.pop("RAY_AUTH_MODE", None)  # where it is not set, a Ray that is started here asks for a token
+        ray_constants.ENABLE_RAY_CLUSTER = False  # else it replaces 127.0.0.1 by this machine's outer address, except on macOS
+        os.environ.pop("RAY_AUTH_MODE", None)  # if it is not set, a Ray that is started here asks for a token
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
         for name, value in RAY_SETTINGS.items():
             os.environ.setdefault(name, value)
@@ -215,7 +215,7 @@ def _resources() -> list[tuple[str, str, float]]:
 
 
 def _error(result: Any) -> str:
-    """What a job raised, on one line; "" where it is done."""
+    """What a job raised, on one line; "" if it is done."""
     try:
         ray.get(result)
     except RayTaskError as error:

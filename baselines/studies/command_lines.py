@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from baselines.registry import policy_spec, preset_cli
+from manifeel_ms3.paths import CHECKPOINTS
 
 from .study import Job
 
 OBS_MODE = "rgb+tacrgb+tacff"
-"""Recordings hold everything that any policy of a study observes."""
+"""Observation mode of all recordings, which hold everything that any policy of a study observes."""
 
 
 def trajectory_of(job: Job, root: Path) -> Path:
@@ -80,7 +81,7 @@ def shell_command(job: Job, root: Path, workers: int) -> str:
     if job.kind == "train":
         return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root)])
     (train,) = job.needs
-    checkpoints = shlex.quote(str(train.folder(root) / "checkpoints"))
+    checkpoints = shlex.quote(str(train.folder(root) / CHECKPOINTS))
     out = shlex.quote(str(job.folder(root)))
     command = shlex.join(["manifeel", "eval", *evaluate_arguments(job, workers, "CHECKPOINT", "OUT")])
     command = command.replace("CHECKPOINT", f"{checkpoints}/$step").replace("OUT", f"{out}/$step.json")

@@ -25,13 +25,14 @@ from manifeel_ms3.tasks.registry import task_spec
 
 from .command_lines import OBS_MODE, train_flags, training_args
 from .jobs import DONE, read_status
-from .study import Job
+from .study import SIMULATING, Job
 
 TRIALS = "trials.json"
+"""Name of the file of measured trials, in the folder of all jobs."""
 SIMULATION_STEPS = 20
-"""Number of control steps in a trial of a simulation."""
+"""Number of control steps in a trial of a simulation; set once, not tuned."""
 GRADIENT_STEPS = 2
-"""Number of gradient steps in a trial of training, after a first one that is not timed."""
+"""Number of gradient steps in a trial of training, after a first one that is not timed; set once, not tuned."""
 ACTION_SIZE = 7
 """Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
 AMOUNTS = ("num", "episodes", "checkpoints", "version", "revision")
@@ -49,7 +50,7 @@ class CostEstimate:
     seconds: float
     """Wall-clock time with the resources that the study gives the job."""
     source: str
-    """Where the figure is from: "runs here" or "a trial"."""
+    """Origin of the estimate: "runs here" or "a trial"."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,7 @@ class Trial:
     measure: Callable[..., float]
     """Function that returns the seconds of one step."""
     arguments: tuple[str, ...]
+    """Arguments of the function."""
 
     @property
     def key(self) -> str:
@@ -84,9 +86,9 @@ def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEs
         job: The job.
         root: Folder of all jobs.
         workers: Number of processes that simulate.
-        try_out: Whether to run trials if no job like this one was done here. There are none of the pretraining of encoders.
+        try_out: Whether to run trials if no job like this one was done here. The pretraining of encoders has no trials.
     """
-    parallel = workers if job.kind in ("record", "evaluate") else 1
+    parallel = workers if job.kind in SIMULATING else 1
     took = [status["seconds"] / max(status["units"], 1) * status["parallel"] for status in _done(job, root)]
     if took:
         return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")

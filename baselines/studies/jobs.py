@@ -32,9 +32,10 @@ from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.provenance import machine
 
 from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
-from .study import Job
+from .study import SIMULATING, Job
 
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
+"""Names of the files in a job's folder that hold its status."""
 
 
 def is_done(job: Job, root: Path) -> bool:
@@ -87,10 +88,10 @@ def _perform(job: Job, root: Path, workers: int) -> None:
     try:
         units = WORK[job.kind](job, root, workers)
     except Exception as error:
-        with suppress(FileWriteError):  # on a full disk the error itself is told
+        with suppress(FileWriteError):  # on a full disk, the error of the job is raised
             write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
-    parallel = workers if job.kind in ("record", "evaluate") else 1
+    parallel = workers if job.kind in SIMULATING else 1
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
 
@@ -111,7 +112,7 @@ def _record(job: Job, root: Path, workers: int) -> int:
 
 
 def _pretrain(job: Job, root: Path, _workers: int) -> int:
-    """Train an encoder of TacRGB, and return 1: what it costs is known of the whole alone."""
+    """Train an encoder of TacRGB, and return 1, because only the cost of the whole training is known."""
     pretrain.main(tyro.cli(pretrain.Args, args=pretrain_arguments(job, root)))
     return 1
 
@@ -120,7 +121,7 @@ def _train(job: Job, root: Path, _workers: int) -> int:
     """Train a policy, and return the number of its gradient steps."""
     resume = bool(saved_checkpoints(job.folder(root) / CHECKPOINTS))
     last = policy_spec(job.settings["policy"]).train(replace(training_args(job, root), resume=resume))
-    return json.loads((last / "config.json").read_text())["step"]
+    return checkpoint_config(last)["step"]
 
 
 def _evaluate(job: Job, root: Path, workers: int) -> int:
@@ -135,7 +136,7 @@ def _evaluate(job: Job, root: Path, workers: int) -> int:
             args = tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out)))
             try:
                 evaluate.main(args)
-            except OtherEvaluationError:  # begun on another machine or with other versions: not to be mixed with these
+            except OtherEvaluationError:  # begun on another machine or with other versions, so its episodes cannot be kept
                 evaluate.main(replace(args, overwrite=True))
     return len(chosen) * settings["episodes"]
 
@@ -164,6 +165,7 @@ def is_result_of(checkpoint: Path, path: Path) -> bool:
 
 
 WORK = dict(record=_record, pretrain=_pretrain, train=_train, evaluate=_evaluate)
+"""Function that does the work of a job, by the kind of the job; it returns the number of units whose cost is estimated."""
 
 
 def read_status(path: Path) -> dict[str, Any]:

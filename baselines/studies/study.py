@@ -1,4 +1,4 @@
-"""What a study runs: its file in yaml, and the jobs that its grids come to."""
+"""A study: its file in yaml, and the jobs that its grids stand for."""
 
 import hashlib
 import json
@@ -21,10 +21,13 @@ from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
 KINDS: tuple[Kind, ...] = ("record", "pretrain", "train", "evaluate")
+"""Kinds of jobs, in the order in which they need each other."""
+SIMULATING: tuple[Kind, ...] = ("record", "evaluate")
+"""Kinds of jobs that simulate, in several processes at once."""
 OF_THE_MACHINE = ("device", "precision", "compile")
 """Settings of a preset that depend on the machine on which it is read."""
 TABLE = "table "
-"""What `tasks` begins with where it names a table of the paper instead of listing tasks: "table I"."""
+"""Prefix of `tasks` if it names a table of the paper instead of listing tasks: "table I"."""
 
 
 class StudyError(InvalidFileError):
@@ -61,7 +64,7 @@ class Grid:
     cameras: tuple[str, ...] = ("policy",)
     """Cameras, of which each policy gets one; "policy" is the task's own."""
     num_demos: tuple[int | None, ...] = (None,)
-    """Numbers of demonstrations to train on; all of a task's where it has fewer. null stands for all."""
+    """Numbers of demonstrations to train on; a task that has fewer is trained on all of its own. null stands for all."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Training seeds."""
     task_args: dict[str, Any] = field(default_factory=dict)
@@ -96,7 +99,9 @@ class Study:
     name: str
     """Name of the file, without its ending."""
     grids: tuple[Grid, ...]
+    """Grids of all included files and of the file itself."""
     resources: dict[Kind, Resources]
+    """Resources of each job, by its kind."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,9 @@ class Job:
     """
 
     kind: Kind
+    """Kind of the job."""
     title: str
+    """Description of the job, for people."""
     settings: dict[str, Any]
     """Everything that the job's outcome depends on, apart from the jobs in `needs`."""
     needs: tuple["Job", ...] = ()

@@ -40,7 +40,7 @@ VIT_LARGE: dict[str, Any] = dict(
     num_attention_heads=16,
     patch_size=14,
     projection_dim=768,
-    hidden_act="gelu",  # as the checkpoint of CLIP has it that AnyTouch begins with (laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K)
+    hidden_act="gelu",  # of the CLIP checkpoint that AnyTouch starts from (laion/CLIP-ViT-L-14-DataComp.XL-s13B-b90K)
 )
 """Settings of CLIP's vision model."""
 
@@ -53,7 +53,7 @@ class AnyTouch(TokenRepresentation):
     sensors, sensor = SENSORS, "gelsight"
 
     def __init__(self, config: CLIPVisionConfig | None = None):
-        from transformers import CLIPVisionConfig, CLIPVisionModel  # here, because it takes seconds
+        from transformers import CLIPVisionConfig, CLIPVisionModel  # imported here, because it takes seconds
 
         super().__init__()
         config = config or CLIPVisionConfig(**VIT_LARGE)

@@ -61,7 +61,7 @@ def require_size(representation: Representation, size: int, option: str = "--tac
         option: Option of the command line that sets the size, for the error's message.
 
     Raises:
-        InvalidArgumentError: It does not.
+        InvalidArgumentError: The representation does not take images of this size.
     """
     patch = representation.patch
     if size < patch or size % patch:

@@ -8,9 +8,11 @@ from .representation import TokenRepresentation
 from .vit import EPS, POSITION_STD, Block
 
 WIDTH, DEPTH, HEADS = 256, 2, 8
-"""Size of the decoder, which only pretraining needs."""
+"""Number of features, of layers and of attention heads of the decoder, which only pretraining needs; smaller than that of He et
+al. (2022), and not tuned."""
 VARIANCE_EPS = 1e-4
-"""Added to the variance of a patch before the division by it, so that uniform patches stay small."""
+"""Number that is added to the variance of a patch before the division by it, so that uniform patches stay small; set once, not
+tuned."""
 
 
 class MaskedAutoencoder(nn.Module):

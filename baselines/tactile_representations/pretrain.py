@@ -3,8 +3,8 @@
     python -m baselines.tactile_representations.pretrain unit --demo-path nut.h5 --env-id ManiFeel-NutBoltAssembly-v1
     python -m baselines.tactile_representations.pretrain t3 --demo-path a.h5 b.h5 --out t3.safetensors
 
-The first is what the paper ManiFeel does for all its tasks. UniT is trained as a VQGAN (Esser et al. 2021), the transformers by
-masked autoencoding; the option `--tacrgb-weights` of a policy's training takes the result.
+The first command does what the paper ManiFeel does for all its tasks. UniT is trained as a VQGAN (Esser et al. 2021), the
+transformers by masked autoencoding; the option `--tacrgb-weights` of a policy's training takes the result.
 """
 
 import math
@@ -48,8 +48,7 @@ EPOCHS = 50
 ADVERSARY_WEIGHT = 0.1
 """Weight of the discriminator's judgement in the loss; constant, whereas Esser et al. (2021, eq. 7) adapt theirs."""
 REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
-
-
+"""Networks of the representations, by name."""
 Representation = Literal["unit", "t3", "anytouch", "sparsh"]
 """Names of the representations that can be trained."""
 
@@ -83,7 +82,7 @@ class Args:
     device: str = "cuda" if torch.cuda.is_available() else "cpu"
     """Device that trains, "cuda" or "cpu"."""
     log_freq: Annotated[int, arg(aliases=["--log-every"])] = 10
-    """Number of gradient steps between the losses that are shown and returned."""
+    """Number of gradient steps between two losses that are shown and returned."""
 
 
 def main(args: Args) -> list[float]:

@@ -1,8 +1,8 @@
 """Reads the tensors of a `.ckpt` or `.pth` file that others have released, and runs nothing of it.
 
 Such a file is a zip with a pickle, and a pickle is a program that can call any function by its name. The reader here knows
-only the names that torch writes for tensors. Every other name, such as a scheduler's of the authors or `os.system`, gives an
-object that keeps and does nothing. Tensors are read after the pickle has ended, and only those that are asked for.
+only the names that torch writes for tensors. Every other name, such as that of the authors' scheduler or `os.system`, gives an
+object that holds nothing and does nothing. Tensors are read after the pickle has ended, and only those that are asked for.
 """
 
 import io
@@ -77,7 +77,7 @@ def _read(archive: zipfile.ZipFile, file_size: int) -> dict[str, torch.Tensor]:
 
 @dataclass(frozen=True)
 class _Tensor:
-    """A tensor's place in the file, as the pickle says it."""
+    """The place of a tensor in the file, as the pickle describes it."""
 
     storage: Any
     offset: Any
@@ -128,7 +128,7 @@ class _RebuildParameter:
 
 
 class _Inert:
-    """An object of any other class or the result of any other function; it keeps and does nothing."""
+    """An object of any other class or the result of any other function; it holds nothing and does nothing."""
 
     def __new__(cls, *_: Any, **__: Any) -> "_Inert":
         return object.__new__(cls)

@@ -25,7 +25,7 @@ class Representation(nn.Module):
     out_features: int
     """Number of features of the output."""
     patch: int
-    """Number of pixels of which both sides of the images are a multiple."""
+    """Number of pixels; both sides of the images must be a multiple of it."""
     size: int
     """Side of the images that its authors, or else the paper ManiFeel, give to it, pixels."""
     released: str
@@ -48,7 +48,7 @@ class Representation(nn.Module):
         """Use the weights of the sensor of this name.
 
         Raises:
-            UnknownNameError: There are none.
+            UnknownNameError: The representation has no weights for this sensor.
         """
         if name not in self.sensors:
             kinds = f"choose from {list(self.sensors)}" if self.sensors else "it has the same weights for all; leave it out"
@@ -64,7 +64,7 @@ class Representation(nn.Module):
         weights, own = self.read(path), self.state_dict()
         if not weights.keys() <= own.keys():
             weights = self._converted(weights, path)
-        buffers = {name: own[name] for name, _ in self.named_buffers() if name in own}  # the authors' files need not hold them
+        buffers = {name: own[name] for name, _ in self.named_buffers() if name in own}  # the authors' files may lack them
         weights = buffers | weights
         wrong = [name for name in own if name not in weights or not _fits(weights[name], own[name])]
         wrong += [name for name in weights if name not in own]

@@ -92,7 +92,7 @@ def _weights_file(folder: Path, stem: str) -> Path:
     """The file of this stem in the released folder, as the authors saved it or as safetensors.
 
     Raises:
-        CheckpointError: There is none.
+        CheckpointError: The folder lacks the file.
     """
     for suffix in (".pth", ".safetensors"):
         if (folder / f"{stem}{suffix}").is_file():

@@ -43,7 +43,7 @@ class UniT(Representation):
     released = "a checkpoint of UniT's VQGAN"
 
     def __init__(self, channels: tuple[int, ...] = CHANNELS, attention: bool = False):
-        from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (here, because it takes seconds)
+        from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (imported here, because it takes seconds)
 
         super().__init__()
         self.size = RELEASED_SIZE if attention else SIZE

@@ -272,7 +272,7 @@ def test_crops_are_of_cameras_alone_and_may_be_larger_than_the_images(image, cro
 
 def test_key_points_are_pairs_of_coordinates():
     spec = observation_spec("rgb", ("wrist",), (), 64)
-    with pytest.raises(InvalidArgumentError, match="7 features are no pairs"):
+    with pytest.raises(InvalidArgumentError, match="7 features cannot be pairs"):
         ObservationEncoder(EncoderConfig("resnet18_keypoints", image_features=7), spec, 2)
 
 

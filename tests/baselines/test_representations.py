@@ -149,7 +149,7 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
     with pytest.raises(ValueError, match="a multiple of 16, not 30; give --tactile-image-size 224"):
         ObservationEncoder(EncoderConfig(tacrgb="sparsh"), replace(SPEC, tactile_image_size=30), 1)
     for setting in (dict(tacrgb_sensor="mini"), dict(freeze_tacrgb=True)):
-        with pytest.raises(ValueError, match="'resnet18' is no representation"), torch.device("meta"):
+        with pytest.raises(ValueError, match="'resnet18' has no pretrained weights"), torch.device("meta"):
             ObservationEncoder(EncoderConfig(**setting), SPEC, 1)
     with pytest.raises(ValueError, match=r"'gs_pink' is no sensor of T3; choose from \['mini'"), torch.device("meta"):
         ObservationEncoder(EncoderConfig(tacrgb="t3", tacrgb_sensor="gs_pink"), SPEC, 1)

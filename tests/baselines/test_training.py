@@ -225,7 +225,7 @@ def test_checkpoint_of_another_policy_is_refused(run, checkpoint, tmp_path):
     other = tmp_path / "other"
     shutil.copytree(checkpoint, other)
     (other / "config.json").write_text(json.dumps(dict(kind="something:Else")))
-    with pytest.raises(CheckpointError, match=f"not one of the policy {run.spec.name!r}"):
+    with pytest.raises(CheckpointError, match=f"does not describe the policy {run.spec.name!r}"):
         run.spec.load(other)
 
 
