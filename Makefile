@@ -1,10 +1,10 @@
 # make setup            Install what the project needs.
 # make demo             Record, train and evaluate one visuotactile policy, and write its report.
-# make data             Record the paper's number of demonstrations of every task: hours; it goes on where it was stopped.
+# make data             Record the paper's number of demonstrations of every task, in hours; it continues where it was stopped.
 # make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
 # make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
 # make lock             Pin the newest versions that pyproject.toml allows in requirements.lock.
-# Every target installs first what is missing, and makes again only what is out of date.
+# Every target first installs what is missing, and makes again only what is out of date.
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 RUN := runs/demo
@@ -14,7 +14,7 @@ TASK := ManiFeel-PegInsertion-v1
 TASK_ARGS := {"randomization": {"socket_xy": 0.025, "start_xy": 0.05, "start_z": 0.025, "start_rotation": 0.05, "in_hand_pitch": 0.0873}}
 READY := .venv/.ready
 WORKERS := $(shell nproc)
-# modules are compiled once, also where the shell forbids it, instead of anew in each of the many processes
+# keep compiled modules even if the shell forbids it, so that not every process compiles them again
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: setup demo data benchmark-smoke test lint types docs lock
@@ -62,7 +62,7 @@ types: $(READY)
 docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
 
-# for Python 3.10 to 3.12; uv is needed for this alone. --upgrade takes newer versions than those pinned before.
+# for Python 3.10 to 3.12; only this target needs uv. --upgrade takes newer versions than those that were pinned.
 EXTRAS := train report lerobot zarr audit study teleop spacemouse gamepad view docs dev
 lock:
 	uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-emit-index-url --no-annotate \

@@ -120,7 +120,7 @@ def _evaluate(name: str, env_id: str, demos: Path, folder: Path, args: Args) -> 
 
 
 def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
-    """Arguments that evaluate an untrained network: a checkpoint after one gradient step, whose first weights are drawn again."""
+    """Arguments that evaluate an untrained network: a checkpoint after one step, whose first weights are drawn again."""
     cameras = read_header(demos)["env_info"]["env_kwargs"]["cameras"]
     policy = policy_spec("diffusion_policy")
     sensing = ["--env-id", env_id, "--obs-mode", OBS_MODE, "--cameras", *cameras]

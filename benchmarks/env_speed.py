@@ -1,6 +1,6 @@
-"""Steps per second of one environment in one process, by what it observes: `python benchmarks/env_speed.py`.
+"""Steps per second of one environment in one process, for several observation modes: `python benchmarks/env_speed.py`.
 
-Beside it, in the same run, ManiSkill's own PegInsertionSide-v1 with its two cameras.
+The same run measures ManiSkill's own PegInsertionSide-v1 with its two cameras for comparison.
 """
 
 import cProfile
@@ -20,7 +20,8 @@ import manifeel_ms3  # noqa: F401
 from manifeel_ms3.rendering.backend import available_render_backend
 
 TARGETS = {"state": 150, "rgb": 50, "rgb+tacff": 35, "rgb+tacrgb+tacff": 25}
-PARTS = {  # where the time goes: functions by a part of their file's and their name
+"""Goal of each observation mode, in steps per second; set once."""
+PARTS = {
     "physics": [("~", "pysapien.step")],
     "rendering": [("~", "get_picture"), ("~", "take_picture"), ("~", "update_render")],
     "control": [("panda_gelsight", "pad_joint_forces"), ("agents/controllers.py", "set_action")],
@@ -28,20 +29,26 @@ PARTS = {  # where the time goes: functions by a part of their file's and their 
     "gel mechanics": [("contact.py", "solve_indentation"), ("touch_model.py", "_slide"), ("taxels.py", "forces")],
     "optics": [("optics.py", "surface"), ("optics.py", "shade")],
 }
+"""Functions that make up each part of a step, by a piece of the name of their file and of their own name."""
+WARM_UP, PROFILED = 10, 50
+"""Number of steps before the timed ones, and number of steps in the profile."""
+ACTION_SCALE = 0.3
+"""Largest component of the random actions, so that the arm stays near its start."""
 
 
 @dataclass
 class Args:
     steps: int = 200
-    """steps timed for each mode"""
+    """Number of steps that are timed in each observation mode."""
     env_id: str = "ManiFeel-PegInsertion-v1"
+    """Id of the task."""
 
 
-def steps_per_second(env: gym.Env, steps: int, scale: float) -> float:
+def steps_per_second(env: gym.Env, steps: int) -> float:
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-scale, scale, (steps, *env.unwrapped.single_action_space.shape)).astype(np.float32)
+    actions = rng.uniform(-ACTION_SCALE, ACTION_SCALE, (steps, *env.unwrapped.single_action_space.shape)).astype(np.float32)
     env.reset(seed=0)
-    for action in actions[:10]:
+    for action in actions[:WARM_UP]:
         env.step(action)
     begin = time.perf_counter()
     for action in actions:
@@ -50,7 +57,7 @@ def steps_per_second(env: gym.Env, steps: int, scale: float) -> float:
 
 
 def shares(env: gym.Env, steps: int) -> dict[str, float]:
-    """Share of a step's time by part."""
+    """Share of each part in the time of a step."""
     profile = cProfile.Profile()
     profile.enable()
     for _ in range(steps):
@@ -62,7 +69,7 @@ def shares(env: gym.Env, steps: int) -> dict[str, float]:
 
 
 def _time_in(stats: dict, file: str, name: str) -> float:
-    # the larger of two of a name: one calls the other
+    # where two functions match, one calls the other, and the larger time holds both
     return max((entry[3] for (path, _, function), entry in stats.items() if file in path and name in function), default=0.0)
 
 
@@ -72,15 +79,15 @@ def main(args: Args) -> None:
     table = Table("environment", "observes", "steps/s", "wanted", *PARTS)
     for mode, target in TARGETS.items():
         env = gym.make(args.env_id, obs_mode=mode, sim_backend="physx_cpu")
-        speed = steps_per_second(env, args.steps, scale=0.3)
-        parts = shares(env, 50)
+        speed = steps_per_second(env, args.steps)
+        parts = shares(env, PROFILED)
         table.add_row(args.env_id, mode, f"{speed:.0f}", f">= {target}", *(f"{100 * share:.0f} %" for share in parts.values()))
         env.close()
     if available_render_backend() != "none":
         stock = gym.make(
             "PegInsertionSide-v1", obs_mode="rgb", sim_backend="physx_cpu", render_backend=available_render_backend()
         )
-        speed = steps_per_second(stock, args.steps // 4, scale=0.3)
+        speed = steps_per_second(stock, args.steps // 4)
         table.add_row("PegInsertionSide-v1 (ManiSkill's)", "rgb, 2 x 128 x 128", f"{speed:.1f}", "")
     console.print(table)
 

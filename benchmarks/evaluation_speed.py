@@ -1,13 +1,13 @@
-"""Wall-clock time of evaluations, in turns, so that a change of the machine's speed meets all of them alike.
+"""Wall-clock time of evaluations, run in turns, so that changes of the machine's speed affect all of them alike.
 
     git clone . ../manifeel_at_721bfa4 && git -C ../manifeel_at_721bfa4 checkout 721bfa4
     python benchmarks/evaluation_speed.py --episodes 50 --workers 2 --rounds 2 --before ../manifeel_at_721bfa4
 
-evaluates Diffusion Policy on ball sorting with this code, once by the present rule and once with `--stop-at-success`, and with
-an older checkout of the repository, as its users would: with imports, the start of all processes, and the result file. Neither
-code reads the other's checkpoints. Each therefore evaluates the network of its own preset `cpu`, which one gradient step on the
-sample of demonstrations in its repository has made a checkpoint of, on images of 256 x 256 pixels. Compared are seconds, and
-seconds for each control step, since the rules and the time limits differ.
+evaluates Diffusion Policy on ball sorting three times: with this code to the time limit, with this code and
+`--stop-at-success`, and with an older checkout of the repository. Times include imports, the start of all processes, and the
+result file. Neither code reads the other's checkpoints. Each therefore evaluates a network of its own preset `cpu` after one
+gradient step on the sample of demonstrations in its repository, on images of 256 x 256 pixels. Total times and times for each
+control step are compared, since the ends of episodes and the time limits differ.
 """
 
 import json
@@ -31,12 +31,13 @@ CAMERA = "wrist"
 RENDERED = dict(sensor_configs=dict(width=256, height=256))
 """Arguments of the task in evaluation: the size of images that policies are trained on; those of the sample are smaller."""
 HERE = Path(__file__).parents[1]
+"""Root of this repository."""
 
 
 @dataclass
 class Args:
     checkpoint: Path | None = None
-    """Checkpoint folder of a policy that this code evaluates; the network of the preset `cpu`, untrained, if not given."""
+    """Checkpoint folder of a policy that this code evaluates; the untrained network of the preset `cpu` if not given."""
     before: Path | None = None
     """Root of a clone with 721bfa4 checked out, which evaluates its own preset `cpu`; left out if not given."""
     episodes: int = 50
@@ -72,9 +73,9 @@ def timed(root: Path, module: str, checkpoint: Path, args: Args, *flags: str) ->
 
 
 def untrained(root: Path, folder: Path) -> Path:
-    """The preset `cpu` of the code in a checkout, after one gradient step; flags have the names that both know."""
+    """A checkpoint of the preset `cpu` after one gradient step, made by the code in a checkout, with flags that both codes know."""
     recorded = (root / "data/sample" / TASK).glob("trajectory*.h5")
-    demos = max(recorded, key=lambda path: len(path.name))  # where there are two, the name of observations says more
+    demos = max(recorded, key=lambda path: len(path.name))  # of two files, the one with observations has the longer name
     command = [sys.executable, "baselines/diffusion_policy/train.py", "cpu", "--demos", str(demos.absolute()), "--env-id", TASK]
     command += ["--cameras", CAMERA, "--steps", "1", "--run-dir", str(folder)]
     environment = os.environ | dict(PYTHONPATH=str(root.absolute()), OMP_NUM_THREADS="1")

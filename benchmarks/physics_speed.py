@@ -1,7 +1,7 @@
-"""How fast each task is simulated: `python benchmarks/physics_speed.py`.
+"""Measures how fast each task is simulated: `python benchmarks/physics_speed.py`.
 
-Plays the sample demonstrations again, contacts and all, without observations. Prints multiples of real time: of the engine
-alone, and of whole steps (controller and measures, no reward).
+It plays the sample demonstrations again, with their contacts and without observations, and prints multiples of real time: of
+the engine alone, and of whole steps (with controller and measures, without rewards).
 """
 
 import time
@@ -24,11 +24,11 @@ from manifeel_ms3.tasks.registry import all_tasks
 @dataclass
 class Args:
     tasks: tuple[str, ...] = tuple(all_tasks())
-    """tasks to time"""
+    """Ids of the tasks."""
 
 
 def real_time_factors(task: str) -> tuple[float, float]:
-    """Simulated seconds a second: of the engine alone, of whole steps; all sample demonstrations together."""
+    """Simulated time over computing time of the engine alone, and of whole steps, over all sample demonstrations."""
     path = data_dir() / "sample" / task / STATES_FILE
     seconds = np.zeros(3)
     episodes = read_header(path)["episodes"]
@@ -41,7 +41,7 @@ def real_time_factors(task: str) -> tuple[float, float]:
 
 
 def seconds_of(task: str, seed: int, actions: np.ndarray) -> tuple[float, float, float]:
-    """What an episode simulates, and what it takes: the engine alone, whole steps."""
+    """Simulated time of an episode, and computing time of the engine alone and of whole steps, in s."""
     env = gym.make(task, obs_mode="none", reward_mode="none", render_backend="none")
     env.reset(seed=seed)
     scene, spent = env.unwrapped.scene, [0.0]

@@ -1,4 +1,4 @@
-"""Measures milliseconds per pad of the tactile sensor, alone and in batches, and its optics against a plain table look-up.
+"""Measures the tactile sensor's milliseconds per pad, alone and in batches, and compares its optics with a table look-up.
 
 Run `python benchmarks/tactile_speed.py` in the repository's root.
 """
@@ -24,7 +24,7 @@ from manifeel_ms3.sensors.optics.shader import KNOTS, Shader, fourier_terms, slo
 from manifeel_ms3.sensors.touch_model import TouchModel
 from manifeel_ms3.sensors.warp_device import use_torch_threads_for_warp
 
-MODES = {  # name: outputs and options of the sensor
+MODES = {  # outputs and options of the sensor, by name
     "TacFF": (("force_field",), {}),
     "TacRGB": (("rgb",), {}),
     "TacRGB + TacFF": (("rgb", "force_field"), {}),
@@ -38,8 +38,8 @@ MODES = {  # name: outputs and options of the sensor
         | {"imperfections.delay": 2},
     ),
 }
-PUSH = (0.5, 0.2, -5.0, 0.0, 0.0, 1e-3)  # N, N m
-TABLE_BINS = 125  # as TacSL's tables have
+PUSH = (0.5, 0.2, -5.0, 0.0, 0.0, 1e-3)  # wrench on each pad, N and N m
+TABLE_BINS = 125  # number of bins of each axis in TacSL's tables
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Args:
 
 
 def press(config: TactileSensorConfig, shape: trimesh.Trimesh, pads: int, device: torch.device) -> MeshRays:
-    """Rays of equal pads, each with the shape half a millimetre in its gel."""
+    """Rays of equal pads, each with the shape half a millimetre deep in its gel."""
     rays = MeshRays([[shape] * pads], config.gel.size, device, config.gel.max_sag)
     deep = torch.tensor([0.0, 0, -5e-4, 0, 0, 0, 1], device=device)
     rays.move(deep.expand(pads, 1, 7), torch.tensor([0.0, 0, 0, 0, 0, 0, 1], device=device).expand(pads, 7))

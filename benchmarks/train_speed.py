@@ -1,6 +1,6 @@
-"""Speed of the training loop beside a plain one: `python benchmarks/train_speed.py`.
+"""Speed of the training loop compared with a plain one: `python benchmarks/train_speed.py`.
 
-The plain loop is a usual first version: a DataLoader that makes one sample at a time, fp32, eager, library convolutions.
+The plain loop is what one would write first: a DataLoader that makes one sample at a time, fp32, eager, library convolutions.
 Both train the same Diffusion Policy with the paper's sizes on the same images, with two image encoders (camera and TacRGB).
 """
 
@@ -25,12 +25,14 @@ from baselines.common.dataset import Episode, SequenceDataset
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
 from baselines.common.memory import keep_freed_memory, lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
-from baselines.common.train_args import ON_GPU
+from baselines.common.train_args import ON_GPU, TrainArgs
 from baselines.common.unet import SequenceConv
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
+from baselines.diffusion_policy.train import LR
 
 RNG = np.random.default_rng(0)
 WARM_UP = 2
+"""Number of gradient steps before the timed ones."""
 
 
 @dataclass
@@ -56,6 +58,7 @@ class Args:
 
 
 SPEC_SENSORS = ("rgb+tacrgb", ("wrist",), ("right",))
+"""Observation mode, cameras and pads of the policy."""
 
 
 def random_episodes(spec, count: int, length: int) -> list[Episode]:
@@ -71,7 +74,7 @@ def random_episodes(spec, count: int, length: int) -> list[Episode]:
 
 
 class PlainDataset(Dataset):
-    """Samples one by one, images as floats."""
+    """Makes samples one by one, with images as floats."""
 
     def __init__(self, data: SequenceDataset):
         self.data = data
@@ -88,8 +91,8 @@ def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> It
     for module in policy.modules():
         if isinstance(module, SequenceConv):
             module.forward = MethodType(nn.Conv1d.forward, module)
-    optimizer = torch.optim.AdamW(policy.parameters(), 8e-5, foreach=False)
-    ema = EMAModel(policy.parameters(), power=0.75)
+    optimizer = torch.optim.AdamW(policy.parameters(), LR, foreach=False)
+    ema = EMAModel(policy.parameters(), power=TrainArgs.ema_power)
     for obs, actions in cycle(DataLoader(PlainDataset(data), args.batch_size, shuffle=True)):
         loss = policy({key: value.to(args.device) for key, value in obs.items()}, actions.to(args.device))
         optimizer.zero_grad()
@@ -101,14 +104,14 @@ def plain_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> It
 
 
 def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iterator[None]:
-    """What `baselines.common.training` does between two entries of the log."""
+    """The gradient steps of `baselines.common.training`, without its log and checkpoints."""
     keep_freed_memory(args.device)
     lay_out_channels_last(policy)
     if args.compile:
         policy.encoder.compile()
         policy.action_network.compile()
-    optimizer = torch.optim.AdamW(policy.parameters(), 8e-5, fused=True)
-    ema = EMAModel(policy.parameters(), power=0.75, foreach=True)
+    optimizer = torch.optim.AdamW(policy.parameters(), LR, fused=True)
+    ema = EMAModel(policy.parameters(), power=TrainArgs.ema_power, foreach=True)
     precision = torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16")
     while True:
         batch = torch.randperm(len(data))[: args.batch_size].to(args.device)

@@ -2,9 +2,9 @@
 
 `train_rgbd.py` of ManiSkill's `examples/baselines/diffusion_policy` reads a file with its `load_demo_dataset` and then turns
 each observation into `rgb` and `state` with a function `obs_process_fn`. Ours is below. Put it into that script, and wrap the
-environments of its `make_eval_envs` as `FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env))`, which makes the same `rgb`
-and `state` of what the policy observes: images of pads become channels of `rgb`, in the size of the cameras' images, and force
-fields become a part of `state`.
+environments of its `make_eval_envs` as `FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env))`, which makes `rgb` and
+`state` in the same way: images of pads become channels of `rgb`, in the size of the cameras' images, and force fields become a
+part of `state`.
 """
 
 import logging
@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.wrappers import resized
 
-OBS_HORIZON, PRED_HORIZON = 2, 16  # those of ManiSkill's script
+OBS_HORIZON, PRED_HORIZON = 2, 16  # the defaults of ManiSkill's script
 
 
 def leaves(tree):

@@ -12,12 +12,12 @@ from threading import Lock
 
 import numpy as np
 
-MAX_EPISODES = 64  # so many processes can run episodes at the same time; older episodes are forgotten
-MAX_BODY = 2**28  # bytes of the observations of one step
+MAX_EPISODES = 64  # number of episodes that can run at the same time; older ones are forgotten
+MAX_BODY = 2**28  # largest size of the observations of one step, bytes
 
 
 class MyPolicy:
-    """Replace this policy, which only moves downwards, by your own. There is one object for each episode; load weights once,
+    """Replace this policy, which only moves downwards, with your own. There is one object for each episode; load weights once,
     outside of the class."""
 
     def __init__(self):
@@ -29,8 +29,8 @@ class MyPolicy:
 
 
 class Handler(BaseHTTPRequestHandler):
-    timeout = 60  # s that a client may keep silent
-    policies = OrderedDict()  # noqa: RUF012  (by the name of the episode, which the header X-Episode has; the latest is the last)
+    timeout = 60  # longest silence of a client, s
+    policies = OrderedDict()  # noqa: RUF012  (by the name of the episode in the header X-Episode, the latest last)
     lock = Lock()  # one policy is asked at a time
 
     def do_POST(self):

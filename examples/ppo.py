@@ -1,8 +1,8 @@
 """PPO on joint states and touch, with the arguments of ManiSkill's `ppo.py`: `python examples/ppo.py`.
 
-The observation is a vector of the state and of the right pad's force field; `FlattenVisuotactileObservationWrapper` makes it.
-Each environment simulates on the CPU in a process of its own. ManiSkill's own `ppo.py` needs the two wrappers of `WRAPPERS` and
-nothing else to do the same on a GPU.
+The observation is a vector of the state and of the right pad's force field, made by `FlattenVisuotactileObservationWrapper`.
+Each environment simulates on the CPU in a process of its own. To do the same on a GPU, ManiSkill's own `ppo.py` needs the two
+wrappers of `WRAPPERS` and nothing else.
 """
 
 import json
@@ -25,11 +25,23 @@ from torch.distributions import Normal
 from torch.utils.tensorboard import SummaryWriter
 
 import manifeel_ms3  # noqa: F401  (registers the tasks)
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper
 
 WRAPPERS = (partial(FlattenVisuotactileObservationWrapper, flat_tacff=True), FlattenObservationWrapper)
 EASY = dict(socket_xy=0.0, start_xy=0.02, start_z=0.0, start_rotation=0.0, in_hand_pitch=0.0)
-"""The peg starts upright, up to 20 mm beside a socket that stays where it is."""
+"""Ranges with which the peg starts upright, up to 20 mm beside a socket that stays where it is."""
+HIDDEN = 256
+"""Number of features of each hidden layer, as in ManiSkill's ppo.py."""
+ACTOR_GAIN, CRITIC_GAIN = 0.01, 1.0
+"""Gains of the orthogonal initial weights of the last layers; small for the actor, so that actions start near 0."""
+FIRST_LOGSTD = -1.6
+"""Logarithm of the actions' standard deviation (0.2) before training; set once, not tuned."""
+FIRST_COUNT, VARIANCE_EPS, MAX_OBS = 1e-4, 1e-4, 5.0
+"""Count with which the running normalisation of observations begins, number that is added to their variance, and limit of
+normalised observations; set once, not tuned."""
+ADAM_EPS, ADVANTAGE_EPS = 1e-5, 1e-8
+"""Epsilon of Adam, and number that is added to the standard deviation of advantages, as in ManiSkill's ppo.py."""
 
 
 @dataclass
@@ -37,7 +49,7 @@ class Args:
     env_id: str = "ManiFeel-PegInsertion-v1"
     """Id of the task."""
     env_kwargs: str = json.dumps(dict(randomization=EASY, max_episode_steps=40))
-    """Arguments of the task as json. By default it is easier than the paper's: see EASY, with short episodes."""
+    """Arguments of the task as json. By default the task is easier than the paper's (see EASY) and its episodes are short."""
     obs_mode: str = "state+tacff"
     """Observation mode."""
     exp_name: str = "ppo"
@@ -55,7 +67,7 @@ class Args:
     learning_rate: float = 3e-4
     """Learning rate of Adam."""
     num_envs: int = 4
-    """Number of environments, each in a process."""
+    """Number of environments, each in a process of its own."""
     num_eval_envs: int = 2
     """Number of environments of an evaluation."""
     num_eval_steps: int = 80
@@ -75,13 +87,13 @@ class Args:
     update_epochs: int = 8
     """Number of epochs of an update."""
     clip_coef: float = 0.2
-    """Clipping of the ratio of probabilities."""
+    """Largest difference of the probability ratio from 1 before it is clipped."""
     vf_coef: float = 0.5
-    """Weight of the value's loss."""
+    """Weight of the loss of the critic."""
     max_grad_norm: float = 0.5
     """Largest norm of a gradient."""
     target_kl: float = 0.1
-    """Divergence of the policy from the one that collected the data at which an update ends."""
+    """Largest Kullback-Leibler divergence between the policy and the one that collected the data; beyond it an update ends."""
 
 
 class Agent(nn.Module):
@@ -89,18 +101,18 @@ class Agent(nn.Module):
 
     def __init__(self, num_obs: int, num_actions: int):
         super().__init__()
-        self.critic, actor = (self.mlp(num_obs, out, std) for out, std in ((1, 1.0), (num_actions, 0.01)))
+        self.critic, actor = (self.mlp(num_obs, out, gain) for out, gain in ((1, CRITIC_GAIN), (num_actions, ACTOR_GAIN)))
         self.actor_mean = actor
-        self.actor_logstd = nn.Parameter(torch.full((1, num_actions), -1.6))
+        self.actor_logstd = nn.Parameter(torch.full((1, num_actions), FIRST_LOGSTD))
         self.register_buffer("mean", torch.zeros(num_obs))
         self.register_buffer("var", torch.ones(num_obs))
-        self.register_buffer("count", torch.tensor(1e-4))
+        self.register_buffer("count", torch.tensor(FIRST_COUNT))
 
     @staticmethod
-    def mlp(num_in: int, num_out: int, last_std: float) -> nn.Sequential:
-        layers = [nn.Linear(a, b) for a, b in ((num_in, 256), (256, 256), (256, num_out))]
-        for layer, std in zip(layers, (2**0.5, 2**0.5, last_std), strict=True):
-            nn.init.orthogonal_(layer.weight, std)
+    def mlp(num_in: int, num_out: int, last_gain: float) -> nn.Sequential:
+        layers = [nn.Linear(a, b) for a, b in ((num_in, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, num_out))]
+        for layer, gain in zip(layers, (2**0.5, 2**0.5, last_gain), strict=True):
+            nn.init.orthogonal_(layer.weight, gain)
             nn.init.zeros_(layer.bias)
         return nn.Sequential(layers[0], nn.Tanh(), layers[1], nn.Tanh(), layers[2])
 
@@ -113,7 +125,7 @@ class Agent(nn.Module):
         self.count = total
 
     def normalized(self, obs: torch.Tensor) -> torch.Tensor:
-        return ((obs - self.mean) / (self.var + 1e-4).sqrt()).clamp(-5, 5)
+        return ((obs - self.mean) / (self.var + VARIANCE_EPS).sqrt()).clamp(-MAX_OBS, MAX_OBS)
 
     def value(self, obs: torch.Tensor) -> torch.Tensor:
         return self.critic(self.normalized(obs))[:, 0]
@@ -141,21 +153,21 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 @torch.no_grad()
 def evaluate(args: Args, agent: Agent, envs: AsyncVectorEnv) -> dict[str, float]:
-    """Mean metrics of the episodes of the mean action, which run to the time limit."""
-    obs, _ = envs.reset(seed=100_000)
+    """Mean metrics of episodes of the policy's mean actions, which run to the time limit."""
+    obs, _ = envs.reset(seed=FIRST_EVALUATION_SEED)
     episodes = []
     for _ in range(args.num_eval_steps):
         obs, _, _, truncated, infos = envs.step(agent.distribution(tensor(obs)).mean.clamp(-1, 1).numpy())
         if truncated.all():
             episodes.append(infos["final_info"]["episode"])
     if not episodes:
-        raise SystemExit(f"no episode ends in num_eval_steps={args.num_eval_steps}; give max_episode_steps or more")
+        raise SystemExit(f"no episode ends in num_eval_steps={args.num_eval_steps}; give at least max_episode_steps")
     names = [name for name in episodes[0] if not name.startswith("_")]
     return {f"eval/{name}": float(np.mean([episode[name] for episode in episodes])) for name in names}
 
 
 class Rollout:
-    """What the environments did between two updates; every array is (T, N, ...)."""
+    """The steps of all environments between two updates; every array is (T, N, ...): T steps of N environments."""
 
     def __init__(self, args: Args, envs: AsyncVectorEnv):
         shape = (args.num_steps, args.num_envs)
@@ -183,7 +195,7 @@ class Rollout:
         return obs, successes
 
     def advantages(self, args: Args, next_value: torch.Tensor) -> torch.Tensor:
-        """Generalized advantage estimation; an episode that ended is continued by the value of its last observation."""
+        """Generalized advantage estimates (T, N); the return after an episode's end is the value of its last observation."""
         advantages, last = torch.zeros_like(self.rewards), torch.zeros(args.num_envs)
         for t in reversed(range(args.num_steps)):
             following = next_value if t == args.num_steps - 1 else self.values[t + 1]
@@ -194,7 +206,7 @@ class Rollout:
 
 
 def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: Rollout, advantages: torch.Tensor) -> dict:
-    """Improve actor and critic on a rollout, and return what is logged."""
+    """Improve actor and critic on a rollout, and return the scalars to log."""
     returns = (advantages + rollout.values).flatten()
     obs, actions = rollout.obs.flatten(0, 1), rollout.actions.flatten(0, 1)
     old_logprobs, advantages = rollout.logprobs.flatten(), advantages.flatten()
@@ -207,7 +219,7 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: 
             divergence = ((ratio - 1) - logratio).mean().item()
             if divergence > args.target_kl:
                 return losses
-            advantage = (advantages[batch] - advantages[batch].mean()) / (advantages[batch].std() + 1e-8)
+            advantage = (advantages[batch] - advantages[batch].mean()) / (advantages[batch].std() + ADVANTAGE_EPS)
             clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
             policy_loss = -torch.min(advantage * ratio, advantage * clipped).mean()
             value_loss = 0.5 * (agent.value(obs[batch]) - returns[batch]).square().mean()
@@ -224,7 +236,7 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: 
 def train(args: Args, agent: Agent, envs: AsyncVectorEnv, eval_envs: AsyncVectorEnv, folder: Path) -> dict[str, float]:
     """Train an agent, and return the metrics of the last evaluation."""
     writer, log = SummaryWriter(str(folder)), (folder / "log.jsonl").open("w")
-    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=1e-5)
+    optimizer = torch.optim.Adam(agent.parameters(), args.learning_rate, eps=ADAM_EPS)
     rollout, (obs, _), begin, metrics = Rollout(args, envs), envs.reset(seed=args.seed), time.time(), {}
     if not args.checkpoint:
         agent.watch(tensor(obs))

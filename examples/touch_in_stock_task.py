@@ -27,7 +27,7 @@ class TouchPickCubeEnv(PickCubeEnv):
     def _get_obs_extra(self, info):
         self.touch.capture()
         touch = self.touch.get_obs()
-        if self.obs_mode == "state":  # which is a vector
+        if self.obs_mode == "state":  # this mode needs vectors
             touch = dict(force_field=touch["force_field"].flatten(1))
         return super()._get_obs_extra(info) | touch
 

@@ -7,10 +7,10 @@ set -euo pipefail
 
 TORCH_VERSION=2.13.0
 TORCH_CPU_INDEX=https://download.pytorch.org/whl/cpu
-MIN_MESA=24.3 # lavapipe has what SAPIEN asks for from here on
+MIN_MESA=24.3 # the first version whose lavapipe has all that SAPIEN needs
 WITHOUT_PICTURES="only what needs no rendered image works: obs_mode='state' or 'tacff' with render_backend='none'."
 
-DEBIAN_MIRROR=http://deb.debian.org/debian/ # where the machine's sources name no mirror
+DEBIAN_MIRROR=http://deb.debian.org/debian/ # used if the machine's sources name no mirror
 DEBIAN_KEYRING=/usr/share/keyrings/debian-archive-keyring.gpg
 BACKPORTS=/etc/apt/sources.list.d/manifeel-backports.list
 
@@ -25,7 +25,7 @@ LAVAPIPE_URLS=(
 
 say() { printf '\033[1m%s\033[0m\n' "$*"; }
 has_gpu() { command -v nvidia-smi >/dev/null 2>&1 && nvidia-smi -L >/dev/null 2>&1; }
-# Asks for the library, since the package that holds it has another name from release to release. The list is read as a whole:
+# Asks for the library, since the name of its package changes from release to release. The list is read as a whole:
 # a pipe into `grep -q` ends early, so that under pipefail a library that is there would count as missing.
 LIBRARIES=
 has_library() {
@@ -59,20 +59,20 @@ debians_mirror() {
   done <<<"$(apt-get indextargets --format '$(CREATED_BY)|$(RELEASE)|$(COMPONENT)|$(ORIGIN)|$(REPO_URI)')"
 }
 
-add_mesa_source() { # a release of Mesa that is new enough, where the system's own is not
+add_mesa_source() { # for a newer Mesa, where the system's own is too old
   # shellcheck source=/dev/null
   . "$OS_RELEASE"
   [ "$ID-$VERSION_ID" = debian-12 ] || return 0
-  as_root rm -f "$BACKPORTS" # of an earlier run
+  as_root rm -f "$BACKPORTS" # left by an earlier run
   if [ -z "$(debians_mirror bookworm-backports)" ]; then
     local uri
     uri=$(debians_mirror bookworm)
     # what it offers counts only if Debian has signed it, whoever serves it
     echo "deb [signed-by=$DEBIAN_KEYRING] ${uri:-$DEBIAN_MIRROR} bookworm-backports main" | as_root tee "$BACKPORTS" >/dev/null
-    # this source alone: whether one of the others fails says nothing about it
+    # update this source alone, because a failure of another one says nothing about it
     if ! as_root apt-get update -q -o APT::Update::Error-Mode=any -o Dir::Etc::sourcelist="$BACKPORTS" \
       -o Dir::Etc::sourceparts=- -o APT::Get::List-Cleanup=0; then
-      say "Debian's backports cannot be had from ${uri:-$DEBIAN_MIRROR}"
+      say "Debian's backports cannot be fetched from ${uri:-$DEBIAN_MIRROR}"
       as_root rm -f "$BACKPORTS"
       return 1
     fi
@@ -103,7 +103,7 @@ install_system_packages() {
     has_library "${pair%%:*}" || missing+=("${pair##*:}")
   done
   python3 -c 'import ensurepip, venv' 2>/dev/null || missing+=(python3-venv)
-  # the leaderboard's page is tried in a browser; Ubuntu's package is a snap, which containers do not run
+  # tests open the leaderboard's page in a browser; Ubuntu's package is a snap, which containers do not run
   has_browser || ! grep -q '^ID=debian' "$OS_RELEASE" || missing+=(chromium)
   local mesa=true
   has_gpu || new_enough_mesa || mesa=false
@@ -129,7 +129,7 @@ install_system_packages() {
 # CPU and for CUDA are different files, so that one lock with hashes cannot name both.
 install_python_packages() {
   [ -x .venv/bin/python ] || python3 -m venv .venv
-  # nothing is compiled ahead: a module is compiled when it is first imported, and most of them never are
+  # nothing is compiled in advance: a module is compiled at its first import, and most modules are never imported
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
   if [ "$(.venv/bin/python -c 'import torch; print(torch.__version__.partition("+")[0])' 2>/dev/null)" != "$TORCH_VERSION" ]; then
     say "Installing torch"
@@ -137,7 +137,7 @@ install_python_packages() {
       "${pip[@]}" "torch==$TORCH_VERSION"
     else
       "${pip[@]}" "torch==$TORCH_VERSION+cpu" 2>/dev/null || "${pip[@]}" --index-url "$TORCH_CPU_INDEX" "torch==$TORCH_VERSION" ||
-        { say "$TORCH_CPU_INDEX cannot be reached: PyPI's torch, larger, for GPUs, is taken instead" && "${pip[@]}" "torch==$TORCH_VERSION"; }
+        { say "$TORCH_CPU_INDEX cannot be reached; installing the larger torch for GPUs from PyPI instead" && "${pip[@]}" "torch==$TORCH_VERSION"; }
     fi
   fi
   say "Installing the packages of requirements.lock"
