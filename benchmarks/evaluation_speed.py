@@ -73,7 +73,7 @@ def timed(root: Path, module: str, checkpoint: Path, args: Args, *flags: str) ->
 
 
 def untrained(root: Path, folder: Path) -> Path:
-    """A checkpoint of the preset `cpu` after one gradient step, made by the code in a checkout, with flags that both codes know."""
+    """A checkpoint of the preset `cpu` after one gradient step, made by the code in a checkout with flags that both know."""
     recorded = (root / "data/sample" / TASK).glob("trajectory*.h5")
     demos = max(recorded, key=lambda path: len(path.name))  # of two files, the one with observations has the longer name
     command = [sys.executable, "baselines/diffusion_policy/train.py", "cpu", "--demos", str(demos.absolute()), "--env-id", TASK]

@@ -57,7 +57,7 @@ class Browser:
                 return answer["result"]
 
     def evaluate(self, expression: str) -> Any:
-        """What some JavaScript comes to."""
+        """The value of a JavaScript expression."""
         return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
 
     @property
@@ -65,7 +65,7 @@ class Browser:
         return self.evaluate("document.body.innerText") or ""
 
     def press(self, key: str, code: str, number: int, times: int = 1) -> None:
-        """A key, held down for so many repeats."""
+        """Hold a key down for a number of repeats."""
         event = dict(key=key, code=code, windowsVirtualKeyCode=number)
         for repeat in range(times):
             self.call("Input.dispatchKeyEvent", type="keyDown", autoRepeat=repeat > 0, **event)
@@ -73,7 +73,7 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyUp", **event)
 
     def click(self, label: str) -> None:
-        """A button, by its text."""
+        """Click the button that has this text."""
         found = self.evaluate(
             f"(() => {{const b = [...document.querySelectorAll('button')].find(b => b.innerText.trim() == {json.dumps(label)});"
             " if (b) b.click(); return !!b})()"
@@ -87,5 +87,5 @@ class Browser:
 def wait_until(condition, seconds: float = 60.0) -> None:
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "it did not come to that"
+        assert time.monotonic() < end, "the condition did not become true in time"
         time.sleep(0.1)

@@ -1,6 +1,7 @@
-"""Shared fixtures. Tests run on the real simulator; those that need a picture are skipped only where no renderer can be had."""
+"""Shared fixtures. Tests run on the real simulator; those that need images are skipped only where there is no renderer."""
 
 from collections import Counter
+from pathlib import Path
 
 import gymnasium as gym
 import pytest
@@ -8,13 +9,20 @@ import torch
 
 import manifeel_ms3  # noqa: F401
 from tests.tasks_and_marks import PEG
+from tests.tiny_study import TINY
 
 torch.set_num_threads(1)
-LONG = ("test_studies", "test_extending", "test_end_to_end", "test_doctor", "test_page")  # few tests of minutes each
+LONG = (
+    "test_studies",
+    "test_extending",
+    "test_end_to_end",
+    "test_doctor",
+    "test_page",
+)  # files with a few tests of minutes each
 
 
 def pytest_collection_modifyitems(items):
-    """Long files first, so that at the end no process waits for one; tests marked `gpu` are skipped where there is none."""
+    """Run long files first, so that no process waits for one at the end; skip tests marked `gpu` where there is none."""
     items.sort(key=lambda item: item.path.stem not in LONG)
     if not torch.cuda.is_available():
         for item in items:
@@ -24,7 +32,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="module")
 def make_env():
-    """gym.make that closes what it made."""
+    """A `gym.make` whose environments are closed after the tests of a module."""
     made = []
 
     def make(env_id: str = PEG, **kwargs):
@@ -38,8 +46,16 @@ def make_env():
 
 
 @pytest.fixture
+def study(tmp_path) -> Path:
+    """File of the tiny study."""
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY)
+    return path
+
+
+@pytest.fixture
 def figure(record_property):
-    """Hold a measured figure against its bound; the end of the run names the worst of each."""
+    """Compare a measured number with its bound; the end of the test run reports the worst of each kind."""
 
     def check(what: str, value: float, at_most: float | None = None, at_least: float | None = None) -> None:
         record_property("figure", [what, float(value), at_most, at_least])

@@ -1,4 +1,4 @@
-"""Made-up outcomes of episodes, which contradict nothing."""
+"""Made-up outcomes of episodes, without contradictions."""
 
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 

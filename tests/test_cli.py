@@ -64,7 +64,7 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
 
 
 SAYS_IT_ALL = {"tasks", "doctor", "view", "teleop"}
-"""Commands that make nothing, or whose page or window says what they make."""
+"""Commands that make nothing, or whose page or window itself says what they make."""
 
 
 @pytest.mark.parametrize("name", sorted(cli.all_commands()))

@@ -1,4 +1,4 @@
-"""The site builds without a warning, and every command that it shows is one, with flags that exist; all of them run, too."""
+"""The site builds without a warning, and every shown command exists, has flags that exist, and runs."""
 
 import importlib.util
 import json
@@ -52,7 +52,7 @@ def command_of(words: list[str]) -> list[str]:
 
 
 @pytest.mark.parametrize("line", SHOWN)
-def test_a_command_that_is_shown_is_one(line, capsys):
+def test_a_shown_command_and_its_flags_exist(line, capsys):
     words = shlex.split(line, comments=True)
     name, *arguments = command_of(words)
     if name in cli.all_commands():
@@ -94,7 +94,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
 
 # -------------------------------------------------------------------- run, page by page
 
-SMALLER = {  # what follows a command, by its name or module: of a flag the last counts, and what takes hours takes seconds
+SMALLER = {  # flags appended to a command, by its name or module, to make hours seconds; the last of a repeated flag counts
     "record": "-n 1 --cameras wrist --tactile-sensors right",
     "dataset": "--num 10 --tasks ManiFeel-BallSorting-v1 --cameras front --tactile-sensors right --image-size 64",
     "render-observations": "--num 1 --image-size 64",
@@ -166,7 +166,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, shelf, tmp_path):
 
 
 def _spelled_out(line: str, place: Path) -> list[str]:
-    """A line as it stands; of a make target, what it would run."""
+    """The line itself, or the commands that a make target would run."""
     if not line.startswith("make"):
         return [re.sub(r"\s+#.*", "", line)]
     said = subprocess.check_output(["make", "--dry-run", line.split()[1]], cwd=place, text=True)
@@ -191,7 +191,7 @@ def _run(command: str, place: Path) -> None:
 
 
 def _prepare_submission(place: Path) -> None:
-    """A policy that learnt nothing, and its 50 starts, of a few steps each."""
+    """Train a policy for two steps, and evaluate it on 50 initial states with a few steps each."""
     flags = "--demo-path peg.h5 --obs-mode tacff --run-dir runs/x --overwrite"
     _run(f"python baselines/diffusion_policy/train.py cpu {flags}", place)
     (place / "my_submission").mkdir()

@@ -1,4 +1,4 @@
-"""What the documentation shows, works."""
+"""The examples work as the documentation says."""
 
 import importlib.util
 import json

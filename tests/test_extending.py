@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from tests.tasks_and_marks import PEG, needs_renderer
-from tests.third_party import install
+from tests.third_party import entry_points_of, install
 
 REPOSITORY = Path(__file__).parents[1]
 PAGE = (REPOSITORY / "docs/extending.md").read_text()
@@ -39,7 +39,7 @@ def done(site: Path, *arguments: object) -> str:
 
 
 def refusal(site: Path, *arguments: object) -> str:
-    """The only line with which a command refuses, after "error: "."""
+    """The line with which a command refuses; it begins with "error: "."""
     ran = manifeel(site, *arguments)
     assert ran.returncode == 1, ran.stdout + ran.stderr
     assert "Traceback" not in ran.stderr
@@ -54,8 +54,7 @@ def site(tmp_path_factory) -> Path:
     files = dict(re.findall(r"```python\n# (my_package/\w+\.py)\n(.*?)```", PAGE, flags=re.DOTALL))
     assert set(files) == {f"my_package/{name}.py" for name in ("lift_block", "encoders", "regression", "count")}
     (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", PAGE, flags=re.DOTALL)
-    entry_points = re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', "")
-    install(site, files=files | {"my_package/__init__.py": ""}, entry_points=entry_points)
+    install(site, files=files | {"my_package/__init__.py": ""}, entry_points=entry_points_of(toml))
     return site
 
 

@@ -1,4 +1,4 @@
-"""The order of the packages is kept by a check that can fail; functions and files stay small enough to be read."""
+"""Imports keep to the layers of the packages, and functions and files stay small enough to be read."""
 
 import ast
 import shutil
@@ -20,7 +20,7 @@ def check_imports(folder: Path) -> subprocess.CompletedProcess:
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory) -> Path:
-    """The packages, and the contracts that they keep."""
+    """A copy of the packages and of the contracts about their imports."""
     folder = tmp_path_factory.mktemp("house")
     for package in PACKAGES:
         shutil.copytree(REPOSITORY / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))

@@ -19,7 +19,7 @@ OTHER = "ManiFeel-ObjectSearch-v1"
 
 
 def rewards(env: gym.Env, steps: int = STEPS):
-    """Of a short episode, one by one."""
+    """Rewards of a short episode, one by one."""
     env.reset(seed=3)
     for t in range(steps):
         action = np.full(env.action_space.shape, 0.2 * (-1) ** t, np.float32)

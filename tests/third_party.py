@@ -1,4 +1,4 @@
-"""A package of somebody else, installed."""
+"""Installs a package of a third party."""
 
 import re
 from pathlib import Path
@@ -7,7 +7,7 @@ PAGE = Path(__file__).parents[1] / "docs/sensor.md"
 
 
 def install(site: Path, *, name: str = "my_package", files: dict[str, str] | None = None, entry_points: str = "") -> None:
-    """What `pip install` leaves behind: the package's modules and a dist-info folder with its entry points."""
+    """Write what `pip install` would: the package's modules, and a dist-info folder with its entry points."""
     for path, code in (files or {}).items():
         (site / path).parent.mkdir(parents=True, exist_ok=True)
         (site / path).write_text(code)
@@ -22,4 +22,9 @@ def own_sensor() -> tuple[str, str]:
     text = PAGE.read_text()
     (toml,) = re.findall(r"```toml\n# pyproject.toml\n(.*?)```", text, flags=re.DOTALL)
     (module,) = re.findall(r"```python\n# my_sensors.py\n(.*?)```", text, flags=re.DOTALL)
-    return re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', ""), module
+    return entry_points_of(toml), module
+
+
+def entry_points_of(toml: str) -> str:
+    """The entry points in a pyproject.toml, in the form of entry_points.txt."""
+    return re.sub(r'\[project\.entry-points\."(.*?)"\]', r"[\1]", toml).replace('"', "")

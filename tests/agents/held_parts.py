@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 
 import manifeel_ms3  # noqa: F401
 
-GRIP = 20.0  # N, of each pad, on parts that the task itself does not put into the hand
+GRIP = 20.0  # N, force of each pad on parts that the task itself does not put into the hand
 BALL_INDENTATION, BATTERY_INDENTATION = 2.5e-3, 6e-4  # m, under that grip
 PUSHER = (0.005, 0.003, 0.001)  # m, half size: it fits between the pads
 PUSHER_SPEED, APPROACH_SPEED, PUSHER_START = 0.012, 0.05, 0.045  # m/s, m/s, m beside the tool
-TURNED, SHIFTED = np.deg2rad(10.0), 2e-3  # rad, m: the push ends where the part has slipped so far
+TURNED, SHIFTED = np.deg2rad(10.0), 2e-3  # rad, m: slips at which the push ends
 FLAT_TORQUE_RATE, ROUND_TORQUE_RATE = 0.2, 0.02  # N m/s: about two seconds to the slip
-SLIPPED, MOST_TORQUE = np.deg2rad(1.0), 1.5  # rad, after which it slips for good; N m
+SLIPPED, MOST_TORQUE = np.deg2rad(1.0), 1.5  # rotation from which on the part slips, rad; largest torque, N m
+CREEP_SHARE = 0.9  # torque of the test of creep, as a share of the slip torque
 RAMP, CREEP_TIME, REST = 0.5, 1.0, 0.5  # s
 
 
@@ -34,7 +35,7 @@ class Kind:
     lever: float
     """Distance of the place that is pushed from the pads' middle, along the fingers, in m."""
     half_width: float | None = None
-    """Half the width that the pads close on, in m, of a part that does not start in the hand, with the gels' indentation."""
+    """Half the distance between the pads, in m, on a part that does not start in the hand, with the gels indented."""
     grip: float = GRIP
     """Force of each pad, in N, with which the task holds it."""
     is_round: bool = False
@@ -96,7 +97,7 @@ class HeldPart:
         return self._body.mass
 
     def run(self, seconds: float, torque: float = 0.0) -> None:
-        """Simulate, with a torque of the world on the part about the closing axis, in N m."""
+        """Simulate, with an external torque on the part about the closing axis, in N m."""
         closing = self._tool()[1].apply([0.0, 1.0, 0.0])
         for _ in range(round(seconds * self.rate)):
             if torque:
@@ -112,7 +113,7 @@ class HeldPart:
         return torque
 
     def creep(self, torque: float) -> float:
-        """Rotation in the hand, in rad, in a second under a steady torque, after it has been laid on and taken up."""
+        """Rotation in the hand, in rad, in a second under a steady torque that was applied slowly before."""
         for step in range(round(RAMP * self.rate)):
             self.run(1 / self.rate, torque * step / (RAMP * self.rate))
         self.run(REST, torque)
@@ -121,10 +122,10 @@ class HeldPart:
         return abs(self.turned - before)
 
     def push(self) -> tuple[float, float, float, float]:
-        """Push the part near its end with an edge until it has slipped, and take the edge away.
+        """Push the part near its end with an edge until it has slipped, and remove the edge.
 
         Returns:
-            Rotation in the hand, in rad, and displacement between the pads, in m, of the slip; and how much of each goes back.
+            Rotation in the hand, in rad, and displacement between the pads, in m, of the slip; and how much of each is undone.
         """
         scene, (tool, facing) = self.env.scene.sub_scenes[0], self._tool()
         along = facing.apply([1.0, 0.0, 0.0])
@@ -184,7 +185,7 @@ def main(seeds: range = range(3)) -> None:
             part.reset(seed)
             torque = part.slip_torque()
             part.reset(seed)
-            creep = part.creep(0.9 * torque)
+            creep = part.creep(CREEP_SHARE * torque)
             part.reset(seed)
             *_, angle, distance = part.push()
             rows.append((torque, np.rad2deg(creep), np.rad2deg(angle), 1e3 * distance))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from .held_parts import GRIP, KINDS, HeldPart
+from .held_parts import CREEP_SHARE, GRIP, KINDS, HeldPart
 
 QUICK = ("peg", "golf ball")
 LEAST_FLAT, LEAST_ROUND = 0.15, 0.04
@@ -27,7 +27,7 @@ def test_slips_at_the_torque_of_a_gel_and_not_below(part, figure):
     figure("slip torque at 20 N, N m", at_20_newtons, at_most=0.55)
     figure("least slip torque at 20 N, N m", at_20_newtons, at_least=LEAST_ROUND if part.kind.is_round else LEAST_FLAT)
     part.reset(0)
-    figure("creep at 90 % of the slip torque, degrees/s", np.rad2deg(part.creep(0.9 * torque)), at_most=0.05)
+    figure("creep at 90 % of the slip torque, degrees/s", np.rad2deg(part.creep(CREEP_SHARE * torque)), at_most=0.05)
 
 
 def test_stays_where_it_was_pushed_to(part, figure):

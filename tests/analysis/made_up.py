@@ -9,11 +9,17 @@ import numpy as np
 
 from baselines.common.checkpoint import as_json
 from baselines.registry import policy_spec
+from manifeel_ms3.analysis import results_page
 from manifeel_ms3.evaluation.result import result_of
 from manifeel_ms3.tasks.registry import evaluation_seeds, full_id, task_spec
 from tests.outcomes import made_up
 
 TOTAL_STEPS = 50_000
+
+
+def page_of(results: Path, page: Path | None = None) -> str:
+    """The page of the results in a folder, which is written into the same folder unless another path is given."""
+    return results_page.main(results_page.Args((results,), page or results / "results.md")).read_text()
 
 
 def config_of(policy: str, preset: str, task: str, mode: str, seed: int, encoder: str = "", **changes: Any) -> dict[str, Any]:
@@ -47,7 +53,7 @@ def write_run(
     env_kwargs: dict[str, Any] | None = None,
     **changes: Any,
 ) -> None:
-    """A run with a rate of success; each condition and seed has outcomes of its own."""
+    """Write the results of a run with this success rate; each condition and seed has outcomes of its own."""
     config = config_of(policy, preset, task, mode, seed, **changes)
     kwargs = dict(cameras=[task_spec(full_id(task)).policy_camera], tactile_sensors=["right"]) | (env_kwargs or {})
     name = json.dumps([config, kwargs], sort_keys=True, default=str)

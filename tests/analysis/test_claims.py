@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from manifeel_ms3.analysis import claims, results_page
+from manifeel_ms3.analysis import claims
 from manifeel_ms3.analysis.condition import Condition
 from manifeel_ms3.analysis.encoder_ranking import rankings, verdict_on
 from manifeel_ms3.analysis.estimates import Estimate
@@ -15,7 +15,7 @@ from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import PEG
 
-from .made_up import write_run
+from .made_up import page_of, write_run
 
 WEIGHTS = dict(unit="unit.safetensors", t3="t3_medium", anytouch="anytouch.pth")
 NEEDS = {name: dict(tacrgb_weights=file) for name, file in WEIGHTS.items()}
@@ -27,10 +27,6 @@ def answered(folder) -> list[tuple[str, str, claims.ClaimResult]]:
     """Claim, task and outcome of everything that the results in a folder answer."""
     outcomes = claims.main(claims.Args((folder,)))
     return [(asked.claim, asked.first.task, one) for asked, found in outcomes.items() for one in found]
-
-
-def page_of(folder) -> str:
-    return results_page.main(results_page.Args((folder,), folder / "results.md")).read_text()
 
 
 def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
@@ -74,11 +70,11 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     assert "What learning gained" not in page
 
 
-# ------------------------------------------------------------------ what once misled the page
+# ------------------------------------------------------------------ which runs are compared
 
 
 def test_both_sides_have_the_papers_number_of_demonstrations(tmp_path):
-    """At 721bfa4, TacFF with 100 demonstrations was compared with vision with 50: the most demonstrations won on each side."""
+    """A run with more demonstrations than the paper's does not stand for the paper's condition."""
     write_run(tmp_path, VISION, 0.5, task="GearAssembly", num_demos=50)
     write_run(tmp_path, TACFF, 0.9, task="GearAssembly", num_demos=100)
     assert answered(tmp_path) == []
@@ -91,14 +87,14 @@ def test_both_sides_have_the_papers_number_of_demonstrations(tmp_path):
 
 
 def test_runs_of_other_purposes_are_listed_and_enter_nothing(tmp_path):
-    """At 721bfa4, the 300-step run of the study of training times, with its 103 demonstrations, stood in Tables II and III."""
+    """Such as the run of 300 steps with 103 demonstrations in the study of training times."""
     write_run(tmp_path, VISION, 0.4, task="BallSorting")
     write_run(tmp_path, TACRGB, 0.7, task="BallSorting")
     before = answered(tmp_path)
     short = dict(task="BallSorting", steps=300, total_steps=300, last_step=300, checkpoints=1)
     write_run(tmp_path, TACRGB, 0.1, num_demos=103, episodes=1, **short)
-    write_run(tmp_path, TACRGB, 0.1, seed=1, **short)  # fifty episodes make it no policy
-    write_run(tmp_path, TACRGB, 0.1, seed=2, task="BallSorting", last_step=30_000, batch_size=16)  # stopped
+    write_run(tmp_path, TACRGB, 0.1, seed=1, **short)  # too short, even with fifty episodes
+    write_run(tmp_path, TACRGB, 0.1, seed=2, task="BallSorting", last_step=30_000, batch_size=16)  # stopped early
     assert answered(tmp_path) == before
     page = page_of(tmp_path)
     for reason in ("1 episodes", "300 gradient steps", "stopped at step 30000 of 50000"):

@@ -1,16 +1,11 @@
 """Failure floors on the page of results: those of the present revisions, beside the rates of the paper's tables."""
 
-from manifeel_ms3.analysis import results_page
 from manifeel_ms3.analysis.paper import VISION
 from manifeel_ms3.evaluation.floors import floors_of, highest_floor
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.tasks_and_marks import PEG
 
-from .made_up import write_run
-
-
-def page_of(folder) -> str:
-    return results_page.main(results_page.Args((folder,), folder / "results.md")).read_text()
+from .made_up import page_of, write_run
 
 
 def test_a_row_of_the_papers_tables_has_the_floor_of_its_task(tmp_path):

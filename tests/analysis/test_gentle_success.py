@@ -5,7 +5,6 @@ import json
 import cv2
 import pytest
 
-from manifeel_ms3.analysis import results_page
 from manifeel_ms3.analysis.gentle_success import draw_success_under_force, gentle_cell
 from manifeel_ms3.analysis.paper import TACFF, VISION
 from manifeel_ms3.analysis.protocol import collect
@@ -13,7 +12,7 @@ from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import PEG
 
-from .made_up import write_run
+from .made_up import page_of, write_run
 
 LIMIT = task_spec(PEG).force_limit
 
@@ -33,7 +32,7 @@ def runs(tmp_path):
     return folder
 
 
-def test_the_gentle_success_is_that_of_the_episodes_which_the_success_is_of(runs):
+def test_gentle_success_counts_the_same_episodes_as_success(runs):
     by_mode = {condition.obs_mode: results for condition, results in collect(results_in(runs)).items()}
     assert gentle_cell(by_mode[VISION]) == f"20% up to {LIMIT:g} N"
     assert gentle_cell(by_mode[TACFF]) == f"37% up to {LIMIT:g} N"  # (25 + 12) of 2 x 50 episodes
@@ -42,7 +41,7 @@ def test_the_gentle_success_is_that_of_the_episodes_which_the_success_is_of(runs
 
 
 def test_the_page_of_results_has_the_column_and_the_figure(runs, tmp_path):
-    page = results_page.main(results_page.Args((runs,), tmp_path / "results.md")).read_text()
+    page = page_of(runs, tmp_path / "results.md")
     header, _, *rows = page.split("## What was run\n\n")[1].splitlines()
     place = header.split(" | ").index("gentle success")
     assert [row.split(" | ")[place] for row in rows[:2]] == [f"20% up to {LIMIT:g} N", f"37% up to {LIMIT:g} N"]

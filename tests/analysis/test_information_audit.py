@@ -1,4 +1,4 @@
-"""The audit finds what is there, and nothing where there is nothing."""
+"""The information audit finds information that is there, and none where there is none."""
 
 import json
 
@@ -27,7 +27,7 @@ def test_a_prediction_knows_a_class_that_shows_and_not_one_that_does_not():
 
 
 def test_a_prediction_does_not_learn_an_episode_by_heart():
-    """Features that name the episode say nothing of episodes that it has not seen."""
+    """Features that name the episode say nothing about episodes that it has not seen."""
     truth = np.repeat(RNG.integers(2, size=40), 5).astype(float)
     episodes = np.repeat(np.arange(40), 5)
     names = np.eye(40)[episodes]

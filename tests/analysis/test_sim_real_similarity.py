@@ -19,7 +19,7 @@ OWN = "tests.analysis.test_sim_real_similarity:brightness"
 
 
 def brightness(images: np.ndarray) -> np.ndarray:
-    """Features of one's own: mean of each colour."""
+    """Features of a user's own: the mean of each colour."""
     return images.mean((1, 2))
 
 
@@ -103,7 +103,7 @@ def test_a_resnet_from_a_folder(folders):
 
 
 def test_inception_with_weights_at_hand(folders, monkeypatch):
-    """They lie where torch keeps downloads; here they are random."""
+    """The weights lie where torch keeps downloads; here they are random."""
     module = pytest.importorskip("torch_fidelity.feature_extractor_inceptionv3")
     monkeypatch.setenv("TORCH_HOME", str(folders))
     weights = folders / "hub/checkpoints" / module.URL_INCEPTION_V3.rpartition("/")[2]

@@ -4,12 +4,11 @@ import csv
 
 import cv2
 
-from manifeel_ms3.analysis import results_page
 from manifeel_ms3.analysis.paper import TACFF, VISION
 from manifeel_ms3.analysis.success_curves import success_curves, write_curves
 from manifeel_ms3.evaluation.result import results_in
 
-from .made_up import TOTAL_STEPS, write_run
+from .made_up import TOTAL_STEPS, page_of, write_run
 
 
 def test_a_curve_has_a_point_for_each_step_over_all_seeds(tmp_path):
@@ -34,7 +33,7 @@ def test_the_page_of_results_shows_the_curves_and_links_the_table(tmp_path):
     for mode, rate in ((VISION, 0.2), (TACFF, 0.5)):
         for task in ("PegInsertion", "GearAssembly"):
             write_run(tmp_path / "runs", mode, rate, task=task, checkpoints=3)
-    page = results_page.main(results_page.Args((tmp_path / "runs",), tmp_path / "results.md")).read_text()
+    page = page_of(tmp_path / "runs", tmp_path / "results.md")
     assert "(images/results_success.png)" in page
     assert "[csv](images/results_success.csv)" in page
     assert cv2.imread(str(tmp_path / "images/results_success.png")).std() > 5

@@ -155,12 +155,12 @@ def test_tacrgb_has_a_size_of_its_own():
 
 
 @pytest.mark.parametrize("sizes", [(0, 64), (64, -1)])
-def test_sizes_that_are_no_sizes_are_refused(sizes):
+def test_images_that_are_too_small_are_refused(sizes):
     with pytest.raises(InvalidArgumentError, match=r"image_size=.*at least 16 pixels"):
         observation_spec("rgb+tacrgb", ("wrist",), ("right",), *sizes)
 
 
-def test_an_unknown_form_of_the_pose_names_those_there_are():
+def test_an_unknown_form_of_the_pose_names_the_known_ones():
     with pytest.raises(InvalidArgumentError, match=r"pose='euler'.*quaternion.*rotation_6d"):
         observation_spec("rgb", ("wrist",), (), 64, pose="euler")
 
@@ -276,7 +276,7 @@ def test_key_points_are_pairs_of_coordinates():
         ObservationEncoder(EncoderConfig("resnet18_keypoints", image_features=7), spec, 2)
 
 
-def test_unknown_encoder_names_those_there_are():
+def test_an_unknown_encoder_names_the_known_ones():
     spec = observation_spec("rgb+tacrgb+tacff", ("wrist",), ("right",), 64)
     for wrong in (dict(image="resnet1800"), dict(tacrgb="resnet1800"), dict(force_field="resnet1800")):
         with pytest.raises(ValueError, match=r"'resnet1800' is unknown; choose from .*resnet18"):

@@ -1,4 +1,4 @@
-"""When the scene turns about the vertical, what the equivariant policy does turns with it."""
+"""When the scene turns about the vertical, the actions of the equivariant policy turn with it."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ PICTURES = range(4)
 
 
 def smooth_picture(size: int, seed: int = 0) -> np.ndarray:
-    """(H, W, 3) in [0, 1]: blobs that end before the picture's rim, on black: nothing is lost when it turns."""
+    """A picture (H, W, 3) in [0, 1] of blobs on black, which end before its rim, so that nothing is lost when it turns."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / (size - 1) * 2 - 1
     picture = np.zeros((size, size, 3))
@@ -32,7 +32,7 @@ def smooth_picture(size: int, seed: int = 0) -> np.ndarray:
 
 
 def turned_picture(picture: np.ndarray, g: int) -> np.ndarray:
-    """Counter-clockwise, as it is looked at."""
+    """The picture, turned counter-clockwise, as one looks at it, by g eighths of a turn."""
     if g % 2 == 0:
         return np.rot90(picture, g // 2, axes=(0, 1))
     return np.clip(rotate(picture, 45 * g, axes=(1, 0), reshape=False, order=3), 0, 1)
@@ -124,7 +124,7 @@ def poses_of(count: int) -> np.ndarray:
 
 
 def observation(pose: np.ndarray, front: np.ndarray, wrist: np.ndarray) -> dict[str, torch.Tensor]:
-    """One window (1, 2, ...)."""
+    """One window of observations (1, 2, ...) with these poses and pictures."""
     torch.manual_seed(1)
     views = {
         key: torch.as_tensor(np.stack([np.round(255 * picture)] * 2).astype(np.uint8))[None]
@@ -138,7 +138,7 @@ def observation(pose: np.ndarray, front: np.ndarray, wrist: np.ndarray) -> dict[
 
 
 def turned_pose(policy, pose: np.ndarray, g: int) -> np.ndarray:
-    """About the vertical through the middle of the demonstrations' places."""
+    """Poses turned by g eighths of a turn about the vertical through the middle of the demonstrations' positions."""
     normalizer = policy.obs_normalizers[POSE.replace("/", "_")]
     centre = ((normalizer.low + normalizer.high) / 2)[:2].numpy()
     out = pose.copy()
@@ -168,7 +168,7 @@ def test_actions_turn_when_the_hand_and_the_scene_turn(policy, g, monkeypatch, f
     pose, noise = poses_of(2), torch.randn(1, 16, 6, generator=torch.Generator().manual_seed(0))
     fronts, wrists = ([smooth_picture(48, seed + shift) for seed in PICTURES] for shift in (0, 100))
     plain = act(policy, monkeypatch, pose, zip(fronts, wrists, strict=True), noise)
-    moved = [turned_picture(picture, g) for picture in fronts]  # and what generation begins with turns, too
+    moved = [turned_picture(picture, g) for picture in fronts]  # the noise that generation starts from turns, too
     pairs = zip(moved, wrists, strict=True)
     found = act(policy, monkeypatch, turned_pose(policy, pose, g), pairs, turned_actions(noise, g))
     error = float((found - turned_actions(plain, g)).norm() / plain.norm())
@@ -201,7 +201,7 @@ def test_what_touch_feels_matters_and_does_not_turn(policy):
     assert torch.allclose(change, change[:, :1].expand_as(change), atol=1e-6)  # alike in every frame
 
 
-def test_actions_of_a_number_that_is_not_known_to_turn(policy):
+def test_actions_of_an_unknown_size_are_refused(policy):
     with pytest.raises(ValueError, match="ACTION_PAIRS"):
         EquivariantDiffusionPolicy(policy.config, SPEC, action_dim=4)
 

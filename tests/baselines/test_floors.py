@@ -29,7 +29,7 @@ def test_random_actions_are_drawn_by_the_seed_of_the_episode():
 
 
 def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
-    """Random fingers let go of the nut in the first steps."""
+    """The episode is short, because random fingers let go of the nut in the first steps."""
     spec, mean = task_spec(NUT), dict(episodes=7, rate=0.5, low=0.25, high=0.75)
     about = dict(schema=FLOORS_SCHEMA, env_id=NUT, revision=spec.revision, git_commit=None, command="made up")
     floors_file(NUT, tmp_path).write_text(json.dumps(about | dict(floors={"mean action": mean})))

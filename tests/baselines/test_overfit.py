@@ -1,4 +1,4 @@
-"""Every policy, in every sensing set-up, learns one demonstration by heart and does it again in the simulator."""
+"""Every policy, in every sensing set-up, memorises one demonstration and repeats it in the simulator."""
 
 import dataclasses
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.tasks_and_marks import needs_renderer
 
 pytestmark = [pytest.mark.slow, needs_renderer]
 TASK = "ManiFeel-BallSorting-v1"
-SEED = 0  # of this task the shortest of the first: its first guess is right
+SEED = 0  # its demonstration is short, because the first ball that it tries is the right one
 SENSORS = dict(cameras=("front",), tactile_sensors=("right",))
 
 
@@ -26,9 +26,9 @@ def demonstration(tmp_path_factory) -> Path:
 
 @pytest.mark.parametrize("mode", ["rgb", "rgb+tacrgb", "rgb+tacff"])
 @pytest.mark.parametrize("script", [diffusion, equivariant, flow], ids=["diffusion", "equivariant", "flow"])
-def test_one_demonstration_is_learnt_by_heart(make_env, demonstration, tmp_path, script, mode):
+def test_one_demonstration_is_memorised_and_repeated(make_env, demonstration, tmp_path, script, mode):
     cpu = script.PRESETS["cpu"].args
-    # nothing that is to help with other starts: no crops, no noise on the pose, and the paper's horizons
+    # without the crops and the noise on the pose that help with other starts, and with the paper's horizons
     alike = dict(encoder=dataclasses.replace(cpu.policy.encoder, crop=0), pose_noise=0.0, noise_draws=1)
     policy = dataclasses.replace(cpu.policy, obs_horizon=2, action_horizon=8, **alike)
     run = dict(demos=(demonstration,), env_id=TASK, obs_mode=mode, run_dir=tmp_path, **SENSORS)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
-from transformers import CLIPVisionConfig
 
 from baselines.common.observation import prepare_images
 from baselines.tactile_representations.anytouch import AnyTouch
@@ -24,34 +23,10 @@ from tests.sensors.optics import make_optics
 
 from .released_encoders import stand_ins
 from .released_encoders.formulae import EXPECTED, UNTOUCHED_COLOUR, probes
-from .released_encoders.stand_ins import HEADS, WIDTHS, picture, values
+from .released_encoders.networks import small_anytouch, small_sparsh, small_t3, small_unit
+from .released_encoders.stand_ins import WIDTHS, picture, values
 
 Weights = dict[str, torch.Tensor]
-SMALL_CLIP = CLIPVisionConfig(
-    hidden_size=32,
-    intermediate_size=64,
-    num_hidden_layers=2,
-    num_attention_heads=HEADS,
-    patch_size=14,
-    projection_dim=16,
-    hidden_act="gelu",
-)
-
-
-def small_t3() -> T3:
-    return T3(width=32, depth=(1, 2), heads=HEADS).eval()
-
-
-def small_sparsh() -> Sparsh:
-    return Sparsh(width=32, depth=2, heads=HEADS).eval()
-
-
-def small_anytouch() -> AnyTouch:
-    return AnyTouch(SMALL_CLIP).eval()
-
-
-def small_unit(attention: bool = False) -> UniT:
-    return UniT(WIDTHS, attention).eval()
 
 
 def foreign_class(module: str, name: str, monkeypatch) -> type:

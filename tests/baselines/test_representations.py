@@ -8,7 +8,6 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from transformers import CLIPVisionConfig
 
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig, ObservationEncoder, load_pretrained
 from baselines.common.memory import lay_out_channels_last
@@ -27,12 +26,9 @@ from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from tests.tasks_and_marks import PEG
 
 from .released_encoders import stand_ins
+from .released_encoders.networks import small_anytouch, small_sparsh, small_t3, small_unit
 
 SPEC = observation_spec("tacrgb", (), ("right",), 32)
-
-
-def small_t3() -> T3:
-    return T3(width=32, depth=(1, 2), heads=4)
 
 
 def millions(module: torch.nn.Module) -> float:
@@ -44,7 +40,7 @@ def test_representations_have_the_published_sizes():
         assert millions(T3()) == pytest.approx(86, rel=0.02)
         assert millions(AnyTouch()) == pytest.approx(305, rel=0.02)
         assert millions(Sparsh()) == pytest.approx(86, rel=0.02)
-        # the published 75 M are the VQGAN with what its training judges it by: VGG-16's convolutions and the discriminator
+        # the published 75 M are the VQGAN and the networks that judge it in training: VGG-16's convolutions, the discriminator
         judges = 14.71 + millions(patch_discriminator())
         assert millions(UniT().vqgan) + judges == pytest.approx(75, rel=0.02)
 
@@ -56,15 +52,8 @@ def test_released_unit_asks_for_its_own_architecture():
             UniT().convert_state_dict(weights)
 
 
-TINY_CLIP = CLIPVisionConfig(
-    hidden_size=32, intermediate_size=64, num_hidden_layers=2, num_attention_heads=4, patch_size=14, projection_dim=16
-)
-SMALL = dict(
-    t3=(small_t3, 32),
-    sparsh=(lambda: Sparsh(32, 2, 4), 32),
-    anytouch=(lambda: AnyTouch(TINY_CLIP), 42),
-    unit=(lambda: UniT(channels=(32, 32, 32, 64)), 32),
-)
+SMALL = dict(t3=(small_t3, 32), sparsh=(small_sparsh, 32), anytouch=(small_anytouch, 42), unit=(small_unit, 32))
+"""Function that makes a small network, and side of its images in pixels, by the name of the representation."""
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +97,7 @@ def trained(name: str, demos: Path, out: Path, **settings) -> list[float]:
     return pretrain.main(pretrain.Args(name, (demos,), out=out, device="cpu", **settings))
 
 
-def test_files_that_are_not_asked_for_are_named(pictures, tmp_path, monkeypatch):
+def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
     monkeypatch.setitem(pretrain.REPRESENTATIONS, "t3", small_t3)
     out = tmp_path / "weights.safetensors"
     with pytest.raises(DemonstrationError, match="hold no TacRGB"):
@@ -179,8 +168,7 @@ def test_the_advice_on_a_size_that_does_not_fit_can_be_followed(make, size):
         assert encoder(torch.zeros(2, 3, advised, advised)).shape == (2, 512)
 
 
-def test_a_policy_takes_the_statistics_of_its_demonstrations(monkeypatch):
-    """And its checkpoint keeps them."""
+def test_a_policy_takes_the_statistics_of_its_demonstrations_and_its_weights_keep_them(monkeypatch):
     monkeypatch.setattr("baselines.tactile_representations.encoder.T3", small_t3)
     config = DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), down_dims=(16, 32))
     policy, other = (DiffusionPolicy(config, SPEC, 6) for _ in range(2))
@@ -197,6 +185,6 @@ def test_a_policy_takes_the_statistics_of_its_demonstrations(monkeypatch):
 def test_every_network_of_touch_can_be_laid_out_for_training(name):
     with torch.device("meta"):
         encoder = TACRGB_ENCODERS[name](224, 512)
-    lay_out_channels_last(encoder)  # of weights of other ranks, a video's say, nothing is asked
+    lay_out_channels_last(encoder)  # weights of other ranks, such as those of video patches, stay as they are
     laid_out = [p.is_contiguous(memory_format=torch.channels_last) for p in encoder.parameters() if p.dim() == 4]
     assert all(laid_out)

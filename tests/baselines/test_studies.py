@@ -42,13 +42,6 @@ from tests.tiny_study import TINY
 REPOSITORY = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def study(tmp_path) -> Path:
-    path = tmp_path / "tiny.yaml"
-    path.write_text(TINY)
-    return path
-
-
 # -------------------------------------------------------------------- planning
 
 
@@ -62,7 +55,8 @@ grids:
 """)
     jobs = jobs_of(read_study(path))
     kinds = [job.kind for job in jobs]
-    assert (kinds.count("record"), kinds.count("train"), kinds.count("evaluate")) == (2, 12, 12)  # rgb; rgb+tacrgb with two
+    # two tasks and two seeds: rgb, and rgb+tacrgb with two encoders
+    assert (kinds.count("record"), kinds.count("train"), kinds.count("evaluate")) == (2, 12, 12)
     touched = [job for job in jobs if job.settings.get("flags", {}).get("policy.encoder.tacrgb") == "t3"]
     assert len(touched) == 4
     assert all(job.settings["flags"]["image-size"] == 224 for job in touched)
@@ -282,7 +276,8 @@ def test_what_a_machine_does_not_have_is_said(study, tmp_path):
     study.write_text(TINY.replace("train: {cpus: 1}", "train: {cpus: 1, gpus: 99}"))
     with pytest.raises(MachineError, match="train needs 99 GPUs"):
         study_command.main(study_command.Args(study, tmp_path))
-    assert subprocess.run([sys.executable, "-c", "raise SystemExit(3)"], check=False).returncode == 3  # Ray has hidden nothing
+    ended = subprocess.run([sys.executable, "-c", "raise SystemExit(3)"], check=False)
+    assert ended.returncode == 3  # Ray does not hide exit codes
 
 
 # -------------------------------------------------------------------- running

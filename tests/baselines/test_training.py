@@ -29,7 +29,7 @@ from tests.tasks_and_marks import PEG
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
 POLICIES["consistency"] = (flow, dict(consistency=True))
 QUICK = ["diffusion", "flow", "consistency", pytest.param("equivariant", marks=pytest.mark.slow)]
-"""All policies; the equivariant one, whose convolutions are slow on a CPU, in the slow run."""
+"""All policies; the equivariant one, whose convolutions are slow on a CPU, only in the slow run."""
 
 
 @dataclasses.dataclass
@@ -196,7 +196,7 @@ def test_agent_acts_and_repeats_itself_after_reset(make_env, run, checkpoint):
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
-def test_the_untrained_self_is_what_training_began_with(run, checkpoint, tmp_path):
+def test_the_untrained_policy_has_the_weights_that_training_began_with(run, checkpoint, tmp_path):
     begun = run.again(run_dir=tmp_path, steps=1, lr=0.0)  # a step that changes nothing
     untrained, trained = Untrained(str(checkpoint)).policy.state_dict(), read_tensors(checkpoint / "model.safetensors")
     for name, first in read_tensors(begun / "model.safetensors").items():

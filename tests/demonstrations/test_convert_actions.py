@@ -1,4 +1,4 @@
-"""Recordings in other controllers: converted by us, and from there by ManiSkill's own script."""
+"""Recordings for other controllers: converted by this package, and from there by ManiSkill's own script."""
 
 import json
 import shutil
@@ -19,7 +19,7 @@ BARE = dict(obs_mode="none", cameras=(), tactile_sensors=("right",), num=1)
 
 @pytest.fixture(scope="module")
 def in_joints(tmp_path_factory) -> Path:
-    """A demonstration as joint positions."""
+    """A demonstration whose actions are joint positions."""
     out = tmp_path_factory.mktemp("demos") / "trajectory.h5"
     return render_observations.main(render_observations.Args(states_sample(TASK), out, **BARE, control_mode="pd_joint_pos"))
 
@@ -33,7 +33,7 @@ def replayed(path: Path, capsys, *flags: str) -> dict[str, Path]:
     return {file.suffix: file for file in set(path.parent.iterdir()) - before}
 
 
-def test_the_robot_moves_as_before_in_another_controllers_words(in_joints):
+def test_actions_that_were_converted_to_joints_move_the_objects_as_before(in_joints):
     assert read_header(in_joints)["env_info"]["env_kwargs"]["control_mode"] == "pd_joint_pos"
     with h5py.File(states_sample(TASK)) as first, h5py.File(in_joints) as second:
         assert second["traj_0/actions"].shape[1] == 8
@@ -43,7 +43,7 @@ def test_the_robot_moves_as_before_in_another_controllers_words(in_joints):
 
 
 def test_an_episode_that_fails_with_another_controller_is_left_out(tmp_path, caplog):
-    """Without an action of the gripper no ball is grasped."""
+    """Without an action for the gripper, no ball is grasped."""
     mode = "pd_ee_delta_pose_fixed_gripper"
     render_observations.main(render_observations.Args(states_sample(TASK), tmp_path / "t.h5", **BARE, control_mode=mode))
     assert "the episodes of the seeds [0] do not succeed in this replay" in caplog.text

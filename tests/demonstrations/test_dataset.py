@@ -1,4 +1,4 @@
-"""The full set: two forms of every episode, a manifest, and what finds fault with it."""
+"""The full data set: every episode with and without observations, a manifest, and the validation of both."""
 
 import json
 import shutil
@@ -15,16 +15,10 @@ from manifeel_ms3.errors import MachineError
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.tasks_and_marks import PEG, needs_renderer
+from tests.trajectories import arrays_of
 
 SEARCH = "ManiFeel-ObjectSearch-v1"
 STATES, OBSERVED = "trajectory.h5", "trajectory.tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
-
-
-def contents(path: Path) -> dict[str, np.ndarray]:
-    out = {}
-    with h5py.File(path) as file:
-        file.visititems(lambda name, item: out.__setitem__(name, item[()]) if isinstance(item, h5py.Dataset) else None)
-    return out
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +31,7 @@ def folder(tmp_path_factory) -> Path:
 def test_states_are_small_and_observations_are_beside_them(folder):
     states, trajectory = folder / PEG / STATES, folder / PEG / OBSERVED
     assert states.stat().st_size / 2 < 0.5e6
-    bare, full = contents(states), contents(trajectory)
+    bare, full = arrays_of(states), arrays_of(trajectory)
     assert not any("/obs/" in name for name in bare)
     assert any(name.endswith("tactile_right/force_field") for name in full)
     for name, values in bare.items():
@@ -137,7 +131,7 @@ def test_rendered_observations_are_those_of_the_recording(tmp_path):
     again = render_observations.main(
         render_observations.Args(bare, tmp_path / "again.h5", cameras=("front",), tactile_sensors=("right",))
     )
-    first, second = contents(direct), contents(again)
+    first, second = arrays_of(direct), arrays_of(again)
     assert set(first) == set(second)
     for name, values in first.items():
         assert np.array_equal(second[name], values), name

@@ -15,11 +15,10 @@ from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_z
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import task_spec
-from tests.sample import observed_sample, states_sample
+from tests.sample import KEYS, observed_sample, states_sample
 from tests.tasks_and_marks import PEG
 
 SAMPLE = observed_sample(PEG)
-KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 
 
 def exported(kind: export.Format, folder: Path) -> Path:

@@ -10,10 +10,10 @@ import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.lerobot import count_episodes, feature_name, is_lerobot, read_lerobot
+from tests.sample import KEYS
 
 pytest.importorskip("pyarrow")
 DATASETS = Path(__file__).with_name("lerobot")
-KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 LENGTHS = (4, 3)
 
 

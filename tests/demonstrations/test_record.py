@@ -24,6 +24,7 @@ from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
 from tests.tasks_and_marks import PEG, needs_renderer
+from tests.trajectories import bytes_of
 
 EASY = dict(fit="paper", render_backend="none")
 KEYS = ["sensor_data/tactile_right/force_field", "extra/tcp_pose"]
@@ -88,8 +89,8 @@ def test_another_sensor_is_recorded_and_named(recorded, tmp_path):
     assert json.loads(path.with_suffix(".json").read_text())["env_info"]["env_kwargs"]["sensor"] == "digit"
     with h5py.File(path) as digit, h5py.File(recorded) as other:
         first, r15 = (file["traj_0/obs"][KEYS[0]][0] for file in (digit, other))
-    assert first[..., 0].sum() == pytest.approx(r15[..., 0].sum(), rel=0.05)  # the same grip of the same start,
-    assert np.abs(first - r15).max() > 0.02  # N: on a dome
+    assert first[..., 0].sum() == pytest.approx(r15[..., 0].sum(), rel=0.05)  # the same grip at the same start
+    assert np.abs(first - r15).max() > 0.02  # N: the domed gel spreads it otherwise
 
 
 def test_names_of_files_say_what_is_in_them():
@@ -99,15 +100,6 @@ def test_names_of_files_say_what_is_in_them():
     assert name("none") == f"{PEG}/trajectory.h5"
     assert name("rgb+tacff") == f"{PEG}/trajectory.rgb+tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
     assert name("state", control_mode="pd_ee_delta_pose") == f"{PEG}/trajectory.state.pd_ee_delta_pose.physx_cpu.h5"
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    out = {}
-    with h5py.File(path) as file:
-        file.visititems(
-            lambda name, item: out.__setitem__(name, item[()].tobytes()) if isinstance(item, h5py.Dataset) else None
-        )
-    return out
 
 
 def wait_for_an_episode(path: Path) -> None:
@@ -121,7 +113,7 @@ def wait_for_an_episode(path: Path) -> None:
 
 def test_any_number_of_workers_gives_the_same_episodes(recorded, tmp_path):
     two = run(tmp_path / "trajectory.h5", num=3, workers=2)
-    assert contents(two) == contents(recorded)
+    assert bytes_of(two) == bytes_of(recorded)
 
 
 def test_every_episode_succeeds_again_from_its_actions(recorded):
@@ -134,7 +126,7 @@ def test_more_can_be_recorded_later(recorded, tmp_path):
     path = run(tmp_path / "trajectory.h5", num=2)
     assert len(read_header(path)["episodes"]) == 2
     run(path, num=3)
-    assert contents(path) == contents(recorded)
+    assert bytes_of(path) == bytes_of(recorded)
 
 
 def test_killed_run_keeps_every_finished_episode_and_goes_on(recorded, tmp_path):
@@ -159,7 +151,7 @@ def test_killed_run_keeps_every_finished_episode_and_goes_on(recorded, tmp_path)
     finished = read_demonstrations(path, KEYS, PEG)
     assert 1 <= len(finished) <= 3
     run(path, num=3)
-    assert contents(path) == contents(recorded)
+    assert bytes_of(path) == bytes_of(recorded)
 
 
 def test_other_settings_do_not_mix_into_a_file(recorded):
@@ -271,4 +263,4 @@ def test_a_worker_that_is_killed_loses_no_finished_episode(recorded, tmp_path):
         record.main(args, kill_workers)
     assert len(read_demonstrations(path, KEYS, PEG)) >= 1
     run(path, num=3)
-    assert contents(path) == contents(recorded)
+    assert bytes_of(path) == bytes_of(recorded)

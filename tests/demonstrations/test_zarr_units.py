@@ -28,7 +28,7 @@ def store(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def papers_store(store, tmp_path) -> Path:
-    """The same arrays without a word on their units, as in the paper's data."""
+    """The same arrays without their units, as in the paper's data."""
     folder = shutil.copytree(store, tmp_path / "papers")
     (folder / ".zattrs").unlink()
     return folder
@@ -50,7 +50,7 @@ def test_the_store_names_its_task_its_arguments_and_its_units(store):
         read(store, "ManiFeel-USBInsertion-v1")
 
 
-def test_newtons_without_a_word_are_not_taken_for_the_papers_penetration(papers_store):
+def test_newtons_without_their_unit_are_not_taken_for_the_papers_penetration(papers_store):
     with pytest.raises(DemonstrationError, match="does not say in which units"):
         read(papers_store)
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from manifeel_ms3.evaluation.policy import PolicyRequest, PolicySource
+from tests.evaluation.policies import CannotBeMade as CannotBeMade  # found by its name in this module
 
 FINE, RAISES, CRASHES, HANGS, MISCOUNTS = 10, 20, 30, 40, 50
-"""Seeds of episodes from each of which on the policy behaves so."""
+"""First seeds of ten episodes each, in which the policy behaves in this way."""
 
 
 class Part:
@@ -51,11 +52,6 @@ class Single:
 
     def act(self, obs):
         return np.zeros(6)
-
-
-class CannotBeMade:
-    def __init__(self):
-        raise OSError("no weights")
 
 
 class DiesWhenMade:

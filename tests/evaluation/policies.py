@@ -1,4 +1,4 @@
-"""Policies of someone's own, good and bad; evaluation imports them by name."""
+"""Policies of a user's own, good and bad, which evaluation imports by name."""
 
 import hashlib
 import os
@@ -9,6 +9,7 @@ import numpy as np
 from manifeel_ms3.evaluation.policy import PolicyUnavailableError
 
 STUCK = "MANIFEEL_TEST_STUCK"
+"""Environment variable that makes `SticksInSecondEpisode` stick."""
 
 
 class StandStill:
@@ -55,7 +56,7 @@ class CannotBeMade(StandStill):
 
 
 class SticksInSecondEpisode(StandStill):
-    """If the environment says so, it computes in native code for minutes, where no signal handler of Python runs."""
+    """If the environment variable is set, it computes for minutes in native code, where no signal handler of Python runs."""
 
     episodes = 0
 

@@ -188,7 +188,7 @@ def test_the_number_of_workers_changes_no_outcome(checkpoint, outcomes_with_one_
 
 
 class Watched:
-    """A policy whose actions are written down; it looks always, or when the policy does."""
+    """A policy that records the actions of another; it looks at every step, or only when the other does."""
 
     def __init__(self, agent, always):
         self.agent, self.always, self.actions, self.seen = agent, always, [], []

@@ -18,6 +18,7 @@ from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.tasks_and_marks import PEG
+from tests.trust.listening import free_port
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=12))
 SERVER = Path(__file__).parents[2] / "examples/policy_server.py"
@@ -100,7 +101,7 @@ def test_a_checkpoint_whose_task_names_a_module_does_not_import_it(tmp_path):
 
 @pytest.fixture
 def server():
-    port = 8900 + int(time.time()) % 90
+    port = free_port()
     process = subprocess.Popen([sys.executable, str(SERVER), "--port", str(port)])
     policy = RemotePolicy(f"http://127.0.0.1:{port}", timeout=10)
     for _ in range(50):

@@ -1,4 +1,4 @@
-"""Evaluation: fixed seeds, honest intervals, identical outcomes, a page that opens."""
+"""Evaluation: its metrics, seeds, limits and intervals, and outcomes that repeat."""
 
 import sys
 from contextlib import closing
@@ -20,13 +20,14 @@ from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
+from tests.evaluation.policies import StandStill
 from tests.outcomes import made_up
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
 
 
 class ExpertPolicy:
-    """The demonstrator behind the policy interface: the loop around it is what is tested."""
+    """A demonstrator behind the policy interface, to test the loop around policies."""
 
     def __init__(self, env, seed, steps=1000, then=(0.0,) * 6):
         self.env, self.seed, self.steps, self.then = env, seed, steps, np.array(then)
@@ -38,14 +39,6 @@ class ExpertPolicy:
     def act(self, obs):
         self.said.append(next(self.actions) if len(self.said) < self.steps else self.then)
         return self.said[-1]
-
-
-class StandStill:
-    def reset(self):
-        pass
-
-    def act(self, obs):
-        return np.zeros(6)
 
 
 LIMIT = 120
@@ -187,7 +180,7 @@ def test_evaluation_seeds_are_fixed_and_counted():
         ("[]", "holds a list instead of an object"),
         ('{"policy_name": "juggler"}', "'juggler' is not registered .*diffusion_policy.*install the package"),
         (
-            '{"kind": "baselines.common.agent:PolicyAgent", "policy_class": "nowhere:Policy"}',  # as commit 721bfa4 wrote it
+            '{"kind": "baselines.common.agent:PolicyAgent", "policy_class": "nowhere:Policy"}',  # as older versions wrote it
             "no policy_name.*train the policy again",
         ),
     ],

@@ -56,7 +56,7 @@ class Screwing:
         return float(np.arccos(np.clip(self._axes.apply([0, 0, 1])[2], -1, 1)))
 
     def run(self, seconds: float, speed: float | None, push: float) -> None:
-        """Turn at a speed (rad/s; None: let it be), pushing down, N."""
+        """Turn the part at a speed, in rad/s, or let it turn freely if None, while a force pushes it down, in N."""
         before = self.turned
         body = self.held._bodies[0]
         for _ in range(round(seconds * self.rate)):

@@ -20,7 +20,7 @@ def outcomes_of(won: int, rng: np.random.Generator) -> list[EpisodeOutcome]:
 
 
 def made_up(folder: Path, name: str, task: str, mode: str, won: int, seeds: int = 2, steps: int = 2) -> Path:
-    """Two checkpoints of two training seeds, if not told otherwise."""
+    """A submission's folder, with the results of two checkpoints of two training seeds unless told otherwise."""
     folder.mkdir(parents=True)
     (folder / "submission.json").write_text(json.dumps(dict(name=name, authors="Us")))
     rng = np.random.default_rng(0)

@@ -29,9 +29,10 @@ def test_every_entry_has_the_checkpoint_that_its_submission_names():
 
 
 def test_the_submissions_in_the_repository_can_be_shown():
-    for folder in BOARD.iterdir():
-        if folder.is_dir():
-            check(read_submission(folder), to_take=False)
+    folders = [folder for folder in BOARD.iterdir() if folder.is_dir()]
+    assert folders
+    for folder in folders:
+        check(read_submission(folder), to_take=False)  # raises an error if there is a fault
 
 
 @needs_renderer

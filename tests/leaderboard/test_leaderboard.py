@@ -28,7 +28,7 @@ BARE = json.dumps(dict(render_backend="none", max_episode_steps=3))
 
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory) -> Path:
-    """A real result, of all 50 starts, each a few steps."""
+    """A real result of all 50 initial states, with a few steps each."""
     out = tmp_path_factory.mktemp("evaluated") / "00000000.json"
     return evaluate.main(evaluate.Args(policy=POLICY, env_id=PEG, obs_mode="tacff", cameras=(), env_kwargs=BARE, out=out))
 
@@ -105,7 +105,7 @@ def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
     assert not (tmp_path / "board").exists()
 
 
-def test_a16_what_was_run_again_is_shown_and_counts_only_for_the_file_that_was_checked(submission, tmp_path, caplog):
+def test_what_was_run_again_is_shown_and_counts_only_for_the_file_that_was_checked(submission, tmp_path, caplog):
     caplog.set_level("INFO")
     board = tmp_path / "board"
     taken = submit(submission, board, rerun=2)
@@ -175,14 +175,14 @@ def test_the_table_ranks_within_a_task(board):
 
 
 def browsed(board: Path, address: str) -> str:
-    """The page as a browser has made it."""
+    """The html of the page after a browser has run its scripts."""
     command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=4000", "--dump-dom"]
     url = f"file://{board}/index.html#{address}"
     return subprocess.run([*command, url], capture_output=True, text=True, timeout=120, check=True).stdout
 
 
 def shown(board: Path, address: str) -> list[str]:
-    """Names of the rows that are to be seen, in their order."""
+    """Names of the visible rows, in their order."""
     rows = re.findall(r'<tr class="row"[^>]*>', browsed(board, address))
     return [html.unescape(re.findall(r'data-name="([^"]*)"', row)[0]) for row in rows if "hidden" not in row]
 

@@ -16,7 +16,7 @@ LOADS = torch.tensor(  # N, N m
 
 
 def pressed(meshes: list[trimesh.Trimesh | None]) -> MeshRays:
-    """One mesh a pad, at rest on its face."""
+    """Rays of several pads, each with one of the meshes at rest on its face."""
     return MeshRays([meshes], CONFIG.gel.size, CPU)
 
 

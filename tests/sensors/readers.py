@@ -1,4 +1,4 @@
-"""Photometric stereo: reads a picture from outside."""
+"""Photometric stereo: recovers a height map from a TacRGB image."""
 
 import numpy as np
 from scipy.fft import dctn, idctn

@@ -23,7 +23,7 @@ INDENTERS = {  # builder, height of the body's origin over the face when it touc
 
 
 LOADS = (1.0, 3.0, 10.0, 30.0)  # N
-# the rod's centre on the dome was 1.16 mm off at 3 or 10 N after other loads: a known limit
+# the centre of pressure of a rod on the dome is up to 1.16 mm off at 3 or 10 N after other loads: a known limit
 FEWER_LOADS = {("digit", "cylinder"): (1.0, 30.0)}
 
 
@@ -232,7 +232,7 @@ def test_field_does_not_depend_on_control_or_physics_rate(figure):
 
 
 def test_tacsl_units_give_penetration_and_speed():
-    """A block that slides over the pad at a known speed: 0.1 |v|, against the pad's motion; nothing moves, no shear."""
+    """A block that slides over the pad at a known speed v: the shear is 0.1 |v|, relative to the pad's motion."""
     press = Press(indenter("box", half_size=[0.006, 0.006, 0.004]), upright=False, tactile={"units": "tacsl"})
     press.place(0.0042)
     press.push(5.0)
@@ -249,7 +249,7 @@ def test_tacsl_units_give_penetration_and_speed():
     expected = 0.1 * (np.array([0.002, -0.001]) - pad_velocity[:2])  # of the object against the pad: it drags the gel along
     assert field[inside][:, 0] == pytest.approx(depth.numpy()[inside])
     assert np.abs(field[inside][:, 1:] - expected).max() < 2e-5
-    assert (field[~inside][:, 1:] == 0).all() or np.abs(field[~inside]).max() < 2e-4
+    assert np.abs(field[~inside]).max() < 2e-4  # m: no component exceeds twice the penetration
     press.close()
 
 

@@ -1,6 +1,6 @@
 """The default sensor gives what it gave when the samples in `data/sample` were recorded.
 
-`python -m tests.sensors.test_pinned` writes the figures anew, where a change of them is meant.
+`python -m tests.sensors.test_pinned` writes new numbers after a change that is intended.
 """
 
 from pathlib import Path

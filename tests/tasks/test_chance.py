@@ -37,7 +37,7 @@ def test_no_success_in_a_hundred_random_episodes_that_keep_hold(make_env, task):
 
 
 def _random_episodes(env, gripper: float | None = None) -> list[int]:
-    """Steps of a hundred episodes that all go without success; the gripper's action is random, too, unless it is given."""
+    """Numbers of steps of a hundred episodes without success; the gripper's action is random, too, unless it is given."""
     rng = np.random.default_rng(0)
     lengths = []
     for seed in range(100):

@@ -1,7 +1,6 @@
 """The page, in a real browser: it loads and steers, another one watches, and a page that is lost stops the robot."""
 
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.replay import replay
 from tests.browser import Browser, browser_program, wait_until
 from tests.tasks_and_marks import PEG, needs_renderer
+from tests.trust.listening import free_port
 
 pytest.importorskip("viser")
 pytestmark = [needs_renderer, pytest.mark.skipif(browser_program() is None, reason="no browser on this machine")]
@@ -22,12 +22,10 @@ SPACE, ENTER, DOWN, AHEAD = (" ", "Space", 32), ("Enter", "Enter", 13), ("f", "K
 
 @pytest.fixture
 def address(tmp_path):
-    """Of a page that `python -m manifeel_ms3.teleop` serves, with the token, as the command prints it."""
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
+    """Address of a page that `python -m manifeel_ms3.teleop` serves, with the token, as the command prints it."""
+    port = free_port()
     command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, "--out", str(tmp_path / "human.h5"), "--port", str(port)]
-    heeding = ["env", "--default-signal=INT", *command]  # ignored by what a background job starts
+    heeding = ["env", "--default-signal=INT", *command]  # a background job's processes ignore SIGINT by default
     process = subprocess.Popen(heeding, stderr=subprocess.PIPE, text=True)
     address = next(line for line in process.stderr if "shows the robot" in line).split()[0]
     assert address.startswith(f"http://localhost:{port}/")
@@ -39,7 +37,7 @@ def address(tmp_path):
 
 
 def listening_addresses(port: int) -> set[str]:
-    """Where something listens on a port, as the kernel tells it (hex)."""
+    """Hosts on which something listens on a port, as the kernel lists them, in hexadecimal."""
     lines = [line.split() for table in ("tcp", "tcp6") for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]]
     local = [line[1].split(":") for line in lines if line[3] == "0A"]
     return {host for host, number in local if int(number, 16) == port}
@@ -57,12 +55,12 @@ def test_a_person_records_an_episode(address, tmp_path):
         first.press(*SPACE)
         wait_until(lambda: "recording" in second.text)
         first.press(*DOWN, times=10)
-        second.press(*AHEAD, times=5)  # not heeded
+        second.press(*AHEAD, times=5)  # ignored
         second.press(*SPACE)
         wait_until(lambda: "recording" in second.text)
         first.close()
         wait_until(lambda: "paused" in second.text)
-        second.press(*SPACE)  # not heeded either, before it has taken over
+        second.press(*SPACE)  # ignored, too, before this page has taken over
         second.click("take over")
         wait_until(lambda: "you steer" in second.text)
         assert "paused" in second.text

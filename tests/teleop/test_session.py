@@ -23,7 +23,7 @@ KWARGS = dict(obs_mode="tacff", render_backend="none", sim_backend="physx_cpu", 
 
 
 class Notes:
-    """What a person would have seen."""
+    """A screen that keeps what a person would have seen."""
 
     def __init__(self):
         self.steps, self.lines = 0, []
@@ -60,7 +60,7 @@ class Desk:
             time.sleep(0.02)
 
     def command(self, command: EpisodeCommand, word: str) -> None:
-        """Say it, and wait for the line that follows."""
+        """Give a command, and wait for a message that holds a word."""
         self.screen.lines.clear()
         self.operator.command(command)
         wait_until(lambda: self.screen.has_line(word))

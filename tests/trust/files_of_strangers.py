@@ -2,7 +2,9 @@
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG
@@ -10,7 +12,6 @@ from tests.tasks_and_marks import PEG
 REPOSITORY = Path(__file__).parents[2]
 SAMPLE = observed_sample(PEG)
 LEROBOT = REPOSITORY / "tests/demonstrations/lerobot"
-KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 SECRET = b"TOP SECRET TEXT OF ANOTHER FILE."
 EXECUTED = "import pathlib; pathlib.Path('executed').touch()\n"
 
@@ -22,7 +23,8 @@ class Gadget:
         return os.system, ("touch executed",)
 
 
-def rewrite_json(path: Path, change) -> None:
+def rewrite_json(path: Path, change: Callable[[Any], object]) -> None:
+    """Let a function change the content of a json file."""
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

@@ -1,17 +1,10 @@
-"""A made-up submission, and changes to its files, for the tests of what strangers submit."""
+"""Names, texts and contents of made-up submissions, for the tests of what strangers submit."""
 
-import json
 from pathlib import Path
 
 FIRST = "results/0/00000100.json"
 NASTY = "<img src=x onerror=alert(1)>|`*_[a](javascript:alert(2))~~$x$ &lt; \\| **b**"
 """A text that would be markup if it were not escaped."""
-
-
-def change(path: Path, edit) -> None:
-    content = json.loads(path.read_text())
-    edit(content)
-    path.write_text(json.dumps(content))
 
 
 def contents(folder: Path) -> dict[str, bytes]:

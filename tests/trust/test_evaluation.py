@@ -66,7 +66,7 @@ def journal_of(out: Path) -> Path:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
+def test_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
     args = args_of("SticksInSecondEpisode", tmp_path / "evaluation.json", episodes=3)
     journal, errors = journal_of(args.out), tmp_path / "stderr"
     with errors.open("w") as file:
@@ -109,7 +109,7 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
 
 
 def test_an_error_says_what_is_kept_and_the_journal_holds_no_secret(tmp_path, caplog):
-    """The policy's first episode fails with its key in the message, and the second ends the evaluation (B8)."""
+    """The policy's first episode fails with its key in the message, and the second ends the evaluation."""
     kwargs = dict(api_key="correct-horse", options=dict(url="https://me:hunter22@example.org/x", hub="hf_abcdefghijkl"))
     args = args_of("LeaksAndGoesAway", tmp_path / "evaluation.json", policy_kwargs=json.dumps(kwargs))
     with caplog.at_level("INFO"), pytest.raises(ConnectionError, match="gone"):
@@ -223,7 +223,7 @@ def test_two_evaluations_cannot_write_one_result(tmp_path):
 
 @contextmanager
 def small_disk(kilobytes: int):
-    """A file system of its own that is soon full."""
+    """A small file system, which is soon full."""
     with tempfile.TemporaryDirectory() as folder:
         command = ["mount", "-t", "tmpfs", "-o", f"size={kilobytes}k", "tmpfs", folder]
         if subprocess.run(command, capture_output=True, check=False).returncode:
@@ -246,7 +246,7 @@ def add_all(journal: Journal) -> None:
         journal.add(outcome(seed))
 
 
-def test_a04_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
+def test_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
     with small_disk(64) as folder:
         out, seeds = folder / "evaluation.json", list(range(2000))
         write_result(result(), out)
@@ -264,14 +264,14 @@ def test_a04_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
         assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.episodes.jsonl"}
 
 
-def test_b05_a_full_disk_is_named_before_the_first_episode():
+def test_a_full_disk_is_named_before_the_first_episode():
     with small_disk(64) as folder:
         fill(folder)
         with pytest.raises(ManifeelError, match="cannot be written"):
             main(args_of("Nobody", folder / "evaluation.json"))
 
 
-def test_b05_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_path):
+def test_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for out, reason in (
@@ -286,7 +286,7 @@ def test_b05_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp
     assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
 
 
-def test_b05_a_read_only_folder_is_named_before_the_first_episode():
+def test_a_read_only_folder_is_named_before_the_first_episode():
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o555)
         child = os.fork()
@@ -331,7 +331,7 @@ def test_two_users_of_one_machine_take_turns_with_a_file():
 
 
 def test_a_bare_environment_gives_a_result(tmp_path):
-    """No git (A5), no HOME, an ASCII locale (A30), and a path with spaces and umlauts."""
+    """No git, no HOME, an ASCII locale, and a path with spaces and umlauts."""
     folder = tmp_path / "Prüfung von Größen"
     folder.mkdir()
     args = args_of("StandStill", folder / "ergebnis für mich.json", episodes=1)
@@ -363,7 +363,7 @@ def commit_seen_from(package: Path) -> str | None:
     return module.git_commit()
 
 
-def test_a28_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_path, monkeypatch):
+def test_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_path, monkeypatch):
     for name in ("foreign", "own"):
         (tmp_path / name).mkdir()
         git(tmp_path / name, "init", "-q")
@@ -383,7 +383,7 @@ def test_a28_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tm
     assert provenance.git_commit() == here
 
 
-def test_a05_without_git_the_commit_is_unknown(monkeypatch):
+def test_without_git_the_commit_is_unknown(monkeypatch):
     monkeypatch.setenv("PATH", "/nogit")
     assert provenance.git_commit() is None
     assert result()["git_commit"] is None
@@ -392,7 +392,7 @@ def test_a05_without_git_the_commit_is_unknown(monkeypatch):
 # ------------------------------------------------------------------------------- what is published
 
 
-def test_a18_nan_never_gets_into_a_result(tmp_path):
+def test_nan_never_gets_into_a_result(tmp_path):
     path = tmp_path / "result.json"
     for bad in (float("nan"), float("inf"), -float("inf")):
         for broken in (
@@ -434,7 +434,7 @@ def test_a_file_that_json_cannot_read_is_no_result(text, tmp_path):
         read_result(tmp_path / "result.json")
 
 
-def test_b08_passwords_and_tokens_are_not_published():
+def test_passwords_and_tokens_are_not_published():
     secret = dict(
         token="abc1",
         hfToken="abc2",

@@ -37,16 +37,13 @@ from manifeel_ms3.evaluation.policy import load_policy
 from manifeel_ms3.evaluation.remote_policy import read_action
 from manifeel_ms3.evaluation.result import read_result
 from tests.outcomes import made_up
-from tests.sample import observed_sample
+from tests.sample import KEYS
 from tests.tasks_and_marks import PEG
 
+from .files_of_strangers import LEROBOT, REPOSITORY, SAMPLE
 from .tiny_checkpoint import save_tiny_checkpoint
 
-REPOSITORY = Path(__file__).parents[2]
-SAMPLE = observed_sample(PEG)
-LEROBOT = REPOSITORY / "tests/demonstrations/lerobot"
 RESULT = Path(__file__).with_name("result.json")
-KEYS = ["sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose"]
 STEPS = 12
 """Number of steps of the valid demonstration."""
 MAX_MEMORY = 300e6
@@ -120,7 +117,7 @@ def damage_h5(path: Path, chance: random.Random, value: Any) -> None:
 
 
 def damage_folder(path: Path, chance: random.Random, value: Any) -> None:
-    """Damage one file of a folder: its structure where it is json, its bytes, or it is gone."""
+    """Damage the structure of a json file in a folder, or the bytes of a file, or delete a file."""
     files = sorted(file for file in path.rglob("*") if file.is_file())
     described = [file for file in files if file.suffix == ".json" or file.name.startswith(".z")]
     how = chance.random()
@@ -266,7 +263,7 @@ DEFAULT_CASES = 77
 
 
 def refused_or_read(read: Callable[[], Any], path: Path | None = None) -> None:
-    """Read, or be refused by an error that names the file or its folder; a `KeyError`, say, is a fault."""
+    """Read, or be refused by an error that names the file or its folder; any other error is a fault."""
     try:
         read()
     except ManifeelError as error:

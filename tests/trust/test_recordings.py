@@ -1,4 +1,4 @@
-"""Recordings: nothing that was finished is lost, whenever and however often a process is killed."""
+"""Recordings lose no finished episode, whenever and however often a process is killed."""
 
 import os
 import random
@@ -10,7 +10,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import h5py
 import numpy as np
 import psutil
 import pytest
@@ -24,7 +23,9 @@ from manifeel_ms3.files import remove_folder
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.teleop.operator import Operator
 from manifeel_ms3.teleop.session import Session
+from tests.browser import wait_until
 from tests.tasks_and_marks import PEG
+from tests.trajectories import bytes_of
 from tests.trust.kills import PATIENCE, forked, recorded, start_recording
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
@@ -33,22 +34,8 @@ ten_and_hundred = pytest.mark.parametrize("count", [10, pytest.param(100, marks=
 two_and_hundred = pytest.mark.parametrize("count", [2, pytest.param(100, marks=pytest.mark.slow)])
 
 
-def contents(path: Path) -> dict[str, bytes]:
-    """All arrays of a file by name."""
-    out = {}
-    with open_trajectories(path) as file:
-        for i in range(len(file)):
-            group = file[f"traj_{i}"]
-            group.visititems(
-                lambda name, item, i=i: (
-                    out.__setitem__(f"{i}/{name}", item[()].tobytes()) if isinstance(item, h5py.Dataset) else None
-                )
-            )
-    return out
-
-
 def seeds(path: Path) -> list[int]:
-    """Seeds that a file's json names, each held against the seed that its arrays were made of or begin with."""
+    """Seeds of the episodes in a file's json; each episode must have as many actions as the json says."""
     episodes = read_header(path)["episodes"]
     with open_trajectories(path) as file:
         for episode in episodes:
@@ -57,8 +44,8 @@ def seeds(path: Path) -> list[int]:
 
 
 def assert_same(path: Path, undisturbed: Path) -> None:
-    """Two recordings are equal, and nothing is left of a killed one but the lock."""
-    assert path.read_bytes() == undisturbed.read_bytes() or contents(path) == contents(undisturbed)
+    """Check that two recordings are equal, and that a killed one left nothing but its lock."""
+    assert path.read_bytes() == undisturbed.read_bytes() or bytes_of(path) == bytes_of(undisturbed)
     assert path.with_suffix(".json").read_text() == undisturbed.with_suffix(".json").read_text()
     assert sorted(file.name for file in path.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))) == sorted(
         file.name for file in undisturbed.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))
@@ -96,7 +83,7 @@ def record_made_up(path: Path, num: int, say=lambda word: None) -> None:
 
 
 def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.Random) -> int:
-    """Kill `work` again and again at random file events, and look at the file after each; the number of kills.
+    """Kill `work` again and again at random file events, check the file after each kill, and return the number of kills.
 
     Args:
         work: Called with a function that reports seeds.
@@ -120,7 +107,7 @@ def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.
 
 
 @ten_and_hundred
-def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
+def test_recording_is_killed_at_random_file_events(tmp_path, count, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 6)
     chance, kills, rounds = random.Random(0), 0, 0
     while kills < count:
@@ -136,7 +123,7 @@ def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
 
 
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
-def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
+def test_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 9)
 
     def prepare(path: Path) -> None:
@@ -164,7 +151,7 @@ def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step, fig
 
 
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
-def test_a09_a_kill_around_the_first_index_neither_blocks_nor_hides_the_settings(tmp_path, step):
+def test_a_kill_around_the_first_index_neither_blocks_nor_hides_the_settings(tmp_path, step):
     record_made_up(tmp_path / "undisturbed/t.h5", 1)
     other = HEADER | dict(env_info=dict(env_id="Another-v1"))
     events = forked(lambda _: record_made_up(tmp_path / "counted/t.h5", 1))[1]
@@ -188,7 +175,7 @@ class Silent:
 
 
 @ten_and_hundred
-def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
+def test_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
     env = make_env(**KWARGS)
 
     def save(path: Path, say=lambda word: None) -> None:
@@ -219,7 +206,7 @@ def undisturbed(tmp_path_factory) -> Path:
     return path
 
 
-def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
+def test_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
     path = tmp_path / "t.h5"
     assert recorded(path, 2, ["os.remove", "'seed_", 1])[0] == -signal.SIGKILL
     assert len(seeds(path)) == 2
@@ -227,11 +214,11 @@ def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tm
     assert_same(path, undisturbed)
 
 
-def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
+def test_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
     path = tmp_path / "t.h5"
     first = start_recording(path, 3)
     assert first.stdout.readline() == "begin\n"
-    wait_until(path.is_file)
+    wait_until(path.is_file, PATIENCE)
     code, episodes, errors = recorded(path, 3)
     assert (code, episodes) == (1, 0)
     assert f"t.h5 is in use by process {first.pid}" in errors
@@ -240,7 +227,7 @@ def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_pat
     assert_same(path, undisturbed)
 
 
-def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
+def test_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
         render_observations.main(render_observations.Args(undisturbed, tmp_path / "t.h5"))
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
@@ -253,14 +240,7 @@ def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_pa
     assert not list(tmp_path.glob("t.*"))
 
 
-def wait_until(condition, patience: float = PATIENCE) -> None:
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
+def test_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
     path = tmp_path / "t.h5"
     process = start_recording(path, 3, workers=2)
     assert process.stdout.readline() == "begin\n"
@@ -277,7 +257,7 @@ def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
     assert_same(path, undisturbed)
 
 
-def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
+def test_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
     with open_recording(tmp_path / "t.h5", HEADER) as dead:
         dead.begin()
     with open_recording(tmp_path / "t.h5", HEADER) as recording:
@@ -292,7 +272,7 @@ def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_p
 
 
 @two_and_hundred
-def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
+def test_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
     """Real processes, killed at random times; every second time the workers are left to themselves."""
     span, chance, kills, rounds = 6.0, random.Random(2), 0, 0
     while kills < count:
@@ -320,7 +300,7 @@ def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count, fi
 # -------------------------------------------------------------------- other misfortunes
 
 
-def test_b10_episodes_reach_the_disk_before_they_count(tmp_path):
+def test_episodes_reach_the_disk_before_they_count(tmp_path):
     """Every file and folder is flushed before the renaming that makes it count (seen by strace where it is installed)."""
     trace = """
 import os, sys
@@ -384,7 +364,7 @@ def test_a_missing_folder_of_episodes_is_named(tmp_path):
         pass
 
 
-def test_a29_a_home_that_cannot_be_written_is_named(tmp_path):
+def test_a_home_that_cannot_be_written_is_named(tmp_path):
     environment = os.environ | dict(HOME="/proc/none", XDG_CACHE_HOME="/proc/none/cache", MANIFEEL_CACHE_DIR="")
     command = [sys.executable, "-m", "manifeel_ms3.demonstrations.record", PEG, "-n", "1", "--out", str(tmp_path / "t.h5")]
     command += ["--obs-mode", "none", "--env-kwargs", '{"render_backend": "none"}']
@@ -411,7 +391,7 @@ assert len(seeds(folder / "t.h5")) == 3
 
 
 @pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
-def test_a30_an_ascii_locale_writes_the_same(tmp_path, locale):
+def test_an_ascii_locale_writes_the_same(tmp_path, locale):
     environment = os.environ | dict(LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     folder = tmp_path / "Übung with space"
     done = subprocess.run(

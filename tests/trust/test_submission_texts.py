@@ -12,16 +12,17 @@ from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from manifeel_ms3.leaderboard.text import is_safe_link, markdown_text
 
-from .submissions import NASTY, change
+from .files_of_strangers import rewrite_json
+from .submissions import NASTY
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a\rb", "a\u2028b", "a\u202eb", "a\x00b", "a\u200bb", " ", ""])
-def test_a15_name_and_authors_are_one_line(folder, text):
+def test_name_and_authors_are_one_line(folder, text):
     for name in ("name", "authors"):
-        change(folder / "submission.json", lambda about, name=name: about.update({name: text}))
+        rewrite_json(folder / "submission.json", lambda about, name=name: about.update({name: text}))
         with pytest.raises(SubmissionError, match=name):
             read_submission(folder)
-        change(folder / "submission.json", lambda about, name=name: about.update({name: "x"}))
+        rewrite_json(folder / "submission.json", lambda about, name=name: about.update({name: "x"}))
 
 
 @pytest.mark.parametrize(
@@ -47,9 +48,9 @@ def test_a15_name_and_authors_are_one_line(folder, text):
         " https://a.b",
     ],
 )
-def test_a15_only_plain_web_addresses_are_links(folder, link):
+def test_only_plain_web_addresses_are_links(folder, link):
     assert not is_safe_link(link)
-    change(folder / "submission.json", lambda about: about.update(link=link))
+    rewrite_json(folder / "submission.json", lambda about: about.update(link=link))
     with pytest.raises(SubmissionError, match="the link must be an address"):
         read_submission(folder)
 
@@ -66,13 +67,13 @@ class Tags(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
-def test_a15_texts_of_a_submission_are_no_markup(folder, tmp_path):
-    change(
+def test_texts_of_a_submission_are_no_markup(folder, tmp_path):
+    rewrite_json(
         folder / "submission.json",
         lambda about: about.update(name=NASTY, authors=NASTY, link="https://example.org/a_b?c=d&e=*f*#g"),
     )
     for path in folder.glob("results/*/*.json"):
-        change(
+        rewrite_json(
             path,
             lambda result: result.update(
                 policy=NASTY + "\n| forged | row |",
@@ -99,7 +100,7 @@ def test_a15_texts_of_a_submission_are_no_markup(folder, tmp_path):
 
 @given(st.text(max_size=60))
 @settings(max_examples=300, deadline=None, derandomize=True)
-def test_a15_a_cell_of_the_table_has_no_markup(text):
+def test_a_cell_of_the_table_has_no_markup(text):
     cell = markdown_text(text)
     assert cell.isprintable()
     assert not re.search(r"(?<!\\)[`*_\[\]{}]", cell.replace("\\\\", ""))

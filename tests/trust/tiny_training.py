@@ -25,7 +25,7 @@ FORKING.set_forkserver_preload([__name__, "tensorboard.summary.writer.event_file
 
 
 def tiny_args(run_dir: Path | None, **changes: Any) -> TrainArgs:
-    """A few milliseconds a step, and a checkpoint every second step."""
+    """Settings with a few milliseconds for each step, and a checkpoint at every second step."""
     paper = diffusion.PRESETS["paper"].args
     policy = dataclasses.replace(
         paper.policy, encoder=EncoderConfig(force_field="small"), down_dims=(8, 16), diffusion_step_embed_dim=8
@@ -49,7 +49,7 @@ def start(args: TrainArgs) -> Any:
 
 
 def finished(args: TrainArgs) -> float:
-    """Train in another process to the end; the answer is how long it took, in s."""
+    """Train in another process to the end, and return how long it took, in s."""
     begin = time.monotonic()
     process = start(args)
     process.join()
@@ -58,7 +58,7 @@ def finished(args: TrainArgs) -> float:
 
 
 def require_whole(checkpoint: Path) -> int:
-    """Check that everything can be read that evaluation and resuming need; the answer is the checkpoint's step."""
+    """Check that everything that evaluation and resuming need can be read, and return the step of the checkpoint."""
     assert read_tensors(checkpoint / WEIGHTS)
     assert read_tensors(checkpoint / TRAINING)
     step = checkpoint_config(checkpoint)["step"]

@@ -37,32 +37,32 @@ def timm_blocks(prefix: str, count: int, width: int, scaled: bool = False) -> Sh
 
 
 def t3_encoder(width: int = 768, depth: int = 3) -> Shapes:
-    """Of encoders/<sensor>.pth."""
+    """Shapes of encoders/<sensor>.pth."""
     shapes = {"cls_token": (1, 1, width), "pos_embed": (1, 197, width)}
     return shapes | conv("patch_embed.proj", 3, width, 16) | timm_blocks("", depth, width)
 
 
 def t3_trunk(width: int = 768, depth: int = 9) -> Shapes:
-    """Of trunk.pth."""
+    """Shapes of trunk.pth."""
     return timm_blocks("", depth, width) | norm("norm", width)
 
 
 def sparsh(width: int = 768, depth: int = 12) -> Shapes:
-    """Of dino_vitbase.safetensors: 174 tensors."""
+    """Shapes of dino_vitbase.safetensors: 174 tensors."""
     shapes = {"register_tokens": (1, 1, width), "pos_embed.frequency_bands": (2, width // 4)}
     shapes |= conv("patch_embed.proj", 6, width, 16) | norm("norm", width)
     return shapes | timm_blocks("", depth, width, scaled=True)
 
 
 def sparsh_checkpoint(width: int = 768, depth: int = 12) -> Shapes:
-    """Of the model in dino_vitbase.ckpt: a student, and the teacher that is released as safetensors; both have a DINO head."""
+    """Shapes of dino_vitbase.ckpt: a student, and the teacher that is released as safetensors, both with a DINO head."""
     backbone = sparsh(width, depth)
     parts = [{f"{part}_encoder.backbone.{name}": shape for name, shape in backbone.items()} for part in ("student", "teacher")]
     return parts[0] | parts[1] | linear("teacher_encoder.dino_head.mlp.0", width, 8)
 
 
 def anytouch(width: int = 1024, depth: int = 24, hidden: int = 4096, projected: int = 768, decoder: int = 512) -> Shapes:
-    """Of the model in checkpoint.pth, its second stage: CLIP's text and vision by a few names, and the touch encoder."""
+    """Shapes of the model in checkpoint.pth: a few tensors of CLIP's text and vision models, and the touch encoder."""
     shapes = linear("text_model.encoder.layers.0.mlp.fc1", 8, 8) | {"logit_scale": ()}
     shapes |= {"vision_model.embeddings.position_embedding.weight": (257, 8), "visual_projection.weight": (8, 8)}
     mae, model = "touch_mae_model.", "touch_mae_model.touch_model."
@@ -81,7 +81,7 @@ def anytouch(width: int = 1024, depth: int = 24, hidden: int = 4096, projected: 
 
 
 def _anytouch_decoder(mae: str, width: int, projected: int, decoder: int) -> Shapes:
-    """What only AnyTouch's training needs: transformers' ViT layers and what is around them."""
+    """Shapes that only AnyTouch's training needs: transformers' ViT layers and the layers around them."""
     shapes = {f"{mae}mask_token": (1, 1, decoder), f"{mae}sensor_token_proj.weight": (decoder, width)}
     shapes |= {f"{mae}decoder_pos_embed": (1, 257, decoder), f"{mae}video_position_embedding.weight": (257, width)}
     shapes |= linear(f"{mae}decoder_embed", projected, decoder) | norm(f"{mae}decoder_norm", decoder)
@@ -116,7 +116,7 @@ def _taming_middle(name: str, width: int) -> Shapes:
 
 
 def unit(widths: tuple[int, ...] = (128, 128, 256, 512), attention: bool = False) -> Shapes:
-    """Of the state_dict of UniT's VQModel: two blocks at each scale, attention at the coarsest or nowhere, and its losses."""
+    """Shapes of UniT's VQModel: two blocks at each scale, attention at the coarsest or nowhere, and its losses."""
     coarsest = len(widths) - 1
     shapes = conv("encoder.conv_in", 3, widths[0], 3) | conv("decoder.conv_out", widths[0], 3, 3)
     for i, (before, width) in enumerate(zip((widths[0], *widths), widths, strict=False)):
@@ -138,7 +138,7 @@ def unit(widths: tuple[int, ...] = (128, 128, 256, 512), attention: bool = False
 
 
 def unit_head(features: int) -> Shapes:
-    """Of the head that policies train over UniT's latents."""
+    """Shapes of the head that policies train over UniT's latents."""
     shapes: Shapes = {}
     for i, (inputs, outputs) in enumerate(((3, 128), (128, 256), (256, 512)), start=1):
         shapes |= conv(f"conv{i}", inputs, outputs, 3) | norm(f"ln{i}", outputs)

@@ -1,0 +1,27 @@
+"""The arrays of trajectory files, for comparisons of whole files."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+
+
+def arrays_of(path: Path) -> dict[str, np.ndarray]:
+    """All arrays of a trajectory file by name, with those of the episodes that it links to."""
+    found = {}
+    with open_trajectories(path) as file:
+        for i in range(len(file)):
+
+            def keep(name: str, item, trajectory: str = f"traj_{i}") -> None:
+                if isinstance(item, h5py.Dataset):
+                    found[f"{trajectory}/{name}"] = item[()]
+
+            file[f"traj_{i}"].visititems(keep)
+    return found
+
+
+def bytes_of(path: Path) -> dict[str, bytes]:
+    """The same as bytes, which can be compared at once."""
+    return {name: values.tobytes() for name, values in arrays_of(path).items()}
