@@ -115,7 +115,7 @@ ENDLESS = ("teleop",)  # runs until it is interrupted
 
 @pytest.fixture(scope="module")
 def shelf(tmp_path_factory) -> Path:
-    """What pages take for granted: recordings, weights, pictures of a real sensor, a policy and a sensor of one's own."""
+    """What pages take for granted: recordings, weights, pictures of a real sensor, a policy and a sensor of a user's own."""
     shelf = tmp_path_factory.mktemp("shelf")
     for name, task in (("gear", "ManiFeel-GearAssembly-v1"), ("peg", PEG)):
         states = states_sample(task)

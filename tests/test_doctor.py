@@ -28,7 +28,7 @@ def test_a_machine_that_is_in_order():
 
 
 def test_a_machine_without_a_renderer():
-    """As one without Mesa: the loader is shown no driver."""
+    """As on a machine without Mesa, the Vulkan loader finds no driver."""
     environment = os.environ | dict(VK_ICD_FILENAMES="/nowhere.json", VK_DRIVER_FILES="/nowhere.json", CUDA_VISIBLE_DEVICES="")
     command = [sys.executable, "-m", "manifeel_ms3.doctor"]
     done = subprocess.run(command, env=environment | dict(COLUMNS="200"), capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""What `make demo` does, small: record, train, evaluate, report, through the command lines' own entry points."""
+"""The steps of `make demo` in small: record, train, evaluate, report, through the command lines' own entry points."""
 
 import json
 from pathlib import Path

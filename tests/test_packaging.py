@@ -49,7 +49,7 @@ def test_the_wheel_holds_all_that_the_packages_hold(wheel):
 
 
 def dependency(name: str) -> Requirement:
-    """What pyproject.toml asks for of a package."""
+    """The requirement on a package in pyproject.toml."""
     (asked,) = re.findall(rf'"({name}[<>=][^"]*)"', (REPOSITORY / "pyproject.toml").read_text())
     return Requirement(asked)
 

@@ -1,4 +1,4 @@
-"""Each task has a page that is what its script makes, and a film that ManiSkill's tools can find."""
+"""Each task has a page that is up to date, and a film that ManiSkill's tools can find."""
 
 import dataclasses
 import json

@@ -65,7 +65,7 @@ def _conv_block(inputs: int, outputs: int, kernel_size: int, n_groups: int) -> n
 class ConditionalUnet1D(nn.Module):
     """Predicts the noise (B, T, A) in actions (B, T, A) at diffusion steps (B,), given conditions (B, C).
 
-    The defaults are those of Diffusion Policy.
+    The defaults, and the kernels and strides between the scales, are those of Diffusion Policy.
 
     Args:
         action_dim: Number of components of an action, A.

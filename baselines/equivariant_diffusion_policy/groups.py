@@ -130,7 +130,7 @@ def halve(fields: torch.Tensor) -> torch.Tensor:
 def pooled(fields: torch.Tensor, factor: int) -> torch.Tensor:
     """The largest values of fields (B, C, H, W) in windows, of which there are `factor` times fewer along each side.
 
-    Where the sides are no multiples of the factor, windows overlap symmetrically, so that quarter turns stay exact.
+    Where the sides are not multiples of the factor, windows overlap symmetrically, so that quarter turns stay exact.
     """
     return F.adaptive_max_pool2d(fields, [max(side // factor, 1) for side in fields.shape[2:]])
 

@@ -38,7 +38,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
 
     Raises:
         InvalidArgumentError: No evaluation in half precision is done.
-        FileExistsAlreadyError: The folder exists and is no submission.
+        FileExistsAlreadyError: The folder exists and is not a submission.
         FileWriteError: The folder cannot be written.
     """
     done = [job for job in jobs if job.kind == "evaluate" and job.settings["half_precision"] and is_done(job, root)]
@@ -47,7 +47,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
             f"no evaluation with `half_precision: true` is done in {root}; run the study first, or give its --root"
         )
     if folder.is_dir() and not (folder / ABOUT).is_file():
-        raise FileExistsAlreadyError(f"{folder} exists and is no submission: it has no {ABOUT}; give another folder")
+        raise FileExistsAlreadyError(f"{folder} exists and is not a submission: it has no {ABOUT}; give another folder")
     with owned(folder), atomic_folder(folder, replace=True) as partial:
         hashes = _copy_old(folder, partial)
         results = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]

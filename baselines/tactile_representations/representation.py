@@ -52,7 +52,7 @@ class Representation(nn.Module):
         """
         if name not in self.sensors:
             kinds = f"choose from {list(self.sensors)}" if self.sensors else "it has the same weights for all; leave it out"
-            raise UnknownNameError(f"tacrgb_sensor={name!r} is no sensor of {type(self).__name__}; {kinds}")
+            raise UnknownNameError(f"tacrgb_sensor={name!r} is not a sensor of {type(self).__name__}; {kinds}")
         self.sensor = name
 
     def load(self, path: Path) -> None:

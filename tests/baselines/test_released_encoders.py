@@ -160,9 +160,9 @@ def test_t3_reads_the_encoder_of_the_chosen_sensor(tmp_path):
 def test_an_unknown_sensor_is_refused():
     with torch.device("meta"):
         for network, message in (
-            (small_t3(), r"no sensor of T3; choose from \['mini', 'gs_green'"),
-            (small_anytouch(), r"no sensor of AnyTouch; choose from \['gelsight', 'digit'"),
-            (UniT(WIDTHS), "no sensor of UniT; it has the same weights for all"),
+            (small_t3(), r"not a sensor of T3; choose from \['mini', 'gs_green'"),
+            (small_anytouch(), r"not a sensor of AnyTouch; choose from \['gelsight', 'digit'"),
+            (UniT(WIDTHS), "not a sensor of UniT; it has the same weights for all"),
         ):
             with pytest.raises(UnknownNameError, match=message):
                 network.choose_sensor("gs_pink")

@@ -140,7 +140,7 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
     for setting in (dict(tacrgb_sensor="mini"), dict(freeze_tacrgb=True)):
         with pytest.raises(ValueError, match="'resnet18' has no pretrained weights"), torch.device("meta"):
             ObservationEncoder(EncoderConfig(**setting), SPEC, 1)
-    with pytest.raises(ValueError, match=r"'gs_pink' is no sensor of T3; choose from \['mini'"), torch.device("meta"):
+    with pytest.raises(ValueError, match=r"'gs_pink' is not a sensor of T3; choose from \['mini'"), torch.device("meta"):
         ObservationEncoder(EncoderConfig(tacrgb="t3", tacrgb_sensor="gs_pink"), SPEC, 1)
     with pytest.raises(ValueError, match="no network of this policy takes them"), torch.device("meta"):
         load_pretrained(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")

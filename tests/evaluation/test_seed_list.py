@@ -1,4 +1,4 @@
-"""A private list of initial states: read with care, and evaluated in its order."""
+"""A private list of initial states is checked when it is read, and evaluated in its order."""
 
 import json
 

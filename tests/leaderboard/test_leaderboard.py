@@ -20,6 +20,7 @@ from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from tests.browser import browser_program
 from tests.leaderboard.made_up import made_up
 from tests.tasks_and_marks import PEG
+from tests.trust.files_of_strangers import rewrite_json
 
 BROWSER = browser_program()
 POLICY = "tests.evaluation.policies:StandStill"
@@ -57,10 +58,7 @@ def test_a_submission_is_run_again_and_accepted(submission, tmp_path):
 
 
 def change(folder: Path, edit) -> None:
-    path = folder / "00000000.json"
-    result = json.loads(path.read_text())
-    edit(result)
-    path.write_text(json.dumps(result))
+    rewrite_json(folder / "00000000.json", edit)
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ THREAD_RADIUS, THREAD_PITCH, THREAD_DEPTH = 8e-3, 2e-3, 1.08e-3  # m: M16
 
 
 def thread_radius(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """V thread: crests at the full radius, one pitch a turn."""
+    """Radius of a V thread, in m: crests at the full radius, one pitch for each turn."""
     phase = (along / THREAD_PITCH - angle / (2 * np.pi)) % 1.0
     return THREAD_RADIUS - THREAD_DEPTH * np.abs(2 * phase - 1)
 
 
 def thread_mesh(length: float = 0.020, per_turn: int = 720, per_pitch: int = 64) -> trimesh.Trimesh:
-    """Axis along y, a surface without ends."""
+    """Surface of a thread with its axis along y, without end faces; m."""
     angle = np.linspace(0, 2 * np.pi, per_turn, endpoint=False)
     along = np.linspace(-length / 2, length / 2, round(length / THREAD_PITCH * per_pitch) + 1)
     a, y = np.meshgrid(angle, along, indexing="ij")
@@ -26,7 +26,7 @@ def thread_mesh(length: float = 0.020, per_turn: int = 720, per_pitch: int = 64)
 
 
 def thread_height(x: np.ndarray, y: np.ndarray, axis_height: float) -> np.ndarray:
-    """Height above the face of the lowest thread surface at (x, y), for an axis so far above the face."""
+    """Height of the thread's lower surface at (x, y), in m into the gel, for an axis at this height above the face."""
     angle = np.linspace(-0.9, 0.9, 20_001)
     out = np.empty_like(x)
     for value in np.unique(y):

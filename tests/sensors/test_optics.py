@@ -1,4 +1,4 @@
-"""The shader: flat is background, no seams, and the published calibration it was fitted to."""
+"""The shader: a flat gel shows the background, colours have no seam, and presses look as in the published calibration."""
 
 from pathlib import Path
 
@@ -118,7 +118,7 @@ def test_shadow_darkens_behind_the_bump_and_nowhere_else(optics):
 
 
 def dots(image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (n, 2) as column and row, and areas (n,), pixels, of what is dark."""
+    """Middles (n, 2), as column and row, and areas (n,) of the dark dots of an image, in pixels."""
     _, _, stats, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))
     return centres[1:], stats[1:, cv2.CC_STAT_AREA]
 

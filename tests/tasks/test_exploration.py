@@ -1,4 +1,4 @@
-"""ObjectSearch and BallSorting: near misses, and that only touch can tell."""
+"""ObjectSearch and BallSorting: near misses do not count, and only touch can tell what cameras cannot see."""
 
 import numpy as np
 import pytest

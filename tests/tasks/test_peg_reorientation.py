@@ -1,4 +1,4 @@
-"""PegReorientation: the peg must be turned in the hand; a hand that tilts instead of turning it does not win."""
+"""PegReorientation: the peg must be turned in the hand; a hand that tilts instead does not succeed."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,7 @@
 """SpaceMouse and gamepad: what their drivers report becomes a push of the robot.
 
-There is no such device on a test machine. The gamepad is one that SDL makes up; of the SpaceMouse, a SpaceNavigator, the
-reports are made up, and the library takes them apart.
+Test machines have no such devices. The gamepad is a virtual one of SDL. Of the SpaceMouse, a SpaceNavigator, the reports are
+made up, and its library parses them.
 """
 
 import ctypes
@@ -36,7 +36,7 @@ def test_a_device_whose_library_is_missing(monkeypatch, device, library):
 # -------------------------------------------------------------------- gamepad
 
 
-# of SDL: kinds of joysticks; sticks, in the order that it gives a made-up gamepad; its lowest button, its right shoulder's
+# numbers in SDL: kinds of joysticks; sticks of a virtual gamepad; its lowest button, and its right shoulder button
 GAMEPAD, WHEEL = 1, 2
 LEFT_ASIDE, LEFT_BACK, RIGHT_ASIDE, RIGHT_BACK = range(4)
 LOWEST, RIGHT_SHOULDER = 0, 10
@@ -44,7 +44,7 @@ LOWEST, RIGHT_SHOULDER = 0, 10
 
 @pytest.fixture
 def sdl():
-    """The library under pygame, its joysticks ready."""
+    """The SDL library of pygame, with joysticks initialised."""
     pygame = pytest.importorskip("pygame")
     files = list((Path(pygame.__file__).parents[1] / "pygame.libs").glob("libSDL2-2*"))
     if not files:
@@ -86,7 +86,7 @@ def test_a_wheel_is_no_gamepad(sdl):
 
 
 class SpaceNavigator:
-    """As hidapi gives one: reports of three axes each, as int16: 1 the pushes (right, back, down), 2 the turns about these."""
+    """As hidapi presents one: a report has three axes, int16; 1 has the pushes (right, back, down), 2 the turns about them."""
 
     vendor_id, product_id = 0x046D, 0xC626
     product_string, manufacturer_string, serial_number, release_number = "SpaceNavigator", "3Dconnexion", "", 1

@@ -17,7 +17,7 @@ def folder(tmp_path) -> Path:
 
 @pytest.fixture
 def demo(tmp_path) -> Path:
-    """A copy of the sample's trajectory file, to be spoiled."""
+    """A copy of the sample's trajectory file, for tests to damage."""
     for suffix in (".h5", ".json"):
         shutil.copy(SAMPLE.with_suffix(suffix), tmp_path / f"trajectory{suffix}")
     return tmp_path / "trajectory.h5"

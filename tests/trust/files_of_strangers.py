@@ -17,7 +17,7 @@ EXECUTED = "import pathlib; pathlib.Path('executed').touch()\n"
 
 
 class Gadget:
-    """Unpickled, it runs a command."""
+    """An object that runs a command when it is unpickled."""
 
     def __reduce__(self):
         return os.system, ("touch executed",)

@@ -90,7 +90,7 @@ def page():
 
 
 def connect(page, path: str | None = None, host: str | None = None, origin: str | None = None):
-    """A websocket to the page: of its own address unless told otherwise, whatever name it claims to ask for."""
+    """A websocket to the page, with the path and host of its address and no origin, unless others are given."""
     import viser
     from websockets.sync.client import connect as client
     from websockets.typing import Origin, Subprotocol

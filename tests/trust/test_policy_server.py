@@ -1,4 +1,4 @@
-"""A policy's server: its episodes stay apart, its absence is no failure of the policy, and nothing that it sends does harm."""
+"""A policy's server: its episodes stay apart, its absence does not count as a failed episode, and its answers do no harm."""
 
 import io
 import json
@@ -259,7 +259,7 @@ def answer(connection: socket.socket, attack: str, head: bytes) -> None:
 
 @contextmanager
 def hostile_server():
-    """Its address; the path says how it answers."""
+    """Address of a server whose answer depends on the path."""
 
     def serve(connection: socket.socket) -> None:
         request = b""

@@ -18,7 +18,7 @@ from .files_of_strangers import Gadget
 
 
 class CosineSchedule:
-    """Stands for a scheduler of the authors: pickled whole, and not to be had here."""
+    """Stands for a scheduler of the authors, which is pickled whole."""
 
     def __init__(self):
         self.steps = [1, 2]
@@ -81,7 +81,7 @@ def test_a_file_of_weights_runs_nothing(gadget, place, tmp_path, monkeypatch):
 
 
 def pickled(program: bytes, path: Path) -> Path:
-    """A file as torch writes it, around a pickle of one's own."""
+    """A file as torch writes it, around any pickle."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("a/data.pkl", program)
         archive.writestr("a/data/0", bytes(16))

@@ -1,4 +1,4 @@
-"""The texts of a submission stay texts: in the page and in the README they are no markup and no link to run."""
+"""The texts of a submission are shown as texts: neither the page nor the README takes them for markup or scripts."""
 
 import html
 import re
