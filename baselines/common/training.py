@@ -298,7 +298,7 @@ class SampleOrder:
 
     def take(self, count: int) -> torch.Tensor:
         """The next `count` indices; those left of an epoch are followed by the first of the next."""
-        if len(self._left) < count:
+        while len(self._left) < count:
             self._left = torch.cat([self._left, torch.randperm(self.num_samples, generator=self._generator)])
         taken, self._left = self._left[:count], self._left[count:]
         return taken

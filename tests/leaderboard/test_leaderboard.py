@@ -103,7 +103,7 @@ def test_an_episode_that_goes_otherwise_is_found(submission, tmp_path):
     assert not (tmp_path / "board").exists()
 
 
-def test_what_was_run_again_is_shown_and_counts_only_for_the_file_that_was_checked(submission, tmp_path, caplog):
+def test_a16_what_was_run_again_is_shown_and_counts_only_for_the_file_that_was_checked(submission, tmp_path, caplog):
     caplog.set_level("INFO")
     board = tmp_path / "board"
     taken = submit(submission, board, rerun=2)

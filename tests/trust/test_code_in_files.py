@@ -41,7 +41,7 @@ GADGETS = [
 
 
 @pytest.mark.parametrize("config", GADGETS, ids=str)
-def test_a_checkpoint_runs_nothing_that_its_config_names(config, tmp_path, monkeypatch):
+def test_a11_a_checkpoint_runs_nothing_that_its_config_names(config, tmp_path, monkeypatch):
     folder = tmp_path / "touch executed"  # the command that `os:system` would run
     folder.mkdir()
     (folder / "config.json").write_text(json.dumps(config))
@@ -80,7 +80,7 @@ def naming(env_id: str, name: str, folder: Path) -> Path:
     return folder / f"{name}.h5"
 
 
-def test_replay_from_the_command_line_imports_no_module_of_the_file(gadget):
+def test_a12_replay_from_the_command_line_imports_no_module_of_the_file(gadget):
     path = naming("gadget:ManiFeel-PegInsertion-v1", "states", gadget)
     command = [sys.executable, "-m", "manifeel_ms3.demonstrations.replay", str(path), "--num", "1"]
     done = subprocess.run(
@@ -104,7 +104,7 @@ READ_ENV_ID = {
 
 @pytest.mark.parametrize("env_id", ["gadget:Other-v1", "gadget:ManiFeel-PegInsertion-v1"])
 @pytest.mark.parametrize("command", READ_ENV_ID)
-def test_no_module_that_a_file_names_is_imported(command, env_id, gadget):
+def test_a12_no_module_that_a_file_names_is_imported(command, env_id, gadget):
     if command == "render_observations" and "Peg" in env_id:
         pytest.skip("it renders in worker processes, which the test of the command line stands for")
     path = naming(env_id, "observed" if command in ("view", "export") else "states", gadget)

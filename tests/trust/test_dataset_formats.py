@@ -45,14 +45,14 @@ INFOS = {
 
 
 @pytest.mark.parametrize("kind", INFOS)
-def test_a_broken_description_of_a_lerobot_dataset_is_refused(kind, images):
+def test_a29_a_broken_description_of_a_lerobot_dataset_is_refused(kind, images):
     (images / "meta/info.json").write_bytes(INFOS[kind])
     for read in (lerobot.count_episodes, lambda folder: lerobot.read_lerobot(folder, KEYS)):
         with pytest.raises(DemonstrationError, match=r"info\.json"):
             read(images)
 
 
-def test_more_episodes_than_there_are_is_refused(images):
+def test_a29_more_episodes_than_there_are_is_refused(images):
     rewrite_json(images / "meta/info.json", lambda info: info.update(total_episodes=9))
     with pytest.raises(DemonstrationError, match="holds 2 episodes, 9 are wanted"):
         lerobot.read_lerobot(images, KEYS)
@@ -62,13 +62,13 @@ def test_more_episodes_than_there_are_is_refused(images):
     "video_path",
     ["/etc/{video_key}", "../../{video_key}.mp4", "{video_key.__class__.__init__.__globals__}", "{0:>99999999999}", 5],
 )
-def test_a_video_path_is_compared_and_never_filled_in(video_path, videos):
+def test_b7_a_video_path_is_compared_and_never_filled_in(video_path, videos):
     rewrite_json(videos / "meta/info.json", lambda info: info.update(video_path=video_path))
     with pytest.raises(DemonstrationError, match="video_path"):
         lerobot.read_lerobot(videos, KEYS)
 
 
-def test_a_playlist_named_mp4_is_not_given_to_ffmpeg(videos, secret):
+def test_b7_a_playlist_named_mp4_is_not_given_to_ffmpeg(videos, secret):
     (path,) = videos.rglob("*.mp4")
     path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{secret}\n#EXT-X-ENDLIST\n")
     with pytest.raises(DemonstrationError, match="not an mp4 file"):
@@ -76,7 +76,7 @@ def test_a_playlist_named_mp4_is_not_given_to_ffmpeg(videos, secret):
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", "data/chunk-000/file-000.parquet", "data", "extra"])
-def test_links_out_of_a_lerobot_dataset_are_refused(name, images, tmp_path):
+def test_b7_links_out_of_a_lerobot_dataset_are_refused(name, images, tmp_path):
     away = tmp_path / "away"
     if (images / name).exists():
         (images / name).rename(away)
@@ -87,14 +87,14 @@ def test_links_out_of_a_lerobot_dataset_are_refused(name, images, tmp_path):
         lerobot.read_lerobot(images, KEYS)
 
 
-def test_a_pipe_in_a_dataset_is_refused_and_not_waited_for(images):
+def test_b7_a_pipe_in_a_dataset_is_refused_and_not_waited_for(images):
     os.mkfifo(images / "data/chunk-000/file-001.parquet")
     with pytest.raises(DemonstrationError, match="is no plain file"):
         lerobot.read_lerobot(images, KEYS)
 
 
 @pytest.mark.parametrize("name", ["../elsewhere/trajectory.h5", "/etc/passwd", "link/trajectory.h5"])
-def test_a_manifest_names_files_in_its_folder_alone(name, tmp_path):
+def test_b7_a_manifest_names_files_in_its_folder_alone(name, tmp_path):
     folder, elsewhere = tmp_path / "set", tmp_path / "elsewhere"
     folder.mkdir()
     shutil.copytree(SAMPLE.parent, elsewhere)
@@ -137,7 +137,7 @@ def store(exported, tmp_path) -> Path:
     ],
     ids=str,
 )
-def test_an_array_that_could_run_code_or_fill_memory_is_refused(name, change, store, tmp_path, monkeypatch):
+def test_b1_an_array_that_could_run_code_or_fill_memory_is_refused(name, change, store, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rewrite_json(store / name / ".zarray", lambda about: about.update(change))
     for chunk in (store / name).glob("[0-9]*"):
@@ -151,7 +151,7 @@ def test_an_array_that_could_run_code_or_fill_memory_is_refused(name, change, st
     assert not (tmp_path / "executed").exists()
 
 
-def test_consolidated_metadata_do_not_stand_in_for_what_was_checked(store, tmp_path, monkeypatch):
+def test_b1_consolidated_metadata_do_not_stand_in_for_what_was_checked(store, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     about = {str(path.relative_to(store)): json.loads(path.read_text()) for path in store.rglob(".z*")}
     about["data/action/.zarray"] |= {"dtype": "|O", "filters": [{"id": "pickle"}]}
@@ -161,7 +161,7 @@ def test_consolidated_metadata_do_not_stand_in_for_what_was_checked(store, tmp_p
 
 
 @pytest.mark.parametrize("ends", [[-1], [10**12], [5, 3], [0, 4], [4, 4], [2.5], [[1]], [float("nan")]], ids=str)
-def test_ends_of_episodes_rise_within_the_steps(ends, store):
+def test_a29_ends_of_episodes_rise_within_the_steps(ends, store):
     import zarr
 
     shutil.rmtree(store / "meta/episode_ends")
@@ -172,7 +172,7 @@ def test_ends_of_episodes_rise_within_the_steps(ends, store):
 
 
 @pytest.mark.parametrize("wanted", [-1, 0, 3])
-def test_as_many_episodes_as_there_are_can_be_read(wanted, store, images):
+def test_a29_as_many_episodes_as_there_are_can_be_read(wanted, store, images):
     with pytest.raises(DemonstrationError, match="episodes"):
         diffusion_policy_zarr.read_zarr(store, KEYS, wanted)
     with pytest.raises(DemonstrationError, match="episodes"):

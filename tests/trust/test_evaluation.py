@@ -66,7 +66,7 @@ def journal_of(out: Path) -> Path:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
+def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
     args = args_of("SticksInSecondEpisode", tmp_path / "evaluation.json", episodes=3)
     journal, errors = journal_of(args.out), tmp_path / "stderr"
     with errors.open("w") as file:
@@ -246,7 +246,7 @@ def add_all(journal: Journal) -> None:
         journal.add(outcome(seed))
 
 
-def test_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
+def test_a04_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
     with small_disk(64) as folder:
         out, seeds = folder / "evaluation.json", list(range(2000))
         write_result(result(), out)
@@ -264,14 +264,14 @@ def test_a_full_disk_leaves_the_old_result_and_all_finished_episodes():
         assert {path.name for path in folder.iterdir()} == {"evaluation.json", "evaluation.episodes.jsonl"}
 
 
-def test_a_full_disk_is_named_before_the_first_episode():
+def test_b05_a_full_disk_is_named_before_the_first_episode():
     with small_disk(64) as folder:
         fill(folder)
         with pytest.raises(ManifeelError, match="cannot be written"):
             main(args_of("Nobody", folder / "evaluation.json"))
 
 
-def test_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_path):
+def test_b05_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "folder").mkdir()
     for out, reason in (
@@ -286,7 +286,7 @@ def test_an_out_that_cannot_be_written_is_named_before_the_first_episode(tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"file", "folder"}
 
 
-def test_a_read_only_folder_is_named_before_the_first_episode():
+def test_b05_a_read_only_folder_is_named_before_the_first_episode():
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o555)
         child = os.fork()
@@ -363,7 +363,7 @@ def commit_seen_from(package: Path) -> str | None:
     return module.git_commit()
 
 
-def test_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_path, monkeypatch):
+def test_a28_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_path, monkeypatch):
     for name in ("foreign", "own"):
         (tmp_path / name).mkdir()
         git(tmp_path / name, "init", "-q")
@@ -383,7 +383,7 @@ def test_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tmp_pa
     assert provenance.git_commit() == here
 
 
-def test_without_git_the_commit_is_unknown(monkeypatch):
+def test_a05_without_git_the_commit_is_unknown(monkeypatch):
     monkeypatch.setenv("PATH", "/nogit")
     assert provenance.git_commit() is None
     assert result()["git_commit"] is None
@@ -392,7 +392,7 @@ def test_without_git_the_commit_is_unknown(monkeypatch):
 # ------------------------------------------------------------------------------- what is published
 
 
-def test_nan_never_gets_into_a_result(tmp_path):
+def test_a18_nan_never_gets_into_a_result(tmp_path):
     path = tmp_path / "result.json"
     for bad in (float("nan"), float("inf"), -float("inf")):
         for broken in (
@@ -434,7 +434,7 @@ def test_a_file_that_json_cannot_read_is_no_result(text, tmp_path):
         read_result(tmp_path / "result.json")
 
 
-def test_passwords_and_tokens_are_not_published():
+def test_b08_passwords_and_tokens_are_not_published():
     secret = dict(
         token="abc1",
         hfToken="abc2",

@@ -22,7 +22,7 @@ from .files_of_strangers import rewrite_json
 from .submissions import FIRST
 
 
-def test_one_evaluation_copied_thirty_times_is_refused(tmp_path):
+def test_a16_one_evaluation_copied_thirty_times_is_refused(tmp_path):
     folder = made_up(tmp_path / "theirs", "Theirs", "PegInsertion", "rgb", 25, seeds=1, steps=1)
     for seed in range(3):
         for step in range(10):
@@ -59,7 +59,7 @@ def retold(source: Path, target: Path, jitter: float, changed: int) -> None:
 @pytest.mark.parametrize(
     ("jitter", "changed", "is_copy"), [(0.015, 0, True), (0.0, 4, True), (0.0, 20, False), (2.0, 0, False)]
 )
-def test_copies_with_small_changes_are_refused(folder, jitter, changed, is_copy):
+def test_a16_copies_with_small_changes_are_refused(folder, jitter, changed, is_copy):
     retold(folder / FIRST, folder / "results/1/00000200.json", jitter, changed)
     submission = read_submission(folder)
     if is_copy:
@@ -69,7 +69,7 @@ def test_copies_with_small_changes_are_refused(folder, jitter, changed, is_copy)
         check(submission)  # running episodes again finds those
 
 
-def test_a_checkpoint_counts_once(folder):
+def test_a16_a_checkpoint_counts_once(folder):
     rewrite_json(folder / FIRST, lambda result: result["config"].update(step=200))
     submission = read_submission(folder)
     with pytest.raises(SubmissionError, match=r"2 results of .* are of training seed 0, step 200"):
@@ -79,13 +79,13 @@ def test_a_checkpoint_counts_once(folder):
 
 
 @pytest.mark.parametrize(("total", "drawn"), [(1, 1), (20, 20), (50, 33), (150, 43), (500, 47), (1500, 49)])
-def test_so_many_episodes_are_run_again(total, drawn):
+def test_a16_so_many_episodes_are_run_again(total, drawn):
     assert episodes_to_run_again(total) == drawn
     if total > 20:
         assert chance_to_pass(total, -(-total // 10), episodes_to_run_again(total)) < 0.01
 
 
-def test_the_draw_is_from_all_files_and_finds_a_tenth_of_inventions(tmp_path):
+def test_a16_the_draw_is_from_all_files_and_finds_a_tenth_of_inventions(tmp_path):
     submission = read_submission(made_up(tmp_path / "theirs", "Theirs", "PegInsertion", "rgb", 10, seeds=3, steps=4))
     episodes = [(path, k) for path in submission.results for k in range(50)]
     invented = set(random.Random(7).sample(episodes, len(episodes) // 10))
@@ -100,7 +100,7 @@ def test_the_draw_is_from_all_files_and_finds_a_tenth_of_inventions(tmp_path):
     assert passed <= 30  # 1 % of 2000 is 20, with a standard deviation of 4.5
 
 
-def test_each_row_of_the_page_is_drawn_from(tmp_path):
+def test_a16_each_row_of_the_page_is_drawn_from(tmp_path):
     folder = made_up(tmp_path / "theirs", "Theirs", "PegInsertion", "rgb", 10)
     other = made_up(tmp_path / "other", "Other", "ObjectSearch", "rgb", 30, seeds=1, steps=1)
     shutil.copytree(other / "results", folder / "results/search")
@@ -109,7 +109,7 @@ def test_each_row_of_the_page_is_drawn_from(tmp_path):
     assert sum(len(numbers) for path, numbers in drawn.items() if "search" not in path.parts) == episodes_to_run_again(200)
 
 
-def test_a_submission_that_was_not_run_again_says_so(folder, tmp_path):
+def test_a16_a_submission_that_was_not_run_again_says_so(folder, tmp_path):
     (folder / "rerun.json").write_text(json.dumps(dict(seed=1, versions={}, files={})))  # the leaderboard's own, forged
     main(Submit(folder, rerun=0, board=tmp_path / "board"))
     assert not (tmp_path / "board/theirs/rerun.json").exists()
@@ -129,7 +129,7 @@ def checkpoints_of(folder: Path, runs: Path) -> Path:
     return runs
 
 
-def test_results_are_of_the_checkpoints_that_the_submission_names(folder, tmp_path):
+def test_a16_results_are_of_the_checkpoints_that_the_submission_names(folder, tmp_path):
     runs = checkpoints_of(folder, tmp_path / "runs")
     submit = Submit(folder, checkpoint=(runs,), board=tmp_path / "board")
     with pytest.raises(SubmissionError, match=r"results/1/00000200.json: submission.json names no checkpoint"):
@@ -151,7 +151,7 @@ def test_results_are_of_the_checkpoints_that_the_submission_names(folder, tmp_pa
     assert not (tmp_path / "board").exists()
 
 
-def test_one_checkpoint_cannot_stand_for_two_results(folder, tmp_path):
+def test_a16_one_checkpoint_cannot_stand_for_two_results(folder, tmp_path):
     runs = checkpoints_of(folder, tmp_path / "runs")
     main(Hash(folder, checkpoint=(runs,)))
 

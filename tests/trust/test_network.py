@@ -45,7 +45,7 @@ def started():
         process.wait(30)
 
 
-def test_the_viewer_in_a_browser_listens_on_loopback_only(started):
+def test_a20_the_viewer_in_a_browser_listens_on_loopback_only(started):
     pytest.importorskip("rerun")
     port = free_port()
     process = started([sys.executable, "-m", "manifeel_ms3.demonstrations.view", str(SAMPLE), "--web", "--port", str(port)])
@@ -61,7 +61,7 @@ def test_the_viewer_in_a_browser_listens_on_loopback_only(started):
     assert not any(viewer.is_running() for viewer in viewers)  # nothing goes on listening
 
 
-def test_the_viewer_in_a_window_listens_on_loopback_only(started, tmp_path):
+def test_a20_the_viewer_in_a_window_listens_on_loopback_only(started, tmp_path):
     rerun = pytest.importorskip("rerun")
     from manifeel_ms3.demonstrations.view import viewer_command
 
@@ -108,7 +108,7 @@ def connect(page, path: str | None = None, host: str | None = None, origin: str 
     )
 
 
-def test_the_page_listens_on_loopback_only(page):
+def test_a21_the_page_listens_on_loopback_only(page):
     from manifeel_ms3.teleop.__main__ import Args
 
     port = urlsplit(page.address).port
@@ -124,7 +124,7 @@ def test_the_example_of_a_policys_server_listens_on_loopback_only(started):
     assert set(hosts_by_port(process).values()) <= LOOPBACK
 
 
-def test_the_page_takes_who_has_its_address(page):
+def test_a21_the_page_takes_who_has_its_address(page):
     own = urlsplit(page.address)
     for origin in (None, f"http://{own.netloc}"):
         with closing(connect(page, origin=origin)) as link:
@@ -153,7 +153,7 @@ def test_the_page_takes_who_has_its_address(page):
     ],
     ids=str,
 )
-def test_the_page_refuses_everybody_else(page, lie):
+def test_a21_the_page_refuses_everybody_else(page, lie):
     from websockets.exceptions import InvalidStatus
 
     with pytest.raises(InvalidStatus) as refused:
@@ -163,14 +163,14 @@ def test_the_page_refuses_everybody_else(page, lie):
     assert token.encode() not in refused.value.response.body
 
 
-def test_the_files_of_the_page_need_the_token_too(page):
+def test_a21_the_files_of_the_page_need_the_token_too(page):
     own = urlsplit(page.address)
     for path in ("/", "/index.html", "/guess/", "/favicon.ico"):
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(f"http://{own.netloc}{path}")
 
 
-def test_nobody_can_ask_for_a_public_tunnel(page, monkeypatch, caplog):
+def test_a21_nobody_can_ask_for_a_public_tunnel(page, monkeypatch, caplog):
     import msgspec
     import viser._viser as viser_server
 
@@ -185,7 +185,7 @@ def test_nobody_can_ask_for_a_public_tunnel(page, monkeypatch, caplog):
     assert made == []
 
 
-def test_each_start_has_another_token(page):
+def test_a21_each_start_has_another_token(page):
     from manifeel_ms3.teleop.operator import Operator
     from manifeel_ms3.teleop.page import Page
 
@@ -197,7 +197,7 @@ def test_each_start_has_another_token(page):
         other.stop()
 
 
-def test_a_page_for_other_machines_asks_for_the_token_too():
+def test_a21_a_page_for_other_machines_asks_for_the_token_too():
     pytest.importorskip("viser")
     from websockets.exceptions import InvalidStatus
 
@@ -221,7 +221,7 @@ def test_a_page_for_other_machines_asks_for_the_token_too():
 # -------------------------------------------------------------------- the doctor, and the cache
 
 
-def test_the_doctor_imports_nothing_from_the_current_folder(monkeypatch, tmp_path):
+def test_a13_the_doctor_imports_nothing_from_the_current_folder(monkeypatch, tmp_path):
     from manifeel_ms3 import doctor
 
     for name in ("torch", "gymnasium", "json"):
@@ -233,7 +233,7 @@ def test_the_doctor_imports_nothing_from_the_current_folder(monkeypatch, tmp_pat
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="PYTHONSAFEPATH is of Python 3.11")
-def test_worker_processes_import_nothing_from_the_current_folder(tmp_path):
+def test_a13_worker_processes_import_nothing_from_the_current_folder(tmp_path):
     """Not even while they start, before they know where their modules are."""
     for name in ("pickle", "socket", "multiprocessing/__init__"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
@@ -266,7 +266,7 @@ CALLS = {
 
 
 @pytest.mark.parametrize("call", CALLS)
-def test_a_home_that_cannot_be_written_is_named_with_its_remedy(call, tmp_path):
+def test_a29_a_home_that_cannot_be_written_is_named_with_its_remedy(call, tmp_path):
     """/proc takes no new folder, not even of root."""
     environment = {name: value for name, value in os.environ.items() if name not in ("MANIFEEL_CACHE_DIR", "XDG_CACHE_HOME")}
     program = (

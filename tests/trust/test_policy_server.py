@@ -74,7 +74,7 @@ def args_of(address: str, out: Path, **changes) -> Args:
 # ------------------------------------------------------------------------------- episodes
 
 
-def test_workers_that_share_a_server_do_not_mix_its_state():
+def test_a08_workers_that_share_a_server_do_not_mix_its_state():
     with served(example(MyPolicy=CountsSteps).Handler) as address:
         first, second = RemotePolicy(address), RemotePolicy(address)
         first.reset()
@@ -85,7 +85,7 @@ def test_workers_that_share_a_server_do_not_mix_its_state():
         assert [step_of(first), step_of(second)] == [1, 3]
 
 
-def test_the_example_forgets_the_oldest_episodes_and_says_so():
+def test_a08_the_example_forgets_the_oldest_episodes_and_says_so():
     with served(example(MyPolicy=CountsSteps, MAX_EPISODES=2).Handler) as address:
         old, used, new = (RemotePolicy(address) for _ in range(3))
         old.reset()
@@ -97,7 +97,7 @@ def test_the_example_forgets_the_oldest_episodes_and_says_so():
             used.act(OBSERVATION)
 
 
-def test_a_server_that_does_not_know_episodes_is_refused(tmp_path):
+def test_a08_a_server_that_does_not_know_episodes_is_refused(tmp_path):
     class Old(BaseHTTPRequestHandler):
         def do_POST(self):
             self.send_response(200)
@@ -114,7 +114,7 @@ def test_a_server_that_does_not_know_episodes_is_refused(tmp_path):
 # ------------------------------------------------------------------------------- absence
 
 
-def test_a_server_that_cannot_be_reached_ends_the_evaluation(tmp_path):
+def test_b04_a_server_that_cannot_be_reached_ends_the_evaluation(tmp_path):
     out = tmp_path / "evaluation.json"
     out.write_text("the result of before")
     with pytest.raises(PolicyUnavailableError, match=r"127.0.0.1:9 cannot be reached \(.*refused.*start the server first"):
@@ -123,7 +123,7 @@ def test_a_server_that_cannot_be_reached_ends_the_evaluation(tmp_path):
     assert list(tmp_path.glob("evaluation*")) == [out]
 
 
-def test_a_server_that_drops_packets_ends_the_evaluation(tmp_path):
+def test_b04_a_server_that_drops_packets_ends_the_evaluation(tmp_path):
     """A full queue of connections that nobody accepts: a further connection is never answered."""
     with socket.socket() as server:
         server.bind(("127.0.0.1", 0))
@@ -140,7 +140,7 @@ def test_a_server_that_drops_packets_ends_the_evaluation(tmp_path):
     assert not list(tmp_path.glob("evaluation*"))
 
 
-def test_an_evaluation_goes_on_when_its_server_is_back(tmp_path):
+def test_b04_an_evaluation_goes_on_when_its_server_is_back(tmp_path):
     whole = example().Handler
 
     resets = []
@@ -164,7 +164,7 @@ def test_an_evaluation_goes_on_when_its_server_is_back(tmp_path):
 
 
 @pytest.mark.parametrize("status", [302, 401, 410, 502, 503])
-def test_what_is_not_the_policys_fault_ends_the_evaluation(status):
+def test_b04_what_is_not_the_policys_fault_ends_the_evaluation(status):
     class Says(BaseHTTPRequestHandler):
         def do_POST(self):
             self.send_response(status)
@@ -314,7 +314,7 @@ ATTACKS = (
 )
 
 
-def test_no_answer_takes_more_than_300_megabytes(figure):
+def test_a22_no_answer_takes_more_than_300_megabytes(figure):
     mark = Path("/tmp/code_from_a_server_ran")
     mark.unlink(missing_ok=True)
     with hostile_server() as address:
@@ -331,7 +331,7 @@ def test_no_answer_takes_more_than_300_megabytes(figure):
 
 @pytest.mark.parametrize("dtype", ["<f8", "<f4", ">f4", "<i8", "|u1"])
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_honest_actions_arrive(dtype, save):
+def test_a22_honest_actions_arrive(dtype, save):
     class Answers:
         def act(self, obs):
             return np.arange(6).astype(dtype)
@@ -348,7 +348,7 @@ def test_honest_actions_arrive(dtype, save):
 
 
 @pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
-def test_a_server_on_this_machine_is_asked_without_a_proxy(name, monkeypatch):
+def test_a23_a_server_on_this_machine_is_asked_without_a_proxy(name, monkeypatch):
     for variable in ("no_proxy", "NO_PROXY"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("http_proxy", NOT_THERE)
@@ -358,7 +358,7 @@ def test_a_server_on_this_machine_is_asked_without_a_proxy(name, monkeypatch):
         assert step_of(policy) == 1
 
 
-def test_other_machines_are_asked_through_the_proxy(monkeypatch):
+def test_a23_other_machines_are_asked_through_the_proxy(monkeypatch):
     asked = []
 
     class Proxy(example().Handler):
@@ -375,7 +375,7 @@ def test_other_machines_are_asked_through_the_proxy(monkeypatch):
     assert asked == ["http://policy.example:8000/reset"]
 
 
-def test_the_password_of_a_server_is_sent_and_not_published(tmp_path):
+def test_b08_the_password_of_a_server_is_sent_and_not_published(tmp_path):
     class Asks(example().Handler):
         def do_POST(self):  # noqa: N802
             if self.headers["Authorization"] != "Basic " + b64encode(b"me:hunter22").decode():
@@ -394,7 +394,7 @@ def test_the_password_of_a_server_is_sent_and_not_published(tmp_path):
         assert "hunter23" not in str(raised.value)
 
 
-def test_the_example_serves_others_while_a_client_sends_half_a_body(figure):
+def test_a24_the_example_serves_others_while_a_client_sends_half_a_body(figure):
     handler = example(MyPolicy=CountsSteps).Handler
     handler.timeout = 1.0
     with served(handler) as address, socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as half:
@@ -410,7 +410,7 @@ def test_the_example_serves_others_while_a_client_sends_half_a_body(figure):
         figure("seconds until half a request is cut off", time.monotonic() - begin, at_most=5)
 
 
-def test_the_example_refuses_a_body_that_is_too_long():
+def test_a24_the_example_refuses_a_body_that_is_too_long():
     with served(example(MAX_BODY=1000).Handler) as address:
         policy = RemotePolicy(address)
         policy.reset()

@@ -31,7 +31,7 @@ def lightning(weights: dict) -> dict:
 
 
 @pytest.mark.parametrize("nested", [lambda w: w, lambda w: {"model": w}, lambda w: {"state_dict": w}, lightning])
-def test_published_weights_are_read_and_all_else_left_aside(nested, tmp_path):
+def test_b2_published_weights_are_read_and_all_else_left_aside(nested, tmp_path):
     base = torch.arange(24.0).reshape(4, 6)
     weights = OrderedDict(
         whole=base, part=base[1:3, ::2], turned=base.T, half=base.half(), bf=base.bfloat16(), count=torch.tensor(7),
@@ -45,7 +45,7 @@ def test_published_weights_are_read_and_all_else_left_aside(nested, tmp_path):
         assert torch.equal(read[name], tensor.detach()), name
 
 
-def test_a_modules_own_state_is_read_as_torch_reads_it(tmp_path):
+def test_b2_a_modules_own_state_is_read_as_torch_reads_it(tmp_path):
     state = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.BatchNorm1d(4)).state_dict()
     torch.save(state, tmp_path / "released.pth")
     read = read_released(tmp_path / "released.pth")
@@ -65,7 +65,7 @@ class Imports:
 
 @pytest.mark.parametrize("gadget", [Gadget, Opens, Imports])
 @pytest.mark.parametrize("place", ["beside", "within", "alone"])
-def test_a_file_of_weights_runs_nothing(gadget, place, tmp_path, monkeypatch):
+def test_b2_a_file_of_weights_runs_nothing(gadget, place, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     weights = {"w": torch.ones(2)}
     content = {"beside": {"model": weights, "x": gadget()}, "within": weights | {"x": gadget()}, "alone": gadget()}[place]
@@ -101,7 +101,7 @@ PICKLES = {
 
 
 @pytest.mark.parametrize("kind", PICKLES)
-def test_other_pickles_are_refused(kind, tmp_path, monkeypatch):
+def test_b2_other_pickles_are_refused(kind, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(CheckpointError, match="cannot be read as weights"):
         read_released(pickled(PICKLES[kind], tmp_path / "x.ckpt"))
@@ -134,7 +134,7 @@ def described(*place) -> bytes:
     return buffer.getvalue()
 
 
-def test_a_tensor_lies_within_its_file(tmp_path):
+def test_b2_a_tensor_lies_within_its_file(tmp_path):
     good = read_released(pickled(described(0, (2, 2), (2, 1)), tmp_path / "x.ckpt"))
     assert torch.equal(good["w"], torch.zeros(2, 2))
     for place in [(0, (5,), (1,)), (2, (3,), (1,)), (-1, (2,), (1,)), (0, (2**40,), (0,)), (0, (2,), (-1,)), (0, "ab", "cd"),
@@ -143,7 +143,7 @@ def test_a_tensor_lies_within_its_file(tmp_path):
             read_released(pickled(described(*place), tmp_path / "x.ckpt"))
 
 
-def test_programs_of_torch_and_other_files_are_refused(tmp_path):
+def test_b2_programs_of_torch_and_other_files_are_refused(tmp_path):
     torch.jit.script(torch.nn.Linear(2, 2)).save(tmp_path / "script.pth")
     (tmp_path / "text.pth").write_text("no zip")
     for path in (tmp_path / "script.pth", tmp_path / "text.pth", tmp_path / "missing.pth", tmp_path):
@@ -155,7 +155,7 @@ def test_programs_of_torch_and_other_files_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"\xff" * 99, b"\x02\0\0\0\0\0\0\0{}x", b"\xff\xff\xff\xff\xff\xff\xff\x7f{}"])
-def test_broken_safetensors_are_refused(content, tmp_path):
+def test_b2_broken_safetensors_are_refused(content, tmp_path):
     (tmp_path / "model.safetensors").write_bytes(content)
     with pytest.raises(CheckpointError, match="cannot be read"):
         read_tensors(tmp_path / "model.safetensors")

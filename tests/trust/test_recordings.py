@@ -107,7 +107,7 @@ def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.
 
 
 @ten_and_hundred
-def test_recording_is_killed_at_random_file_events(tmp_path, count, figure):
+def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 6)
     chance, kills, rounds = random.Random(0), 0, 0
     while kills < count:
@@ -123,7 +123,7 @@ def test_recording_is_killed_at_random_file_events(tmp_path, count, figure):
 
 
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
-def test_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
+def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 9)
 
     def prepare(path: Path) -> None:
@@ -151,7 +151,7 @@ def test_consolidation_is_killed_before_every_file_event(tmp_path, step, figure)
 
 
 @pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_kill_around_the_first_index_neither_blocks_nor_hides_the_settings(tmp_path, step):
+def test_a09_a_kill_around_the_first_index_neither_blocks_nor_hides_the_settings(tmp_path, step):
     record_made_up(tmp_path / "undisturbed/t.h5", 1)
     other = HEADER | dict(env_info=dict(env_id="Another-v1"))
     events = forked(lambda _: record_made_up(tmp_path / "counted/t.h5", 1))[1]
@@ -175,7 +175,7 @@ class Silent:
 
 
 @ten_and_hundred
-def test_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
+def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
     env = make_env(**KWARGS)
 
     def save(path: Path, say=lambda word: None) -> None:
@@ -206,7 +206,7 @@ def undisturbed(tmp_path_factory) -> Path:
     return path
 
 
-def test_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
+def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
     path = tmp_path / "t.h5"
     assert recorded(path, 2, ["os.remove", "'seed_", 1])[0] == -signal.SIGKILL
     assert len(seeds(path)) == 2
@@ -214,7 +214,7 @@ def test_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_pa
     assert_same(path, undisturbed)
 
 
-def test_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
+def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
     path = tmp_path / "t.h5"
     first = start_recording(path, 3)
     assert first.stdout.readline() == "begin\n"
@@ -227,7 +227,7 @@ def test_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
     assert_same(path, undisturbed)
 
 
-def test_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
+def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
         render_observations.main(render_observations.Args(undisturbed, tmp_path / "t.h5"))
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
@@ -240,7 +240,7 @@ def test_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
     assert not list(tmp_path.glob("t.*"))
 
 
-def test_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
+def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
     path = tmp_path / "t.h5"
     process = start_recording(path, 3, workers=2)
     assert process.stdout.readline() == "begin\n"
@@ -257,7 +257,7 @@ def test_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
     assert_same(path, undisturbed)
 
 
-def test_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
+def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
     with open_recording(tmp_path / "t.h5", HEADER) as dead:
         dead.begin()
     with open_recording(tmp_path / "t.h5", HEADER) as recording:
@@ -272,7 +272,7 @@ def test_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path)
 
 
 @two_and_hundred
-def test_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
+def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
     """Real processes, killed at random times; every second time the workers are left to themselves."""
     span, chance, kills, rounds = 6.0, random.Random(2), 0, 0
     while kills < count:
@@ -300,7 +300,7 @@ def test_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure
 # -------------------------------------------------------------------- other misfortunes
 
 
-def test_episodes_reach_the_disk_before_they_count(tmp_path):
+def test_b10_episodes_reach_the_disk_before_they_count(tmp_path):
     """Every file and folder is flushed before the renaming that makes it count (seen by strace where it is installed)."""
     trace = """
 import os, sys
@@ -364,7 +364,7 @@ def test_a_missing_folder_of_episodes_is_named(tmp_path):
         pass
 
 
-def test_a_home_that_cannot_be_written_is_named(tmp_path):
+def test_a29_a_home_that_cannot_be_written_is_named(tmp_path):
     environment = os.environ | dict(HOME="/proc/none", XDG_CACHE_HOME="/proc/none/cache", MANIFEEL_CACHE_DIR="")
     command = [sys.executable, "-m", "manifeel_ms3.demonstrations.record", PEG, "-n", "1", "--out", str(tmp_path / "t.h5")]
     command += ["--obs-mode", "none", "--env-kwargs", '{"render_backend": "none"}']
@@ -391,7 +391,7 @@ assert len(seeds(folder / "t.h5")) == 3
 
 
 @pytest.mark.parametrize("locale", ["C", "C.UTF-8"])
-def test_an_ascii_locale_writes_the_same(tmp_path, locale):
+def test_a30_an_ascii_locale_writes_the_same(tmp_path, locale):
     environment = os.environ | dict(LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     folder = tmp_path / "Übung with space"
     done = subprocess.run(

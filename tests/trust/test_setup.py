@@ -67,7 +67,7 @@ def deb822(uri: str, suite: str = "bookworm") -> str:
 
 @needs_apt
 @pytest.mark.parametrize("form", [one_line, deb822])
-def test_the_mirror_is_debians_and_not_that_of_the_first_source(form, apt):
+def test_a26_the_mirror_is_debians_and_not_that_of_the_first_source(form, apt):
     """Of the repositories that call themselves bookworm, with a component main; the first one is Google's."""
     ending = "list" if form is one_line else "sources"
     google = repository(apt / "packages.cloud.google.com/debian", "Google")
@@ -79,7 +79,7 @@ def test_the_mirror_is_debians_and_not_that_of_the_first_source(form, apt):
 
 
 @needs_apt
-def test_without_a_source_of_debian_there_is_no_mirror(apt):
+def test_a26_without_a_source_of_debian_there_is_no_mirror(apt):
     (apt / "sources.list.d/cloudsdk.list").write_text(one_line(repository(apt / "google", "Google")))
     (apt / "sources.list.d/never-fetched.list").write_text(one_line("file:/nowhere/debian"))
     done = run("apt-get update -q >/dev/null 2>&1 || true; debians_mirror bookworm", apt)
@@ -87,7 +87,7 @@ def test_without_a_source_of_debian_there_is_no_mirror(apt):
 
 
 @needs_apt
-def test_what_debian_has_not_signed_is_not_added(apt):
+def test_a26_what_debian_has_not_signed_is_not_added(apt):
     """A mirror whose list of packages nobody signed, though it claims to be Debian's."""
     (apt / "os-release").write_text("ID=debian\nVERSION_ID=12\n")
     forged = repository(apt / "forged", "Debian")
@@ -102,7 +102,7 @@ def test_what_debian_has_not_signed_is_not_added(apt):
 
 
 @needs_apt
-def test_backports_that_are_there_are_not_added_again(apt):
+def test_a26_backports_that_are_there_are_not_added_again(apt):
     """Two sources of one suite with different keys would stop apt altogether."""
     (apt / "os-release").write_text("ID=debian\nVERSION_ID=12\n")
     there = repository(apt / "mirror", "Debian Backports", "bookworm-backports")
@@ -114,7 +114,7 @@ def test_backports_that_are_there_are_not_added_again(apt):
 
 
 @needs_apt
-def test_undo_takes_back_what_was_added_and_nothing_else(apt):
+def test_a26_undo_takes_back_what_was_added_and_nothing_else(apt):
     other, added = apt / "sources.list.d/debian.list", apt / "sources.list.d/manifeel-backports.list"
     other.write_text("")
     added.write_text(one_line("file:/nowhere", "bookworm-backports"))
@@ -132,20 +132,20 @@ def test_undo_takes_back_what_was_added_and_nothing_else(apt):
     assert "Removed: nothing" in run("undo", apt).stdout
 
 
-def test_without_root_undo_says_what_it_cannot_remove(apt):
+def test_a26_without_root_undo_says_what_it_cannot_remove(apt):
     (apt / "sources.list.d/manifeel-backports.list").write_text("")
     done = run("as_root() { return 1; }; undo", apt)
     assert done.returncode == 1
     assert "cannot be removed" in done.stdout
 
 
-def test_an_unknown_flag_installs_nothing():
+def test_a26_an_unknown_flag_installs_nothing():
     done = subprocess.run([SETUP, "--undoo"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "usage" in done.stderr
 
 
-def test_a_long_list_of_libraries_is_read_as_a_whole(apt, tmp_path):
+def test_a27_a_long_list_of_libraries_is_read_as_a_whole(apt, tmp_path):
     """`ldconfig` that says more than a pipe holds, and dies of a reader that has left."""
     program = tmp_path / "bin/ldconfig"
     program.parent.mkdir()
@@ -160,7 +160,7 @@ def test_a_long_list_of_libraries_is_read_as_a_whole(apt, tmp_path):
     assert (tmp_path / "calls").read_text().split() == ["call"]
 
 
-def test_the_image_is_named_by_its_content_and_has_git():
+def test_b10_the_image_is_named_by_its_content_and_has_git():
     lines = (SETUP.parents[1] / "Dockerfile").read_text().splitlines()
     (base,) = [line for line in lines if line.startswith("FROM ")]
     name, _, digest = base.partition("@sha256:")
@@ -170,7 +170,7 @@ def test_the_image_is_named_by_its_content_and_has_git():
     assert any("apt-get install" in line and " git " in line for line in lines)
 
 
-def test_every_package_is_installed_by_its_hash():
+def test_b10_every_package_is_installed_by_its_hash():
     lock = (SETUP.parents[1] / "requirements.lock").read_text()
     pins = re.split(r"^(?=[a-z])", lock, flags=re.MULTILINE)[1:]
     assert len(pins) > 100
@@ -181,7 +181,7 @@ def test_every_package_is_installed_by_its_hash():
         assert all("--no-deps --require-hashes" in line for line in installs)
 
 
-def test_an_older_torch_is_replaced_by_the_pinned_one(tmp_path):
+def test_b02_an_older_torch_is_replaced_by_the_pinned_one(tmp_path):
     """A `.venv` of an earlier version, with torch 2.9 and a pip that writes down what it is asked for."""
     python = tmp_path / ".venv/bin/python"
     python.parent.mkdir(parents=True)

@@ -37,7 +37,7 @@ GRIDS = f"grids: [{{tasks: [{PEG}]}}]\n"
 # -------------------------------------------------------------------- results and status
 
 
-def test_a_result_counts_only_if_it_is_whole_and_of_this_checkpoint(tmp_path):
+def test_a04_a_result_counts_only_if_it_is_whole_and_of_this_checkpoint(tmp_path):
     kwargs = json.dumps(dict(render_backend="none", max_episode_steps=3))
     trained = Job("train", "a training", {})
     settings = dict(episodes=1, checkpoints=1, stop_at_success=False, half_precision=False, env_kwargs=kwargs)
@@ -62,7 +62,7 @@ def test_a_result_counts_only_if_it_is_whole_and_of_this_checkpoint(tmp_path):
     assert again() == 77.0
 
 
-def test_a_status_that_was_cut_off_is_none(study, tmp_path):
+def test_a04_a_status_that_was_cut_off_is_none(study, tmp_path):
     record, *_ = jobs_of(read_study(study))
     record.folder(tmp_path).mkdir(parents=True)
     for content in ("", '{"secon', "[]", "\x00"):
@@ -71,7 +71,7 @@ def test_a_status_that_was_cut_off_is_none(study, tmp_path):
     study_command.progress(read_study(study), [record], tmp_path)
 
 
-def test_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
+def test_a03_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
     """The other process is this one: a worker of Ray finds that it holds the job."""
     record, *others = jobs_of(read_study(study))
     with owned(record.folder(tmp_path) / STARTED), pytest.raises(study_command.StudyFailed) as error:
@@ -85,7 +85,7 @@ def test_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
         perform(record, tmp_path)
 
 
-def test_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp_path):
+def test_b05_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp_path):
     (tmp_path / "file").write_text("")
     for root in (tmp_path / "file", tmp_path / "file/inside", Path("/proc/study")):
         for arguments in (dict(), dict(dry_run=True)):
@@ -98,7 +98,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
 @pytest.mark.slow  # a whole Ray and a second one that is refused: minutes
-def test_ray_is_reached_from_here_alone_and_imports_nothing_from_the_current_folder(study, tmp_path):
+def test_b03_and_a13_ray_is_reached_from_here_alone_and_imports_nothing_from_the_current_folder(study, tmp_path):
     for name in ("torch.py", "json.py"):
         (tmp_path / name).write_text(f"import pathlib\npathlib.Path({str(tmp_path / 'executed')!r}).write_text({name!r})\n")
     root = tmp_path / "root"
@@ -144,7 +144,7 @@ def test_ray_is_reached_from_here_alone_and_imports_nothing_from_the_current_fol
 
 
 @pytest.mark.slow  # a whole Ray: a minute
-def test_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, figure):
+def test_a06_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, figure):
     root = tmp_path / "root"
     record, *_ = jobs_of(read_study(study))
     process = subprocess.Popen(
@@ -173,7 +173,7 @@ def test_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, figu
     assert "Traceback" not in errors
 
 
-def test_only_versions_of_ray_with_authentication_are_allowed():
+def test_b03_only_versions_of_ray_with_authentication_are_allowed():
     (ray,) = [one for one in map(Requirement, requires(PACKAGE) or []) if one.name == "ray"]
     pinned = Requirement(re.search(r'"(ray[^"]*)"', (REPOSITORY / "pyproject.toml").read_text())[1])
     assert AUTHENTICATED in pinned.specifier
@@ -202,7 +202,7 @@ print(cost.__file__, cost.estimate(second, Path(), 1).seconds)
 """
 
 
-def test_a_study_from_the_wheel_needs_no_sample_data(tmp_path):
+def test_a07_a_study_from_the_wheel_needs_no_sample_data(tmp_path):
     subprocess.run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)], cwd=REPOSITORY, check=True)
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as archive:
         archive.extractall(tmp_path / "site")
@@ -218,7 +218,7 @@ def test_a_study_from_the_wheel_needs_no_sample_data(tmp_path):
     assert float(seconds) == 0.5 * 1000 * 300  # 1000 epochs of 50 demonstrations of 48 samples (55 steps), in batches of 8
 
 
-def test_tasks_have_the_measured_length_of_their_demonstrations():
+def test_a07_tasks_have_the_measured_length_of_their_demonstrations():
     table = (REPOSITORY / "docs/tasks.md").read_text()
     rows = re.findall(r"^\| ([\w, ]+?)(?:, tight)? \| [\w ]+ \| (\d+) \| [\d.]+ \|$", table, flags=re.MULTILINE)
     measured = {name: int(steps) for names, steps in rows for name in names.split(", ") if "tight" not in names}
@@ -245,7 +245,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_a_wrong_study_is_told_in_one_line(name, tmp_path):
+def test_a29_a_wrong_study_is_told_in_one_line(name, tmp_path):
     content, said = WRONG[name]
     path = tmp_path / "study.yaml"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -256,7 +256,7 @@ def test_a_wrong_study_is_told_in_one_line(name, tmp_path):
     assert len(str(error.value)) < 1000
 
 
-def test_two_files_may_include_a_third(tmp_path):
+def test_a29_two_files_may_include_a_third(tmp_path):
     (tmp_path / "third.yaml").write_text(GRIDS)
     for name in ("one", "two"):
         (tmp_path / f"{name}.yaml").write_text("include: [third.yaml]")
@@ -264,7 +264,7 @@ def test_two_files_may_include_a_third(tmp_path):
     assert len(read_study(tmp_path / "study.yaml").grids) == 2
 
 
-def test_a_study_is_utf8_in_every_locale(tmp_path):
+def test_a29_a_study_is_utf8_in_every_locale(tmp_path):
     (tmp_path / "Prüfung.yaml").write_text("# Prüfung\n" + GRIDS, encoding="utf-8")
     script = "import sys; from pathlib import Path; from baselines.studies.study import read_study\n"
     script += "read_study(next(Path().glob('*.yaml')))"

@@ -42,7 +42,7 @@ def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> b
 
 
 @pytest.mark.parametrize("kills", [6, pytest.param(100, marks=pytest.mark.slow)])
-def test_a_submission_that_is_killed_while_it_is_taken_is_whole_or_absent(tmp_path, kills, figure):
+def test_a10_a_submission_that_is_killed_while_it_is_taken_is_whole_or_absent(tmp_path, kills, figure):
     folder = made_up(tmp_path / "theirs", "Theirs", "PegInsertion", "rgb", 10, seeds=3, steps=3)
     expected, rng, killed = contents(folder), random.Random(0), 0
     for number in range(kills):
@@ -60,7 +60,7 @@ def test_a_submission_that_is_killed_while_it_is_taken_is_whole_or_absent(tmp_pa
     figure(f"of {kills} processes killed while they take a submission, number hit at work", killed, at_least=kills // 3)
 
 
-def test_a_copy_that_fails_leaves_nothing(folder, tmp_path):
+def test_a10_a_copy_that_fails_leaves_nothing(folder, tmp_path):
     board = tmp_path / "board"
     (board / ".incoming").mkdir(parents=True)  # what a killed copy has left
     (board / ".incoming/results").write_text("in the way")
@@ -70,7 +70,7 @@ def test_a_copy_that_fails_leaves_nothing(folder, tmp_path):
     assert contents(take(submission, board)) == contents(folder)
 
 
-def test_only_what_was_checked_is_taken(folder, tmp_path):
+def test_a10_only_what_was_checked_is_taken(folder, tmp_path):
     (folder / "notes.txt").write_text("not for the board")
     (folder / "results/a.mp4").write_bytes(b"not in videos")
     submission = read_submission(folder)
@@ -108,7 +108,7 @@ def pipe(folder: Path, secret: Path) -> None:
 
 
 @pytest.mark.parametrize("harm", [link_to_a_secret, link_to_a_folder, link_in_a_folder, broken_link, pipe])
-def test_links_and_special_files_are_refused(folder, tmp_path, harm):
+def test_a14_links_and_special_files_are_refused(folder, tmp_path, harm):
     secret = tmp_path / "mine/secret.mp4"
     secret.parent.mkdir()
     secret.write_bytes(b"PRIVATE KEY")
@@ -124,7 +124,7 @@ def test_links_and_special_files_are_refused(folder, tmp_path, harm):
     assert "Theirs" not in page.read_text()
 
 
-def test_a_linked_folder_is_no_submission(folder, tmp_path):
+def test_a14_a_linked_folder_is_no_submission(folder, tmp_path):
     (tmp_path / "link").symlink_to(folder)
     with pytest.raises(SubmissionError, match="give the folder itself"):
         read_submission(tmp_path / "link")
@@ -134,7 +134,7 @@ def test_a_linked_folder_is_no_submission(folder, tmp_path):
     assert rows_on(board) == []
 
 
-def test_files_have_a_limit_of_size(folder, tmp_path, monkeypatch):
+def test_a14_files_have_a_limit_of_size(folder, tmp_path, monkeypatch):
     (folder / "videos").mkdir()
     with (folder / "videos/a.mp4").open("wb") as file:
         file.truncate(2**40)  # takes no room on the disk

@@ -43,14 +43,14 @@ from .submissions import FIRST, NASTY, contents
         (FIRST, lambda result: result["episodes"][0].update(more=1)),
     ],
 )
-def test_the_form_is_checked_before_anything_is_copied(folder, tmp_path, file, edit):
+def test_a17_the_form_is_checked_before_anything_is_copied(folder, tmp_path, file, edit):
     rewrite_json(folder / file, edit)
     with pytest.raises(SubmissionError, match=re.escape(file)):
         main(Submit(folder, rerun=0, board=tmp_path / "board"))
     assert not (tmp_path / "board").exists()
 
 
-def test_build_names_a_broken_submission_and_shows_the_others(folder, tmp_path, caplog):
+def test_a17_build_names_a_broken_submission_and_shows_the_others(folder, tmp_path, caplog):
     board = tmp_path / "board"
     main(Submit(folder, rerun=0, board=board))
     for name in ("empty", "broken", "foreign", "few"):
@@ -72,7 +72,7 @@ def test_build_names_a_broken_submission_and_shows_the_others(folder, tmp_path, 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e400", "-1e999"])
 @pytest.mark.parametrize("place", ["peak_contact_force", "inference_ms", "episode_len", "rate", "num_demos"])
-def test_numbers_are_finite(folder, number, place):
+def test_a18_numbers_are_finite(folder, number, place):
     text = (folder / FIRST).read_text()
     (folder / FIRST).write_text(re.sub(rf'"{place}": [\d.]+', f'"{place}": {number}', text, count=1))
     assert (folder / FIRST).read_text() != text
@@ -97,7 +97,7 @@ def test_numbers_are_finite(folder, number, place):
         b"\x00" * 100,
     ],
 )
-def test_whatever_a_file_holds_it_is_refused_in_one_way(folder, content):
+def test_a19_whatever_a_file_holds_it_is_refused_in_one_way(folder, content):
     for name in ("submission.json", FIRST, "rerun.json"):
         before = (folder / name).read_bytes() if (folder / name).exists() else None
         (folder / name).write_bytes(content)

@@ -17,7 +17,7 @@ from .submissions import NASTY
 
 
 @pytest.mark.parametrize("text", ["a\nb", "a\rb", "a\u2028b", "a\u202eb", "a\x00b", "a\u200bb", " ", ""])
-def test_name_and_authors_are_one_line(folder, text):
+def test_a15_name_and_authors_are_one_line(folder, text):
     for name in ("name", "authors"):
         rewrite_json(folder / "submission.json", lambda about, name=name: about.update({name: text}))
         with pytest.raises(SubmissionError, match=name):
@@ -48,7 +48,7 @@ def test_name_and_authors_are_one_line(folder, text):
         " https://a.b",
     ],
 )
-def test_only_plain_web_addresses_are_links(folder, link):
+def test_a15_only_plain_web_addresses_are_links(folder, link):
     assert not is_safe_link(link)
     rewrite_json(folder / "submission.json", lambda about: about.update(link=link))
     with pytest.raises(SubmissionError, match="the link must be an address"):
@@ -67,7 +67,7 @@ class Tags(HTMLParser):
         self.found.append((tag, dict(attrs)))
 
 
-def test_texts_of_a_submission_are_no_markup(folder, tmp_path):
+def test_a15_texts_of_a_submission_are_no_markup(folder, tmp_path):
     rewrite_json(
         folder / "submission.json",
         lambda about: about.update(name=NASTY, authors=NASTY, link="https://example.org/a_b?c=d&e=*f*#g"),
@@ -100,7 +100,7 @@ def test_texts_of_a_submission_are_no_markup(folder, tmp_path):
 
 @given(st.text(max_size=60))
 @settings(max_examples=300, deadline=None, derandomize=True)
-def test_a_cell_of_the_table_has_no_markup(text):
+def test_a15_a_cell_of_the_table_has_no_markup(text):
     cell = markdown_text(text)
     assert cell.isprintable()
     assert not re.search(r"(?<!\\)[`*_\[\]{}]", cell.replace("\\\\", ""))

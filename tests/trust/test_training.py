@@ -64,7 +64,7 @@ def require_equal(run_dir: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.slow)])
-def test_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, figure):
+def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, figure):
     whole, seconds = undisturbed
     moments = random.Random(kills)
     killed, resumed, runs = 0, 0, 0
@@ -94,7 +94,7 @@ def test_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, fi
 
 
 @pytest.mark.parametrize("linked", [None, "00000038"])
-def test_a_checkpoint_that_was_not_made_the_last_one_counts(linked, undisturbed, tmp_path):
+def test_a02_a_checkpoint_that_was_not_made_the_last_one_counts(linked, undisturbed, tmp_path):
     """As after a kill between the checkpoint and the link: after the first one, and after a later one."""
     shutil.copytree(undisturbed[0], tmp_path / "run", symlinks=True)
     checkpoints = tmp_path / "run/checkpoints"
@@ -107,7 +107,7 @@ def test_a_checkpoint_that_was_not_made_the_last_one_counts(linked, undisturbed,
     require_equal(tmp_path / "run", undisturbed[0])
 
 
-def test_what_was_logged_after_the_checkpoint_does_not_stay(tmp_path):
+def test_b06_what_was_logged_after_the_checkpoint_does_not_stay(tmp_path):
     """A run that was killed long after its last checkpoint, in the middle of a line of the log."""
     run_dir, saved = tmp_path / "run", STEPS - 10
     train(tiny_args(run_dir, steps=saved))
@@ -123,7 +123,7 @@ def test_what_was_logged_after_the_checkpoint_does_not_stay(tmp_path):
     assert all(json.loads(line)["losses/total_loss"] < 99 for line in after)
 
 
-def test_no_log_is_an_empty_one(tmp_path):
+def test_b06_no_log_is_an_empty_one(tmp_path):
     assert entries_until(tmp_path / "log.jsonl", 5) == []
     (tmp_path / "log.jsonl").write_bytes(b'[1]\n{"losses/total_loss": 1}\n\xff\xfe\n{"step": 2}\n{"step": 6}\n')
     assert entries_until(tmp_path / "log.jsonl", 5) == [dict(step=2)]
@@ -132,7 +132,7 @@ def test_no_log_is_an_empty_one(tmp_path):
 # -------------------------------------------------------------------- the folder of a run
 
 
-def test_a_folder_with_checkpoints_is_refused_and_stays_as_it_is(undisturbed, tmp_path):
+def test_a02_a_folder_with_checkpoints_is_refused_and_stays_as_it_is(undisturbed, tmp_path):
     run_dir = tmp_path / "run"
     shutil.copytree(undisturbed[0], run_dir, symlinks=True)
     before = {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")}
@@ -149,7 +149,7 @@ def test_a_folder_with_checkpoints_is_refused_and_stays_as_it_is(undisturbed, tm
     assert (run_dir / "notes.txt").read_text() == "mine"
 
 
-def test_nothing_is_deleted_before_the_new_run_can_begin(undisturbed, tmp_path):
+def test_a02_nothing_is_deleted_before_the_new_run_can_begin(undisturbed, tmp_path):
     run_dir = tmp_path / "run"
     shutil.copytree(undisturbed[0], run_dir, symlinks=True)
     with pytest.raises(ValueError, match=r"no\.h5"):
@@ -157,7 +157,7 @@ def test_nothing_is_deleted_before_the_new_run_can_begin(undisturbed, tmp_path):
     assert require_whole(run_dir / "checkpoints/last") == STEPS
 
 
-def test_runs_without_a_folder_get_one_each(tmp_path, monkeypatch):
+def test_a02_runs_without_a_folder_get_one_each(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     first = train(tiny_args(None, steps=2, seed=3))
     time.sleep(1.1)  # the names have seconds
@@ -169,14 +169,14 @@ def test_runs_without_a_folder_get_one_each(tmp_path, monkeypatch):
         assert checkpoint.parts[2].startswith("PegInsertion-tacff-seed3-20")
 
 
-def test_a_run_to_resume_must_be_named(tmp_path):
+def test_a02_a_run_to_resume_must_be_named(tmp_path):
     with pytest.raises(InvalidArgumentError, match="--resume needs --run-dir"):
         train(tiny_args(None, resume=True))
     with pytest.raises(InvalidArgumentError, match="excludes --overwrite"):
         train(tiny_args(tmp_path / "run", resume=True, overwrite=True))
 
 
-def test_prune_spares_what_last_names(tmp_path):
+def test_a02_prune_spares_what_last_names(tmp_path):
     """A shorter run and a longer one in the same folder."""
     for step in (41000, 42000, 43000, 5000):
         save_checkpoint(tmp_path / f"{step:08d}", dict(step=step), dict(a=torch.ones(1)), dict(b=torch.ones(1)))
@@ -186,7 +186,7 @@ def test_prune_spares_what_last_names(tmp_path):
     assert require_whole(tmp_path / "last") == 5000
 
 
-def test_a_checkpoint_is_never_replaced(tmp_path):
+def test_a02_a_checkpoint_is_never_replaced(tmp_path):
     tensors = dict(a=torch.ones(1))
     save_checkpoint(tmp_path / "00000001", dict(step=1), tensors, tensors)
     with pytest.raises(FileWriteError, match="00000001 cannot be written"):
@@ -195,7 +195,7 @@ def test_a_checkpoint_is_never_replaced(tmp_path):
     assert require_whole(tmp_path / "00000001") == 1
 
 
-def test_a_second_training_in_a_folder_is_told_of_the_first(tmp_path):
+def test_b06_a_second_training_in_a_folder_is_told_of_the_first(tmp_path):
     run_dir = tmp_path / "run"
     process = start(tiny_args(run_dir, steps=100_000))
     try:
@@ -217,7 +217,7 @@ def test_a_second_training_in_a_folder_is_told_of_the_first(tmp_path):
 # -------------------------------------------------------------------- other code
 
 
-def test_an_evaluation_does_not_import_from_the_current_folder(undisturbed, tmp_path):
+def test_a13_an_evaluation_does_not_import_from_the_current_folder(undisturbed, tmp_path):
     """In a process whose current folder has a torch.py, a json.py and a package of our name."""
     for name in ("torch.py", "json.py", "manifeel_ms3/__init__.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -59,7 +59,7 @@ HARM = {
 
 
 @pytest.mark.parametrize("kind", HARM)
-def test_a_trajectory_file_is_refused(kind, demo, secret):
+def test_a25_a_trajectory_file_is_refused(kind, demo, secret):
     with_dataset(demo, lambda group: HARM[kind](group, secret))
     for read in (
         lambda: read_demonstrations(demo, KEYS),
@@ -80,7 +80,7 @@ def test_a_trajectory_file_is_refused(kind, demo, secret):
         ("trajectory.episodes/missing.h5", "traj_0"),
     ],
 )
-def test_an_index_links_to_its_own_episodes_alone(file, place, tmp_path, secret):
+def test_a25_an_index_links_to_its_own_episodes_alone(file, place, tmp_path, secret):
     shutil.copy(SAMPLE.with_suffix(".json"), tmp_path / "trajectory.json")
     episodes, other = tmp_path / "trajectory.episodes", secret.with_name("other.h5")
     episodes.mkdir()
@@ -96,7 +96,7 @@ def test_an_index_links_to_its_own_episodes_alone(file, place, tmp_path, secret)
     assert len(read_demonstrations(tmp_path / "trajectory.h5", KEYS, num=1)) == 1
 
 
-def test_an_episode_of_an_index_is_checked_too(tmp_path, secret):
+def test_a25_an_episode_of_an_index_is_checked_too(tmp_path, secret):
     shutil.copy(SAMPLE.with_suffix(".json"), tmp_path / "trajectory.json")
     episodes = tmp_path / "trajectory.episodes"
     episodes.mkdir()
