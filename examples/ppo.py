@@ -9,7 +9,7 @@ import json
 import logging
 import random
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -17,8 +17,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
+import wandb
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
-from mani_skill.utils.wrappers import CPUGymWrapper
+from mani_skill.utils.wrappers import CPUGymWrapper, RecordEpisode
 from mani_skill.utils.wrappers.flatten import FlattenObservationWrapper
 from torch import nn
 from torch.distributions import Normal
@@ -44,6 +45,10 @@ ADAM_EPS, ADVANTAGE_EPS = 1e-5, 1e-8
 """Epsilon of Adam, and number that is added to the standard deviation of advantages, as in ManiSkill's ppo.py."""
 
 
+FILMED = dict(render_mode="rgb_array", human_render_camera_configs=dict(width=256, height=256))
+"""Arguments of the environment that is filmed; smaller than the task's own films, which take seconds an image on a CPU."""
+
+
 @dataclass
 class Args:
     env_id: str = "ManiFeel-PegInsertion-v1"
@@ -58,6 +63,14 @@ class Args:
     """Seed of the networks, the environments and the actions."""
     total_timesteps: int = 16_384
     """Number of environment steps."""
+    track: bool = False
+    """Whether Weights & Biases gets the log, too."""
+    wandb_project_name: str = "ManiSkill"
+    """Project of Weights & Biases."""
+    wandb_entity: str | None = None
+    """User or team of Weights & Biases; the user's default if not given."""
+    capture_video: bool = False
+    """Whether the first environment of every evaluation is filmed, to runs/<exp_name>/videos; this needs a renderer."""
     save_model: bool = True
     """Whether to write the weights to runs/<exp_name>/ckpt_<update>.pt at every evaluation."""
     evaluate: bool = False
@@ -66,6 +79,8 @@ class Args:
     """File of weights to start from."""
     learning_rate: float = 3e-4
     """Learning rate of Adam."""
+    anneal_lr: bool = False
+    """Whether the learning rate falls linearly to zero over the training."""
     num_envs: int = 4
     """Number of environments, each in a process of its own."""
     num_eval_envs: int = 2
@@ -134,16 +149,22 @@ class Agent(nn.Module):
         return Normal(self.actor_mean(self.normalized(obs)), self.actor_logstd.exp())
 
 
-def make_env(args: Args, ignore_terminations: bool = False) -> gym.Env:
+def make_env(args: Args, ignore_terminations: bool = False, videos: Path | None = None) -> gym.Env:
+    """One environment with flat observations; its episodes are filmed where a folder of videos is given."""
     torch.set_num_threads(1)
-    env = gym.make(args.env_id, obs_mode=args.obs_mode, render_backend="none", **json.loads(args.env_kwargs))
+    rendering = dict(render_backend="none") if videos is None else FILMED
+    env = gym.make(args.env_id, obs_mode=args.obs_mode, **rendering, **json.loads(args.env_kwargs))
     for wrapper in WRAPPERS:
         env = wrapper(env)
+    if videos is not None:
+        env = RecordEpisode(env, str(videos), save_trajectory=False, max_steps_per_video=args.num_eval_steps)
     return CPUGymWrapper(env, ignore_terminations=ignore_terminations, record_metrics=True)
 
 
-def make_envs(args: Args, num: int, **kwargs) -> AsyncVectorEnv:
+def make_envs(args: Args, num: int, videos: Path | None = None, **kwargs) -> AsyncVectorEnv:
+    """Environments in processes of their own; the first is filmed where a folder of videos is given."""
     made = [partial(make_env, args, **kwargs)] * num
+    made[0] = partial(made[0], videos=videos)
     return AsyncVectorEnv(made, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
 
 
@@ -249,10 +270,13 @@ def train(args: Args, agent: Agent, envs: AsyncVectorEnv, eval_envs: AsyncVector
             if args.save_model:
                 torch.save(agent.state_dict(), folder / f"ckpt_{iteration}.pt")
         if iteration < num_updates:
+            if args.anneal_lr:
+                optimizer.param_groups[0]["lr"] = args.learning_rate * (1 - iteration / num_updates)
             obs, successes = rollout.collect(agent, envs, obs)
             advantages = rollout.advantages(args, agent.value(tensor(obs)).detach())
             scalars = scalars | update(args, agent, optimizer, rollout, advantages)
             agent.watch(rollout.obs.flatten(0, 1))
+            scalars |= {"charts/learning_rate": optimizer.param_groups[0]["lr"]}
             scalars |= {"train/reward": rollout.rewards.mean().item(), "time/total": time.time() - begin}
             scalars |= {"train/success_once": float(np.mean(successes))} if successes else {}
         for name, value in scalars.items():
@@ -271,7 +295,12 @@ def main(args: Args) -> dict[str, float]:
     torch.set_num_threads(1)  # networks this small gain nothing from more, and lose much where other processes run
     torch.manual_seed(args.seed)
     random.seed(args.seed)
-    eval_envs = make_envs(args, args.num_eval_envs, ignore_terminations=True)
+    folder = Path("runs") / args.exp_name
+    if args.track:
+        names = dict(project=args.wandb_project_name, entity=args.wandb_entity, name=args.exp_name)
+        wandb.init(**names, config=asdict(args), sync_tensorboard=True, group="PPO", tags=["ppo", args.env_id])
+    videos = folder / "videos" if args.capture_video else None
+    eval_envs = make_envs(args, args.num_eval_envs, videos, ignore_terminations=True)
     agent = Agent(eval_envs.single_observation_space.shape[0], eval_envs.single_action_space.shape[0])
     if args.checkpoint:
         agent.load_state_dict(torch.load(args.checkpoint, weights_only=True))
@@ -280,9 +309,11 @@ def main(args: Args) -> dict[str, float]:
         logging.info("%s", {name: round(value, 3) for name, value in metrics.items()})
     else:
         envs = make_envs(args, args.num_envs, ignore_terminations=not args.partial_reset)
-        metrics = train(args, agent, envs, eval_envs, Path("runs") / args.exp_name)
+        metrics = train(args, agent, envs, eval_envs, folder)
         envs.close()
     eval_envs.close()
+    if args.track:
+        wandb.finish()
     return metrics
 
 

@@ -184,14 +184,27 @@ def test_ppo_trains_on_a_task_and_evaluates_what_it_saved(tmp_path, monkeypatch)
     ppo = load("ppo")
     monkeypatch.chdir(tmp_path)
     few = dict(num_envs=1, num_eval_envs=1, num_steps=100, num_eval_steps=10, env_kwargs=json.dumps(dict(max_episode_steps=10)))
-    trained = ppo.main(ppo.Args(exp_name="peg", total_timesteps=200, eval_freq=2, **few))
+    trained = ppo.main(ppo.Args(exp_name="peg", total_timesteps=200, eval_freq=2, anneal_lr=True, learning_rate=1e-3, **few))
     assert sorted(path.name for path in Path("runs/peg").glob("*.pt")) == ["ckpt_0.pt", "ckpt_2.pt"]
     log = [json.loads(line) for line in Path("runs/peg/log.jsonl").read_text().splitlines()]
     assert [entry["step"] for entry in log] == [0, 100, 200]
     assert "losses/policy_loss" in log[1]
+    assert [entry.get("charts/learning_rate") for entry in log] == [1e-3, 5e-4, None]
     assert trained["eval/return"] > 0.0
     checkpoint = Path("runs/peg/ckpt_2.pt")
     assert ppo.main(ppo.Args(evaluate=True, checkpoint=checkpoint, **few)) == pytest.approx(trained)
+
+
+@needs_renderer
+def test_ppo_films_an_evaluation_and_is_tracked(tmp_path, monkeypatch):
+    ppo = load("ppo")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    few = dict(num_eval_envs=1, num_envs=1, num_eval_steps=3, env_kwargs=json.dumps(dict(max_episode_steps=3)))
+    ppo.main(ppo.Args(exp_name="film", total_timesteps=0, track=True, capture_video=True, **few))
+    (video,) = Path("runs/film/videos").glob("*.mp4")
+    assert video.stat().st_size > 0
+    assert list(Path("wandb").glob("offline-run-*/*.wandb"))
 
 
 def test_ppo_needs_weights_to_evaluate():
