@@ -101,23 +101,24 @@ SETTINGS: dict[str, tuple[Any, Any]] = {  # setting: (paper, public code); "" wh
 }
 WHY_SETTINGS = {
     "lr": "Paper and code differ; the rates of the tables were measured with the code.",
-    "pose": "The equivariant policy of the code turns two columns of the rotation matrix.",
+    "pose": "The equivariant policy of the code rotates two columns of the rotation matrix.",
 }
 OVER_SOCKET = "At the code's height the plug could start inside its socket."
 WHY_STARTS = {
     "USBInsertion": OVER_SOCKET,
     "PowerPlugInsertion": OVER_SOCKET,
     "GearAssembly": OVER_SOCKET,
-    "ObjectSearch": "Without these millimetres around the two places, fifty evaluation episodes would be two.",
+    "ObjectSearch": "Without this variation, the fifty evaluation episodes would have only two different initial states.",
 }
 """Why starts differ from the code's."""
-HEAD = """# Fidelity: ours, the paper's and its public code's
+HEAD = """# Fidelity to the paper and its public code
 
 *Made by `python -m docs.make_fidelity` from the registry of tasks, the presets and docs/fidelity.yaml.*
 
-This benchmark bears the name of the paper ManiFeel ([Luu et al. 2025](https://arxiv.org/abs/2505.18472)). This page says, row
-by row, what is the same as in the paper and in its public code (purdue-mars/manifeel, commit e80b1f4), what is different,
-and why. Where the paper is silent, the code counts. Of {total} rows, {same} are the same and {different} differ.
+This package reimplements the benchmark of the paper ManiFeel ([Luu et al. 2025](https://arxiv.org/abs/2505.18472)). This page
+says, row by row, what is the same as in the paper and in its public code (purdue-mars/manifeel, commit e80b1f4), what is
+different, and why. Where the paper says nothing, the comparison is with the code. Of {total} rows, {same} are the same and
+{different} differ.
 """
 NAMES = ("", "paper", "public code", "here", "", "why")
 
@@ -132,7 +133,7 @@ def page() -> Iterator[str]:
     from_the_code = {
         "Demonstrations, camera and actions": task_rows(),
         "Time limits": limit_rows(),
-        "Starts: half ranges in m and rad, heights": start_rows(),
+        "Initial states: half ranges in m and rad, and heights": start_rows(),
         "Settings of the policies' preset `paper`": setting_rows(),
     }
     sections = {title: list(rows) for title, rows in from_the_code.items()} | written_rows()
@@ -154,7 +155,7 @@ def paper_tasks() -> list[TaskSpec]:
 def task_rows() -> Iterator[Row]:
     """A row on each task: demonstrations, camera and size of the actions."""
     for spec in paper_tasks():
-        trained_on = f"{training_demos(spec.name)} trained on"
+        trained_on = f"{training_demos(spec.name)} used for training"
         theirs = f"{RECORDED[spec.name]} recorded, {trained_on}; {CAMERAS[spec.category]}; {ACTIONS.get(spec.name, 6)} numbers"
         size = len(ACTION_AXES[spec.env_class.default_control_mode])
         ours = f"{spec.paper_demos} recorded, {trained_on}; {spec.policy_camera}; {size} numbers"
@@ -163,7 +164,7 @@ def task_rows() -> Iterator[Row]:
 
 def limit_rows() -> Iterator[Row]:
     """A row on the time limit of each task."""
-    why = "About twice a demonstration's length: waiting is not rewarded, and evaluation stays cheap."
+    why = "About twice the length of a demonstration, so that waiting is not rewarded and evaluation stays cheap."
     for spec in paper_tasks():
         yield _row(spec.name, "", f"{CODE_LIMIT} steps", f"{spec.max_episode_steps} steps", why)
 
@@ -178,7 +179,7 @@ def start_rows() -> Iterator[Row]:
         yield spec.name, "", shown[0], shown[1], _verdict(same), "" if same else WHY_STARTS.get(spec.name, "")
     for spec in paper_tasks():
         heights = (CODE_HEIGHTS.get(spec.name, 0.15), start_height(spec))
-        there, here = (f"tool {height * 1000:.0f} mm over the table" for height in heights)
+        there, here = (f"tool {height * 1000:.0f} mm above the table" for height in heights)
         yield _row(spec.name, "", there, here, WHY_STARTS.get(spec.name, ""))
 
 

@@ -28,7 +28,7 @@ DOCS = Path(__file__).parent
 CARDS, FILMS, PICTURES = DOCS / "tasks", DOCS / "films", DOCS / "images" / "tasks"
 RESULT_COLUMNS = 15
 """Number of columns of the table of docs/results.md that says what was run."""
-CAPTION = "The scene, front, side and wrist camera, left and right pad, at four fifths of a demonstration."
+CAPTION = "The scene, the front, side and wrist cameras, and the left and right pads, after four fifths of a demonstration."
 
 
 def main() -> None:
@@ -87,11 +87,11 @@ def _facts(spec: TaskSpec) -> str:
         "Instruction": spec.instruction,
         "Tables of the paper": ", ".join(spec.paper_tables) or "none",
         "Time limit": f"{spec.max_episode_steps} steps, {spec.max_episode_steps / CONTROL_FREQ:g} s",
-        "Actions": f"{len(axes)} numbers (`{env.default_control_mode}`): {', '.join(axes)}",
-        "Cameras": f"{spec.policy_camera} for policies; {', '.join(CAMERAS)} can be had",
+        "Actions": f"{len(axes)} components (`{env.default_control_mode}`): {', '.join(axes)}",
+        "Cameras": f"{spec.policy_camera} for policies; {', '.join(CAMERAS)} are available",
         "Reward": f"{modes}; the dense one is at most {env.max_reward:g}",
         "Gentle success": f"contact force of at most {gentle}",
-        "Demonstrations": f"{spec.paper_demos} recorded in the paper, {training_demos(spec.name)} of them trained on",
+        "Demonstrations": f"{spec.paper_demos} recorded in the paper, {training_demos(spec.name)} of them used for training",
         "Revision": spec.revision,
     }
     return f"## At a glance\n\n{markdown_table(('What', 'Value'), rows.items())}"
@@ -100,7 +100,7 @@ def _facts(spec: TaskSpec) -> str:
 def _randomization(spec: TaskSpec) -> str:
     ranges, reward = spec.env_class.Randomization, type(spec.env_class.reward_config)
     parts = []
-    for title, config in (("What is random: half ranges", ranges), ("Constants of the dense reward", reward)):
+    for title, config in (("Randomization: half ranges", ranges), ("Constants of the dense reward", reward)):
         documented = field_documentation(config)
         rows = [(f"`{name}`", f"{value:.4g}", documented[name]) for name, value in _defaults(config).items()]
         parts.append(f"## {title}\n\n{markdown_table(('Field', 'Default', 'Meaning'), rows)}")
@@ -124,7 +124,7 @@ def field_documentation(config: type) -> dict[str, str]:
 
 
 def _arguments(spec: TaskSpec) -> str:
-    """The arguments that make variants of a task: its own ones, and those of all tasks."""
+    """The arguments that make variants of a task: its own ones, and those of all tasks; none that is unset by default."""
     env: Any = spec.env_class
     own: dict[str, Any] = {}
     for base in reversed(env.__mro__[: env.__mro__.index(VisuotactileEnv)]):
@@ -132,7 +132,7 @@ def _arguments(spec: TaskSpec) -> str:
             own |= {p.name: p.default for p in inspect.signature(base).parameters.values() if p.default is not p.empty}
     of_all_tasks = {"lighting": "normal"} | ({"occlusion": True} if env.has_occluder else {})
     given = own | of_all_tasks | own  # a task's own default is the one that holds
-    rows = [(f"`{name}`", f"`{default!r}`", _values(env, name)) for name, default in given.items()]
+    rows = [(f"`{name}`", f"`{default!r}`", _values(env, name)) for name, default in given.items() if default is not None]
     return f"## Variants\n\n{markdown_table(('Argument', 'Default', 'Values'), rows)}"
 
 

@@ -13,13 +13,13 @@ from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
 from .presets import TrainingSettings
 
 SIGNIFICANCE = 0.05
-"""Value of p below which a gain is not called a matter of chance; the field's convention, as the intervals of 95 %."""
+"""Value of p below which a gain is called significant; the field's convention, like the 95 % intervals."""
 
 TEXT = """
 ## What touch adds, and how episodes fail
 
-Gains are over vision alone on the same initial states, with intervals of 95 %; how the other episodes end is counted by a rule
-of the task. What camera and touch could tell at all is in the [audit](audit.md).
+Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. How an episode fails is
+determined by a rule of its task. The [audit](audit.md) shows how much the camera and touch can reveal at all.
 
 """
 NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
@@ -53,13 +53,13 @@ def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterat
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
     rates: dict[str, Rate] = dict(zip(MODES, MODALITIES[task], strict=True))
-    papers = f"the paper's {rates[mode].mean - rates[VISION].mean:+.0%}"
+    papers = f"the paper: {rates[mode].mean - rates[VISION].mean:+.0%}"
     try:
         gain, p_value = difference(found[conditions[mode]], found[conditions[VISION]])
     except ResultError:  # evaluated on other initial states
         return f"{NAMES[mode]} cannot be compared"
-    verdict = "" if p_value < SIGNIFICANCE else ", which may be chance"
-    return f"{NAMES[mode]} adds {gain.signed}{verdict} ({papers})"
+    verdict = "" if p_value < SIGNIFICANCE else "not significant; "
+    return f"{NAMES[mode]} changes success by {gain.signed} ({verdict}{papers})"
 
 
 def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> str:
@@ -67,4 +67,4 @@ def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> 
     if endings is None:
         return ""
     missed = ", ".join(f"{count} {name}" for name, count in endings.missed) or "none"
-    return f"With {NAMES[mode]}, of {endings.episodes} episodes {endings.episodes - endings.succeeded} fail: {missed}."
+    return f"With {NAMES[mode]}, {endings.episodes - endings.succeeded} of {endings.episodes} episodes fail: {missed}."

@@ -10,9 +10,9 @@ from .markdown import markdown_table
 CENSUS = """
 ## How episodes end
 
-Counts over all episodes of the last checkpoint of every training seed. "lost": the episode could not be won any more, such as a
-part that was dropped. The others are what was missing at the time limit. "Pressed too hard" counts episodes of any ending but
-success whose largest contact force was above the task's limit for gentle success.
+Counts over all episodes of the last checkpoint of every training seed. "Lost" means that the episode could no longer succeed,
+for example because a part was dropped; the other endings say what was missing at the time limit. "Pressed too hard" counts
+the unsuccessful episodes whose largest contact force was above the task's limit for gentle success.
 
 """
 Results = list[dict[str, Any]]

@@ -17,16 +17,17 @@ RUNTIME_TASKS = ("BallSorting", "BallSortingDim")
 RUNTIME_TEXT = """
 ## Training time
 
-Minutes for one epoch of Diffusion Policy with TacRGB, sorting with {demos} demonstrations and batches of 8. The epochs differ
-in length, since the paper's demonstrations were recorded on a real robot; samples per second do not depend on that. Its GPU is
-an NVIDIA A30. Ours is measured by `manifeel study configs/runtime.yaml`.
+Minutes for one epoch of Diffusion Policy with TacRGB in ball sorting, with {demos} demonstrations and batches of 8. The paper's
+demonstrations were recorded on a real robot, so that its epochs differ in length from ours; samples per second do not depend on
+that. The paper's GPU is an NVIDIA A30. `manifeel study configs/runtime.yaml` measures our times.
 """
 SIMILARITY_TEXT = """
 ## Simulated and real touch
 
-Distances of simulated to real tactile images, by features of a network; the smaller, the more alike. The paper's are of a
-ResNet that it does not name. Ours need pictures of a real sensor, which this repository does not have: `manifeel similarity
---sim peg.h5 --real PICTURES --object ball` measures them, and this page shows them if it is given their folder.
+Distances between simulated and real tactile images in the feature space of a network; a smaller distance means that they are
+more alike. The paper used a ResNet that it does not name. Our distances need images of a real sensor, which this repository
+does not have: `manifeel similarity --sim peg.h5 --real PICTURES --object ball` measures them, and this page shows them if it
+is given the folder of the measurement.
 """
 
 

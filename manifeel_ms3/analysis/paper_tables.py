@@ -18,15 +18,15 @@ from .presets import PAPER, TrainingSettings
 TEXT = """
 ## The paper's tables
 
-A cell has our success with its interval of 95 %, and the paper's after the slash; a number of ours links to its result file,
-and what stands after ± is the standard deviation over training seeds, where there are several.
-Only conditions with the paper's number of demonstrations appear; each set-up has tables of its own. "Floor" is the highest
-success of policies that have learnt nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts
-itself on ball sorting: its list of set-ups has dim light alone, but Tables I and II report different rates for the same
-policies; here, Tables II and III are run in both lights.
+Each cell has our success with its 95 % interval and, after the slash, the paper's. Our rate links to its result file; the
+number after ± is the standard deviation over training seeds, where there are several. Only conditions with the paper's number
+of demonstrations appear, and each set-up has its own tables. "Floor" is the highest success of policies that have learnt
+nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts itself on ball sorting: its list of
+set-ups has only dim light, but its Tables I and II report different rates for the same policies. Here, Tables II and III are
+therefore run in both lights.
 """
 NEEDS_GPU = """
-Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` estimates their hours on yours.
+Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` estimates the hours on your machine.
 """
 HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
 PANEL = (11.0, 4.2)

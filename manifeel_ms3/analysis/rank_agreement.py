@@ -30,10 +30,10 @@ RESAMPLES = 1000
 TEXT = """
 ## Ranks
 
-Whether our results rank the paper's conditions as the paper does: Kendall's tau (1: the same order, -1: the reverse) and the
-mean maximum rank violation (MMRV; 0: the same order), with intervals of 95 % from a bootstrap over our training seeds and
-initial states. Within tasks, conditions of different tasks are not compared, so that the order is not that of the tasks'
-difficulty.
+Whether our results rank the paper's conditions as the paper does, by Kendall's tau (1: the same order, -1: the reverse) and
+the mean maximum rank violation (MMRV; 0: the same order), with 95 % intervals from a bootstrap over our training seeds and
+initial states. "Within tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
+difficult the tasks are.
 
 """
 

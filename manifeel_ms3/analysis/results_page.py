@@ -40,32 +40,32 @@ REFERENCES = ("MeanAction", "Untrained")
 SECONDS_PER_HOUR = 3600
 HEAD = """# Results
 
-*Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is typed by hand.*
+*Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is written by hand.*
 
-Success is success at any step of an episode, with its interval of 95 % over training seeds and initial states: the mean over
-training seeds, the last checkpoints (at most {last}) and the evaluation episodes; "of" says how many there are of each. "Std"
-is the standard deviation over training seeds. "Gentle success" counts the episodes that succeed before the contact force
-exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor" is the highest
-success of policies that have learnt nothing, where it was measured on this revision of the task. "Settings" names the preset
-of the policy and what differs from it, "id" is the hash of everything that makes the condition another one. Cost is that of
-training, all seeds together.
+An episode is a success if the task was solved at any step. A rate is the mean over training seeds, the last checkpoints (at
+most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states; "of" gives the number
+of each. "Std" is the standard deviation over training seeds. "Gentle success" counts the episodes that succeed before the
+contact force exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor"
+is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "Settings"
+names the preset of the policy and what differs from it, and "id" is a hash of everything that defines the condition. "Cost"
+is the time of training, summed over the seeds.
 """
 CHART = """
-![Success by task and sensing, with intervals of 95 %, and the paper's rates]({figure})
+![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})
 
-Success in the tasks of the paper's Table I by what the policy senses. Black lines are the paper's rates, of larger networks and
-other parts of the benchmark ([fidelity](fidelity.md)); the numbers stand in the tables below.
+Success in the tasks of the paper's Table I by what the policy senses. Black lines are the paper's rates, which come from larger
+networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
 """
 AGAIN = """
-The file of a result is linked from its success. Where it lies in a folder `leaderboard/NAME/seed0`, its checkpoint is beside
-it, and `manifeel eval --entry NAME` runs its episodes again and says in how many the outcomes agree. `manifeel study
-configs/tables_cpu.yaml` makes all results of the small networks.
+Each success rate links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is beside
+it, and `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree. `manifeel study
+configs/tables_cpu.yaml` produces all results of the small networks.
 """
 CURVES = """
 ![Success over environment steps trained on]({figure})
 
-Success of the checkpoints in the course of training, with intervals of 95 %. An environment step is one recorded step that a
-sample of a batch begins at: gradient steps times batch size. The numbers: [csv]({table}).
+Success of the checkpoints in the course of training, with 95 % intervals. Each sample of a batch counts as one environment
+step: their number is that of the gradient steps times the batch size. The numbers are also available as [csv]({table}).
 """
 GENTLE = """
 ## Gentle success
@@ -78,20 +78,22 @@ The curves end at the success of the tables, and the dashed line is the limit of
 FLOORS = """
 ## Failure floors
 
-Success of policies that have learnt nothing, with Wilson intervals of 95 % and the number of episodes, on the present revision
-of each task: {policies}. `python -m baselines.floors` measures them; tasks that are not in the table were not measured.
+Success of policies that have learnt nothing, with 95 % Wilson intervals and the number of episodes, on the current revision
+of each task. The policies are {policies}. `python -m baselines.floors` measures them; tasks that are not in the table have
+not been measured.
 
 """
 LEFT_OUT = """
 Runs with fewer than {episodes} episodes or {steps:,} gradient steps, and runs whose training was stopped, have another purpose:
-they are listed here and enter nothing below.
+they are listed here, and nothing below includes them.
 """
 CLAIMS = """
 ## The paper's claims
 
-Each claim is a difference of two conditions on the same initial states, with its interval of 95 % ([how](evaluation.md)). Both
-have the same settings, and equally many demonstrations: the paper's. Claim 4 may rest on the public code: it trains Flow
-Matching on Gaussian noise, but starts it from uniform noise ([fidelity](fidelity.md)).
+Each claim is tested as the difference between two conditions on the same initial states, with its 95 % interval
+([method](evaluation.md#the-papers-protocol-and-claims)). Except for what the claim compares, both conditions have the same
+settings and the paper's number of demonstrations. Claim 4 may be an artefact of the public code, which trains Flow Matching
+on Gaussian noise but starts generation from uniform noise ([fidelity](fidelity.md)).
 """
 
 
@@ -251,7 +253,8 @@ def _table_of_floors() -> str:
         (spec.name, spec.revision, *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
         for spec, here in floors
     ]
-    policies = "; ".join(f"{name}: {about}" for name, about in POLICIES.items())
+    *others, last = (f'"{name}" ({about})' for name, about in POLICIES.items())
+    policies = f"{', '.join(others)} and {last}"
     return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 

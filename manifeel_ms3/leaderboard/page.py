@@ -123,12 +123,14 @@ def ranked(rows: list[Row]) -> list[Row]:
 def leaderboard_table(rows: list[Row]) -> str:
     """The leaderboard in Markdown."""
     head = (
-        f"# Leaderboard\n\n`{PAGE}` shows the same with filters, learning curves and videos. Success is the mean over "
-        f"{FULL[0]} training seeds, the last {FULL[1]} checkpoints and {FULL[2]} evaluation episodes, with its interval of "
-        '95 %; where there are fewer, "of" says how many. A success is gentle where the contact force stayed within the limit '
-        'of the task until then ([limits](../docs/evaluation.md)). "Std" is the standard deviation over training seeds, '
-        '"floor" the success of policies that have learnt nothing, as far as it was measured. "Run again" is the number of '
-        "episodes that the leaderboard ran again with the same outcome ([what this proves](../docs/evaluation.md)).\n\n"
+        f"# Leaderboard\n\n`python -m manifeel_ms3.leaderboard build` writes this table, and `{PAGE}`, which shows the "
+        f"same with filters, learning curves and videos. Success is the mean over {FULL[0]} training seeds, the last {FULL[1]} "
+        f"checkpoints and {FULL[2]} evaluation episodes, with its 95 % interval; where there are fewer, "
+        '"of" gives their numbers. A success is gentle if the contact force stays within the limit of the task until then '
+        '([limits](../docs/evaluation.md#what-is-measured)). "Std" is the standard deviation over training seeds; "floor" is '
+        'the success of policies that have learnt nothing, where it was measured. "Run again" is the number of episodes that '
+        "the leaderboard ran again with the same outcome "
+        "([what this proves](../docs/evaluation.md#what-running-episodes-again-proves)).\n\n"
     )
     cells = []
     for row in rows:

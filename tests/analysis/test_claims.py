@@ -48,9 +48,9 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
     assert "What touch adds, and how" not in page_of(tmp_path)  # nothing to compare with
     write_run(tmp_path, TACFF, 0.5)
     (paragraph,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
-    assert re.search(r"TacFF adds \+30% \[\+\d+%, \+\d+%\] \(the paper's \+26%\)\. ", paragraph)
+    assert re.search(r"TacFF changes success by \+30% \[\+\d+%, \+\d+%\] \(the paper: \+26%\)\. ", paragraph)
     assert "TacRGB" not in paragraph
-    assert re.search(r"With vision alone, of 50 episodes 40 fail: 40 [a-z]", paragraph)
+    assert re.search(r"With vision alone, 40 of 50 episodes fail: 40 [a-z]", paragraph)
 
 
 def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):

@@ -45,7 +45,7 @@ class PegReorientationRandomization(InsertionRandomization):
     force_limit=38.0,
 )
 class PegReorientationEnv(InsertionEnv):
-    """Turn a tilted peg in the hand against a rim that the camera cannot see, and put it in.
+    """Turn a tilted peg in the hand against a rim that the camera cannot see, and insert it.
 
     **Task Description:**
     The gripper holds a peg, 16 x 10 x 50 mm, at an angle, over a rim in an opaque box that the policy's camera cannot see into.
@@ -56,7 +56,7 @@ class PegReorientationEnv(InsertionEnv):
     - peg in hand: pitch about the closing axis +-30 degrees
 
     **Success Conditions:** held for 0.5 s
-    - at least 90 % of the rim's depth is taken
+    - the peg fills at least 90 % of the depth of the rim
     - the peg is tilted by less than 3 degrees, and the hand by less than 5 degrees
     - the angle between the peg and the hand is less than 3 degrees: a hand that tilts instead of turning the peg fails
 

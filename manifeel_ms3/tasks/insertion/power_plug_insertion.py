@@ -18,10 +18,10 @@ from .base import InsertionEnv
     force_limit=32.0,
 )
 class PowerPlugInsertionEnv(InsertionEnv):
-    """Insert a NEMA 5-15 plug into a socket that looks up.
+    """Insert a NEMA 5-15 plug into a socket that faces up.
 
     **Task Description:**
-    The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that looks up. With
+    The gripper holds a NEMA 5-15 plug and puts its two blades and its ground pin into a socket that faces up. With
     `fit="paper"` plug and socket are those of the paper's public code, 1.8 times the standard, with 0.5 to 0.8 mm of play on
     each side; with `fit="tight"` they are the standard's, with 0.2 mm. The ground pin, longer than the blades, finds its hole
     first.
@@ -32,7 +32,7 @@ class PowerPlugInsertionEnv(InsertionEnv):
     - plug in hand: pitch about the closing axis +-10 degrees
 
     **Success Conditions:** held for 0.5 s
-    - the blades are within a tenth of their length of where they end
+    - the blades are inserted to within a tenth of their length of the final position
     - the plug is tilted by less than 3 degrees
 
     **Fail Conditions:** the plug has left the grip (30 mm).

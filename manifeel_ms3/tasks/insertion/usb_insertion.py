@@ -18,10 +18,10 @@ from .base import InsertionEnv
     force_limit=31.0,
 )
 class USBInsertionEnv(InsertionEnv):
-    """Insert a USB-A plug into a port that looks up.
+    """Insert a USB-A plug into a port that faces up.
 
     **Task Description:**
-    The gripper holds a USB-A plug by its handle and puts it into a port that looks up. With `fit="paper"` plug and port are
+    The gripper holds a USB-A plug by its handle and puts it into a port that faces up. With `fit="paper"` plug and port are
     those of the paper's public code, 1.8 times the standard, with 0.7 mm of play on each side along the plug's width and 0.4 mm
     at the tongue; with `fit="tight"` they are the standard's, with 0.1 mm. The plug fits only one way round, which is the way
     it is held.
