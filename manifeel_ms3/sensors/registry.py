@@ -51,7 +51,7 @@ def gelsight_mini(uid: str, link: str) -> TactileSensorConfig:
         pixel_size=5.9e-5,
         taxel_pitch=TAXEL_PITCH,
         optics=OpticsConfig(calibration=data_dir() / "gelsight_mini_shader.npz"),
-        # outer size of the data sheet, 28 mm across, 32 mm along, 24 mm deep
+        # outer size of the data sheet: 28 mm across, 32 mm along and, with the gel's 3 mm, 24 mm deep
         housing=HousingConfig(width=0.028, depth=0.021, beyond_gel=(0.032 - gel.size[1]) / 2),
     )
 
@@ -75,7 +75,7 @@ def digit(uid: str, link: str) -> TactileSensorConfig:
         pixel_size=0.019 / 320,
         taxel_pitch=TAXEL_PITCH,
         optics=OpticsConfig(lights=LightsConfig(tuple(around))),
-        # 18 mm deep without its gel (Lambeta et al. 2020); width and tip are chosen
+        # 18 mm deep without its gel (Lambeta et al. 2020); width, tip and protrusion are chosen, the last above the dome's sag
         housing=HousingConfig(width=0.026, depth=0.018, beyond_gel=0.003, protrusion=0.008),
     )
 

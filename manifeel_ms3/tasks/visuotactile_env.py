@@ -230,7 +230,7 @@ class VisuotactileEnv(SceneryEnv):
         return None
 
     def failed(self, measures: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Whether the episode cannot be won any more, (N,) bool."""
+        """Whether the episode can no longer succeed, (N,) bool."""
         raise NotImplementedError
 
     def shortcomings(self, measures: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
