@@ -84,7 +84,7 @@ def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--out", "peg.avi"], "peg.avi is no path of a film; give a file that ends in .mp4, .webp, .gif"),
+        (["--out", "peg.avi"], "peg.avi is not a path of a film; give a file that ends in .mp4, .webp, .gif"),
         (["--episode", "7"], "has the episodes 0 to 1"),
         (["--camera", "top"], "--camera='top' is unknown; choose from"),
         (["--pad", "both"], "--pad='both' is unknown; choose from"),

@@ -1,8 +1,8 @@
 """Controllers for contact: a pose target with a limited lead over the tool, and a gripper that keeps its grip.
 
-The arm follows pose targets that accumulate (precise in the air: a commanded millimetre is a millimetre). Before each command,
-the target is pulled back until it leads the tool's actual pose by at most `target_lead_limit`. Contact force is thereby bounded
-by that limit times the joint stiffness, whatever the policy asks for, as with a task-space impedance.
+The arm follows pose targets that accumulate, so that free motion is precise: a commanded millimetre is a millimetre. Before
+each command, the target is pulled back until it leads the tool's actual pose by at most the target lead limit. This bounds
+the contact force by that limit times the joint stiffness, whatever the policy asks for, as with a task-space impedance.
 """
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
@@ -35,27 +35,33 @@ from mani_skill.utils.structs import Pose
 IK_TOLERANCE = 1e-7
 """Norm of the pose error, in m and rad, at which inverse kinematics has converged: the resolution of single precision."""
 IK_ITERATIONS = 30
-"""Largest number of Gauss-Newton iterations; a step of an episode takes a few."""
+"""Largest number of Gauss-Newton iterations; a control step takes only a few. Set once; not tuned."""
 
 
 def clamp_norm(vector: torch.Tensor, limit: float) -> torch.Tensor:
-    """Shorten the rows of `vector` (N, D) that are longer than `limit`."""
+    """Vectors (N, D) like those of `vector`, the ones that are longer than `limit` shortened to it."""
     norm = torch.linalg.norm(vector, dim=-1, keepdim=True)
     return vector * (limit / norm.clamp(min=limit))
 
 
 def rotation_between(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:
-    """Rotation vector (N, 3), rad, that turns quaternion `start` into `end` about the axes both are expressed in."""
+    """Rotation vector (N, 3), rad, that turns the quaternion `start` (N, 4), w first, into `end`, in the frame of both."""
     turn = quaternion_multiply(end, quaternion_invert(start))
     turn = torch.where(turn[:, :1] < 0, -turn, turn)  # of the two rotations, the shorter one
     return quaternion_to_axis_angle(turn)
 
 
 def solve_ik(kinematics: Kinematics, pose: Pose, q0: torch.Tensor, iterations: int = 1) -> torch.Tensor:
-    """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0`.
+    """Arm joint angles (N, 7), in rad, that put the tool at a pose, by inverse kinematics.
 
-    On a GPU this takes `iterations` Levenberg-Marquardt steps; on the CPU Gauss-Newton runs to convergence. Where no solution
-    is found the nearest iterate is returned: a target out of reach must not stop the arm dead.
+    On a GPU this takes `iterations` Levenberg-Marquardt steps; on the CPU, Gauss-Newton runs to convergence. Where no solution
+    is found, the last iterate is returned, so that the arm does not stop at a target that is out of reach.
+
+    Args:
+        kinematics: Kinematics of the arm.
+        pose: Poses (N,) of the tool in the base frame; N is 1 on the CPU.
+        q0: Joint positions (N, 9) of the whole robot, in rad and m.
+        iterations: Number of steps on a GPU.
     """
     joints = kinematics.active_joint_indices
     if kinematics.use_gpu_ik:
@@ -64,7 +70,7 @@ def solve_ik(kinematics: Kinematics, pose: Pose, q0: torch.Tensor, iterations: i
             q[:, joints] = kinematics.compute_ik(pose, q)
         return q[:, joints]
     start = q0[0, kinematics.pmodel_active_joint_indices].cpu().numpy()
-    # dt = 1 makes the damped iteration Gauss-Newton; the stock 0.1 stops 0.1 mm short
+    # dt = 1 makes the damped iteration Gauss-Newton; with ManiSkill's 0.1, it stops 0.1 mm short
     solution, _, _ = kinematics.pmodel.compute_inverse_kinematics(
         kinematics.end_link_idx, pose.sp, start, kinematics.qmask, eps=IK_TOLERANCE, max_iterations=IK_ITERATIONS, dt=1.0
     )
@@ -90,14 +96,14 @@ class LimitedLeadEEPoseController(PDEEPoseController):
     def _clip_and_scale_action_space(self):
         super()._clip_and_scale_action_space()
         self._scale = self.action_space_high
-        # ManiSkill's conversion of actions (`from_pd_joint_pos_to_ee`), which divides by these bounds, takes it that rotations
-        # are flipped, as its own controllers flip them
+        # ManiSkill's conversion of actions (`from_pd_joint_pos_to_ee`), which divides by these bounds, assumes that
+        # rotations are reversed, as in its own controllers
         sign = torch.ones_like(self._scale)
         sign[3:] = -1.0
         self.action_space_low, self.action_space_high = self.action_space_low * sign, self.action_space_high * sign
 
     def _clip_and_scale_action(self, action):
-        # not the stock scaling: that one multiplies rotations by their lower bound, which flips their sign
+        # not ManiSkill's scaling, which multiplies rotations by their lower bound and so reverses their sign
         return action.clamp(-1.0, 1.0) * self._scale
 
     def set_action(self, action):
@@ -131,7 +137,7 @@ class LimitedLeadEEPoseController(PDEEPoseController):
         )
 
     def set_state(self, state: dict):
-        if state:  # that of another controller has none
+        if state:  # the state of some controllers is empty
             self._target_pose = Pose.create(state["target_pose"])
 
 
@@ -148,7 +154,7 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     rot_upper: float = 0.05
     """Rotation of a delta action of 1, in rad (public code of the paper); highest angle of an absolute action."""
     rotation_axes: Sequence[int] = (0, 1, 2)
-    """Axes of the base frame that have a rotation action; (2,) is yaw alone."""
+    """Axes of the base frame that have a rotation action; (2,) is yaw only."""
     locked_axes: Sequence[int] = ()
     """Axes of the base frame whose rotation action is ignored, as the paper's public code sets it to zero."""
     target_lead_limit_pos: float = 0.006
@@ -156,8 +162,9 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     speed by 5.8 mm (joint time constant 0.1 s at 10 Hz), so that free motion is never held back; in contact the limit bounds
     the force near 16 N."""
     target_lead_limit_rot: float = 0.04
-    """Largest lead of the target over the tool in rotation, in rad."""
+    """Largest lead of the target over the tool in rotation, in rad. Set once; not tuned."""
     use_target: bool = True
+    """Whether delta actions are relative to the last target, and not to the tool's pose."""
     controller_cls = LimitedLeadEEPoseController
 
 
@@ -180,7 +187,7 @@ class HoldGripperController(PDJointPosController):
         return {"target_qpos": self.articulation.get_drive_targets()[:, self.active_joint_indices]}
 
     def set_state(self, state: dict):
-        if state:  # files that were recorded before grips were recorded have none
+        if state:  # empty in files that hold no grip
             targets = common.to_tensor(state["target_qpos"], device=self.device).reshape(-1, len(self.joints))
             self.set_drive_targets(targets)
 

@@ -1,8 +1,8 @@
 """The fingers of the robot for any sensor: a housing and a gel pad, as parts of a URDF.
 
-A domed gel is drawn as it is. For the engine it is the dome as a light grip flattens it: a box whose face is the part that lies
-less than `FLATTENED` under the highest point, so that a flat part rests on four contact points as on a flat gel, and around it
-the dome, moved out by `FLATTENED`, whose top is cut off below the box.
+A domed gel is drawn as it is, but collides as a light grip flattens it: as a box, whose face is the part of the dome that lies
+less than `FLATTENED` under the highest point, and around it as the dome, moved out by `FLATTENED`, with its top cut off below
+the box. A flat part then rests on four contact points, as on a flat gel.
 """
 
 import xml.etree.ElementTree as ET
@@ -14,12 +14,14 @@ import trimesh
 
 from manifeel_ms3.sensors.config import GelConfig, HousingConfig, TactileSensorConfig
 
-GEL_CENTRE = 0.082  # m along the finger, for all sensors: the R1.5's gel ends 2 mm short of the tip
+GEL_CENTRE = 0.082  # m along the finger, the same for all sensors: the R1.5's gel then ends 2 mm before the tip
 FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 FLATTENED = 5e-4  # m: 2.6 N flatten a dome with a radius of 35 mm so far (F = pi K R d^2)
-CUT = 2e-3  # m under the box: deeper than 30 N on two contact points press the box in, so that the dome then carries nothing
-MIDDLE = 0.012  # m: side of the middle box; a golf ball then slips at 0.073 N m under 20 N, where the gel's patch gives 0.093
-DRAWN_POINTS, SOLID_POINTS = 41, 13  # along each side of a dome that is drawn, and that bodies collide with (chosen)
+CUT = 2e-3  # m under the box's face: more than 30 N on two contact points press the box in, so that the dome carries nothing
+MIDDLE = 0.012  # m: side of the middle box. A golf ball gripped with 20 N slips at 0.073 N m; on a real gel, at 0.093 N m
+DRAWN_POINTS, SOLID_POINTS = 41, 13  # points along each side of the dome that is drawn, and of the one that collides (chosen)
+SIZE_DIGITS = 6  # decimals, in m, to which the finger's length is rounded: a micrometre
+HOUSING_COLOUR, GEL_COLOUR = "0.16 0.16 0.18 1", "0.75 0.77 0.8 1"  # RGBA, chosen by eye
 
 
 @dataclass(frozen=True)
@@ -40,19 +42,24 @@ class Finger:
     """Curvature of the gel's face across and along the finger, 1/m."""
     grips_round_parts: bool = False
     """Whether a gel collides as five boxes, its middle and four around it, so that a ball or a bulb touches it in five points
-    instead of one, about which it would spin freely. Flat parts are held by one box as firmly, and at half the cost."""
+    instead of one, about which it would spin freely. One box holds flat parts as firmly, at half the cost."""
 
     @classmethod
     def of(cls, sensor: TactileSensorConfig, grips_round_parts: bool = False) -> "Finger":
-        """The finger of a sensor, for parts of one kind."""
+        """Finger that carries a sensor.
+
+        Args:
+            sensor: Configuration of the pad.
+            grips_round_parts: Whether the parts that it holds are round.
+        """
         housing, gel = sensor.housing, sensor.gel
         sizes = (housing.width, housing.depth, housing.beyond_gel, housing.protrusion)
         return cls(*sizes, gel.size, gel.curvature, grips_round_parts)
 
     @property
     def size(self) -> tuple[float, float, float]:
-        """Extent of the housing across, deep and along the finger, m."""
-        return self.width, self.depth, round(GEL_CENTRE + self.gel_size[1] / 2 + self.beyond_gel, 6)
+        """Extent of the housing across the finger, from front to back, and along the finger, m."""
+        return self.width, self.depth, round(GEL_CENTRE + self.gel_size[1] / 2 + self.beyond_gel, SIZE_DIGITS)
 
     @property
     def gel_box(self) -> tuple[float, float, float]:
@@ -106,12 +113,12 @@ def replace_finger(link: ET.Element, outward: float, finger: Finger) -> None:
             link.remove(element)
     _, deep, long = finger.size
     centre = (0.0, outward * (finger.protrusion + deep / 2), long / 2)
-    _add_box(link, finger.size, centre, colour="0.16 0.16 0.18 1")
+    _add_box(link, finger.size, centre, HOUSING_COLOUR)
     _add_inertia(link, mass=FINGER_MASS, size=finger.size, centre=centre)
 
 
 def gel_pad(side: str, parent: str, outward: float, finger: Finger, folder: Path) -> tuple[ET.Element, ET.Element]:
-    """Link and joint of a gel pad.
+    """Link of a gel pad, and the joint that fixes it to its finger.
 
     Args:
         side: "left" or "right".
@@ -122,14 +129,14 @@ def gel_pad(side: str, parent: str, outward: float, finger: Finger, folder: Path
     """
     name = f"gel_{side}"
     link = ET.Element("link", name=name)
-    centre, colour = (0.0, 0.0, -finger.protrusion / 2), "0.75 0.77 0.8 1"
+    centre = (0.0, 0.0, -finger.protrusion / 2)
     if finger.curvature == (0.0, 0.0):
-        _add_box(link, finger.gel_box, centre, colour, tags=("visual",))
+        _add_box(link, finger.gel_box, centre, GEL_COLOUR, tags=("visual",))
     else:
         solid = finger.dome(SOLID_POINTS, FLATTENED, CUT)
         for tag, mesh in (("visual", finger.dome(DRAWN_POINTS)), ("collision", solid)):
             mesh.export(folder / f"gel_{tag}.obj")
-            _add_mesh(link, tag, f"gel_{tag}.obj", colour)
+            _add_mesh(link, tag, f"gel_{tag}.obj", GEL_COLOUR)
     for size, place in finger.solid_boxes:
         _add_box(link, size, place, tags=("collision",))
     _add_inertia(link, mass=GEL_MASS, size=finger.gel_box, centre=centre)

@@ -31,10 +31,11 @@ GEL_STIFFNESS = 16000.0
 """Stiffness of the gel, in N/m per contact point. PhysX averages it with the other body's 0: 8 kN/m acts, which is 0.6 mm at
 20 N on a face."""
 GEL_FRICTION = 0.5
-"""Coulomb's coefficient of the gel (public code of the paper); PhysX averages it with the other body's. A gel's own is higher,
-but PhysX takes the friction of a face at two far corners, with twice the torque of an even pressure (docs/sensor.md)."""
+"""Coulomb's friction coefficient of the gel (public code of the paper); PhysX averages it with the other body's. A real
+gel's is higher, but PhysX takes the friction of a face at two far corners, with twice the torque of an even pressure
+(docs/sensor.md)."""
 HOUSING_FRICTION = 0.3
-"""Coulomb's coefficient of the fingers' housings."""
+"""Coulomb's friction coefficient of the fingers' housings: ManiSkill's default."""
 ARM_STIFFNESS, ARM_DAMPING, ARM_FORCE_LIMIT = 1e3, 1e2, 100.0
 """Joint control of the arm, in N m/rad, N m s/rad and N m: those of ManiSkill's Panda."""
 HOLD_STIFFNESS = 1.0e4
@@ -42,29 +43,29 @@ HOLD_STIFFNESS = 1.0e4
 HOLD_DAMPING, HOLD_FORCE_LIMIT = 2e2, 100.0
 """Damping, in N s/m, and largest force, in N, of a finger that holds."""
 GRIPPER_FORCE_LIMIT = 40.0
-"""Largest force of a finger, in N, that a policy can command."""
+"""Largest force of a finger, in N, that a policy can command. Set once; not tuned."""
 FINGER_RANGE = (-0.01, 0.04)
-"""Range of a finger's commanded distance from the middle, in m. A command short of a thin object is a force: 1 kN/m times the
-distance."""
+"""Range of a finger's commanded distance from the middle, in m. A command beyond the surface of a held object is a force:
+1 kN/m times the distance."""
 IK_STEPS = 20
-"""Number of Levenberg-Marquardt steps of the inverse kinematics at a reset on a GPU."""
+"""Number of Levenberg-Marquardt steps of the inverse kinematics at a reset on a GPU. Set once; not tuned."""
 JOINT_DELTA = 0.1
 """Largest change of a joint's target in a step of the delta controllers of joints, in rad (ManiSkill's Panda)."""
 ABSOLUTE_LEAD_POS, ABSOLUTE_LEAD_ROT = 0.024, 0.127
-"""Largest lead of an absolute target over the tool, in m and rad: the lead limit of delta control and, along the diagonal, one
-step of it, so that an absolute action can do what a delta action can."""
+"""Largest lead of an absolute target over the tool, in m and rad: the lead limit of delta control plus its largest step along
+the diagonal, so that an absolute action can do what a delta action can."""
 ABSOLUTE_RANGE_POS, ABSOLUTE_RANGE_ROT = 2.0, 2 * np.pi
 """Largest coordinate, in m, and angle, in rad, of an absolute action (ManiSkill's Panda)."""
 IMAGE_SIZE = 256
 """Width and height of the policy's cameras' images, in pixels (public code of the paper)."""
 FARTHEST = 10.0
-"""Largest distance that the cameras draw, in m."""
+"""Largest distance that the cameras draw, in m. Set once; not tuned."""
 WRIST_NEAREST = 0.005
-"""Smallest distance that the wrist camera draws, in m; the fingers are near it."""
+"""Smallest distance that the wrist camera draws, in m; it is small since the fingers are near. Set once; not tuned."""
 FIELD_OF_VIEW = np.deg2rad(75)
 """Field of view of the policy's cameras, in rad (public code of the paper)."""
 FIXED_GRIPPER = "_fixed_gripper"
-"""End of the names of control modes without an action of the gripper, which keeps its grip."""
+"""Suffix of the names of control modes without an action for the gripper, which keeps its grip."""
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 ACTION_AXES = {
     "pd_ee_delta_pose": (*_POSE, "gripper"),
@@ -73,9 +74,11 @@ ACTION_AXES = {
     "pd_ee_delta_pose_fixed_rotation": (*_POSE, "gripper"),
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
-"""Meaning of the components of an action by delta controller, in their order; rotations are about the base's axes."""
-WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)  # hand frame, m (public code of the paper)
-WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)  # 30 degrees inward
+"""Names of the components of an action, in order, by delta control mode; rotations are about the axes of the base frame."""
+WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)
+"""Position of the wrist camera in the hand frame, in m (public code of the paper)."""
+WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)
+"""Direction of the wrist camera's view in the hand frame: along the fingers, tilted inward by 30 degrees."""
 
 
 @register_agent()
@@ -117,6 +120,7 @@ class PandaGelSight(BaseAgent):
     )
 
     mounted_cameras: tuple[str, ...] = ("wrist",)
+    """Names of the cameras on the robot that are rendered."""
 
     def __init__(self, *args, finger: Finger | None = None, **kwargs):
         self.finger = finger or Finger()
@@ -127,7 +131,12 @@ class PandaGelSight(BaseAgent):
         return panda_gelsight_urdf(self.scene.can_render(), self.finger)
 
     def set_action(self, action: torch.Tensor) -> None:
-        """Pass an action on to the controller, as ManiSkill does, which warns of NumPy 2 where it looks for NaN in a tensor.
+        """Pass an action on to the controller.
+
+        ManiSkill's own method does the same, but causes a warning of NumPy 2 when it looks for NaN in a tensor.
+
+        Args:
+            action: Actions (N, D) of the control mode.
 
         Raises:
             ValueError: The action has a NaN, in a simulation on the CPU.
@@ -156,7 +165,7 @@ class PandaGelSight(BaseAgent):
         unturned = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1, 2))
         delta_yaw = LimitedLeadEEPoseControllerConfig(**pose, rotation_axes=(2,))
         joint_delta = drive | dict(lower=-JOINT_DELTA, upper=JOINT_DELTA, use_delta=True)
-        arms = dict(  # every one of these also with a gripper that keeps its grip
+        arms = dict(  # each of these exists also with a gripper that keeps its grip
             pd_ee_delta_pose=delta_pose,
             pd_ee_pose=absolute_pose,
             pd_joint_pos=PDJointPosControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
@@ -229,7 +238,7 @@ class PandaGelSight(BaseAgent):
         self._joint_to_hand = torch.as_tensor(rotations, dtype=torch.float32, device=self.device)
 
     def reset(self, init_qpos: torch.Tensor | None = None, grip_force: float = 0.0):
-        """Put the joints (n, 9) of the environments being reset in place, to stay there.
+        """Put the joints of the n environments that are being reset in place, and make them stay there.
 
         Args:
             init_qpos: Joint positions (n, 9), in rad and m; the present ones if not given.
@@ -248,7 +257,8 @@ class PandaGelSight(BaseAgent):
             pose: Poses (n,) of the tool in the base frame.
             opening: Distance of each finger from the middle, in m.
             grip_force: Force, in N, of each finger on the object that it holds there.
-            wrist_turn: Angle, in rad, near which the last joint is to be, of those that differ by a whole turn.
+            wrist_turn: Angle, in rad, by which the last joint is turned in the first guess of the inverse kinematics; it
+                selects one of the solutions that differ by a whole turn.
         """
         qpos = torch.tensor(self.keyframes["tool_down"].qpos, dtype=torch.float32, device=self.device).repeat(len(pose), 1)
         qpos[:, 6] += wrist_turn
@@ -265,11 +275,11 @@ class PandaGelSight(BaseAgent):
         return self.robot.pose.inv() * self.tcp.pose
 
     def solve_ik(self, pose: Pose, q0: torch.Tensor) -> torch.Tensor:
-        """Arm joint angles (N, 7) that put the tool at `pose` (base frame), starting from joint positions `q0` (N, 9)."""
+        """Arm joint angles (N, 7), in rad, that put the tool at poses (N,) in the base frame; see `controllers.solve_ik`."""
         return solve_ik(self._kinematics, pose, q0, iterations=IK_STEPS)
 
     def tool_pose_at(self, joints: torch.Tensor) -> Pose:
-        """Pose of the tool in the base frame, at arm joint angles (1, 7), in rad; of one environment on the CPU."""
+        """Pose of the tool in the base frame at arm joint angles (1, 7), in rad; only for one environment on the CPU."""
         model = self._kinematics.pmodel
         model.compute_forward_kinematics(torch.cat([joints[0], self.robot.get_qpos()[0, 7:]]).double().cpu().numpy())
         return Pose.create(model.get_link_pose(self._kinematics.end_link_idx), device=self.device)
@@ -283,12 +293,12 @@ class PandaGelSight(BaseAgent):
         return Kinematics(self.urdf_path, self.ee_link_name, self.robot, arm.active_joint_indices)
 
     def pad_wrench(self, side: str) -> torch.Tensor:
-        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame: the sums over its TacFF."""
+        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; TacFF adds up to it."""
         return self._gauges[side].read()
 
     @property
     def pad_joint_forces(self) -> torch.Tensor:
-        """Force and moment (N, 2, 6), N and N m, of both pads' joints, in the joints' frames: cheap to collect."""
+        """Force and moment (N, 2, 6), N and N m, of both pads' joints, in the joints' frames; it costs little."""
         return self.robot.get_link_incoming_joint_forces()[:, self._gel_indices]
 
     def held_object_force(self, pad_joint_forces: torch.Tensor) -> torch.Tensor:

@@ -30,14 +30,14 @@ from manifeel_ms3.paths import cache_dir, writable_cache
 from . import fingers
 from .fingers import GEL_CENTRE, Finger, gel_pad, replace_finger
 
-HAND_TO_FINGER = 0.0584  # m: hand frame to finger frame, from the Panda's URDF
+HAND_TO_FINGER = 0.0584  # m: distance from the hand frame to the finger frame, from the Panda's URDF
 HAND_TO_TCP = HAND_TO_FINGER + GEL_CENTRE
-TRIANGLES_PER_MESH = 1200  # with so many, a link's silhouette moves by less than a pixel at 256 x 256
-TRIANGLES_OF_THE_HAND = 2400  # which every camera sees from near; with half as many it looks dented
-FEWEST_TRIANGLES = 24  # of a small part of a mesh, which would vanish with its share of the triangles
-SMOOTH_ANGLE = np.deg2rad(35)  # edges that are sharper stay sharp; chosen by eye
-NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; by eye
-ROUGHNESS = 0.35  # of the arm's painted and plastic surfaces; by eye
+TRIANGLES_PER_MESH = 1200  # a link's silhouette then moves by less than a pixel at 256 x 256
+TRIANGLES_OF_THE_HAND = 2400  # every camera sees the hand from near; with half as many triangles it looks dented
+FEWEST_TRIANGLES = 24  # triangles of a small part of a mesh, which would vanish with its share of them; set once, not tuned
+SMOOTH_ANGLE = np.deg2rad(35)  # rad: sharper edges stay sharp; chosen by eye
+NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; chosen by eye
+ROUGHNESS = 0.35  # roughness of the arm's painted and plastic surfaces; chosen by eye
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
@@ -48,7 +48,7 @@ def panda_gelsight_urdf(visuals: bool = True, finger: Finger | None = None) -> s
 
     Args:
         visuals: Whether links have visual meshes. Without them the file can be loaded where there is no renderer at all: SAPIEN
-            makes a render material for every visual.
+            makes a render material for every visual mesh.
         finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
     """
     finger = finger or Finger()
@@ -77,7 +77,7 @@ def _build_into(folder: Path, finger: Finger) -> None:
 
 @contextmanager
 def _unless_made_meanwhile(folder: Path) -> Iterator[None]:
-    """Do without the folder that is built in the context where another process has made it in the meantime."""
+    """Ignore that the folder cannot be written in this context if another process has made it in the meantime."""
     try:
         yield
     except FileWriteError:
@@ -120,7 +120,7 @@ def _decimate(source: Path, work: Path) -> str:
 
 
 def _placed(mesh: trimesh.Trimesh, matrix: np.ndarray) -> trimesh.Trimesh:
-    """A mesh where its node has it, with the normals of its file; `Scene.dump` would compute others."""
+    """Mesh at the place of its node, with the normals of its file; `Scene.dump` would compute others."""
     vertices, normals = trimesh.transform_points(mesh.vertices, matrix), mesh.vertex_normals @ matrix[:3, :3].T
     return trimesh.Trimesh(vertices, mesh.faces, vertex_normals=normals, visual=mesh.visual, process=False)
 

@@ -19,7 +19,7 @@ from .upright_insertion import UprightInsertionExpert as UprightInsertionExpert
 
 
 class Expert(Protocol):
-    """A demonstrator for one episode, made after `env.reset(seed=seed)`."""
+    """Demonstrator of one episode, which is made after `env.reset(seed=seed)`."""
 
     def actions(self) -> Iterator[np.ndarray]:
         """Actions in [-1, 1], one for every step; take each one in the environment before asking for the next."""
@@ -41,7 +41,7 @@ def make_expert(env_id: str, env: VisuotactileEnv, seed: int) -> Expert:
 
 
 def require_demonstrator(env_id: str) -> Callable[[Any, int], Expert]:
-    """The callable that makes a task's demonstrator from an environment and a seed.
+    """Callable that makes a task's demonstrator from an environment and a seed.
 
     Raises:
         UnknownNameError: The task is not registered, or has no demonstrator.

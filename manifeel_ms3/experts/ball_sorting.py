@@ -32,7 +32,7 @@ class BallSortingExpertConfig:
     rough: float = 2.0
     """Roughness of the tactile image, in grey levels, above which the ball has dimples. Tuned."""
     grain: float = 11.0
-    """Length over which roughness is taken, in pixels of TacRGB: one millimetre."""
+    """Length over which roughness is measured, in pixels of TacRGB: one millimetre."""
     touching: float = 4.0
     """Change of the smoothed tactile image, in grey levels, above which a pixel is in contact. Tuned."""
     lift_height: float = 0.12
@@ -42,9 +42,9 @@ class BallSortingExpertConfig:
     open_steps: int = 5
     """Number of steps for which the gripper opens. Tuned."""
     lane: float = 0.035
-    """Distance in x, in m, from the balls at which the hand goes from one to the other. Tuned."""
+    """Distance in x, in m, from the balls at which the hand crosses from one to the other. Tuned."""
     lane_height: float = 0.050
-    """Height of the tool over the balls' centres on that way, in m: the fingertips are clear of the balls. Tuned."""
+    """Height of the tool over the balls' centres while the hand crosses, in m: the fingertips are clear of the balls. Tuned."""
     touch_force: float = 1.0
     """Normal force on each pad, in N, at which a ball is between the fingers. Tuned."""
     grip_steps: int = 6
@@ -61,7 +61,12 @@ class BallSortingExpertConfig:
 
 @register_demonstrator("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1")
 class BallSortingExpert:
-    """Cannot tell the two balls apart by sight; it grasps one of them and decides by the TacRGB image of its surface."""
+    """Grasps one of the two balls, which look alike, and decides by the TacRGB image of its surface.
+
+    Args:
+        env: Environment that has just been reset.
+        seed: Seed of the episode.
+    """
 
     config = BallSortingExpertConfig()
 
@@ -73,21 +78,21 @@ class BallSortingExpert:
         self.stand = perceived_position(env.stand, rng)
         tool, _ = self.skills.tool
         self.first = int(self.stand[1] < tool[1])  # the seat that is nearer to the hand
-        # whatever the sensor, in the colours that `rough` and `touching` are tuned for
+        # in the R1.5's colours whatever the sensor, since `rough` and `touching` are tuned for them
         pad = sensor_config(env.sensor, "feel", "gel_right", optics=OpticsConfig())
         self._pad = TactileSensor(pad, env.scene, env.agent.robot, ("rgb",))
         self._untouched = self._tactile_image()
 
     def actions(self) -> Actions:
-        """Actions of one episode, without end: at last the demonstrator holds its pose."""
+        """Actions of an episode, without end: in the end, the demonstrator holds its pose."""
         yield from self._sort() if self.env.goal == "bowls" else self._take_golf_ball()
 
     def _take_golf_ball(self) -> Actions:
         """Try the balls in turn.
 
         The hand comes to a ball from one side and leaves it to the other, as on a road with two lanes, and opens while it
-        leaves. If it came and left by the same way, a policy without memory could not tell the two apart, and would grasp the
-        same ball again.
+        leaves. If it came and left by the same way, a policy without memory could not tell coming from leaving, and would grasp
+        the same ball again.
         """
         for seat in (self.first, 1 - self.first, self.first):
             yield from self._go_to_lane(seat, 1 - seat)
@@ -116,7 +121,7 @@ class BallSortingExpert:
         yield from skills.hold_still()
 
     def _ball(self, seat: int, x: float = 0.0, height: float = 0.0) -> np.ndarray:
-        """Position of the tool at a ball's centre, moved by `x` and raised by `height`, in m."""
+        """Position (3,), in m, of a seated ball's centre, moved by `x` and raised by `height`; seats are 0 and 1 along y."""
         return self.stand + np.array([x, SEAT_SPACING * (seat - 0.5), SEAT_HEIGHT + height])
 
     def _grasp(self, seat: int) -> Actions:
@@ -127,7 +132,7 @@ class BallSortingExpert:
         yield from skills.set_gripper(config.grip, config.feel_steps)
 
     def _go_to_lane(self, seat: int, came_from: int) -> Actions:
-        """Go beside a ball, on the lane by which the hand goes from the ball `came_from` to the other one."""
+        """Go beside the ball in a seat, on the lane by which the hand goes from the seat `came_from` to the other one."""
         lane = self.config.lane * (2 * came_from - 1)
         yield from self.skills.reach(self._ball(seat, lane, self.config.lane_height), DOWNWARD, self.config.free_tolerance)
 

@@ -1,4 +1,4 @@
-"""What the demonstrators of the insertion tasks share: seeing the socket, the plug in the hand, and pressing the plug in."""
+"""What the demonstrators of the insertion tasks share: perceiving socket and plug, random pushes, and pressing the plug in."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,7 @@ from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
 
 STRAIGHT = Rotation.identity()
+"""Lean of an upright plug."""
 STREAM = 7
 """Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
 
@@ -22,7 +23,7 @@ class InsertionExpertConfig:
     """
 
     grasp_error: float = float(np.deg2rad(0.5))
-    """Largest error of the plug's pitch in the hand, in rad: how well TacRGB shows it."""
+    """Largest error of the plug's perceived pitch in the hand, in rad: about the accuracy of TacRGB."""
     hover_height: float = 0.010
     """Height over the rim from which the plug approaches and to which it returns, in m. Tuned."""
     approach_tolerance: float = 1e-3
@@ -31,22 +32,22 @@ class InsertionExpertConfig:
     """Distance from the point over the rim, in m, at which the hand has returned before a new attempt. Tuned."""
 
     feel_press: float = 4.5
-    """Downward force while the plug leans, is led to a corner or slides about on top, in N. Tuned."""
+    """Downward force while the plug leans, is led to a corner or slides on top of the socket, in N. Tuned."""
     upright: float = float(np.deg2rad(0.7))
     """Angle, in rad, below which the plug counts as upright. Tuned."""
     leaning: float = 3.0
-    """Multiple of `upright` beyond which the plug is pressed with `feel_press` only. Tuned."""
+    """Multiple of `upright` from which on the plug is pressed only with `feel_press`. Tuned."""
     turn_rate: float = 0.012
     """Rotation of the plug towards upright while it is in contact, in rad per step. Tuned."""
 
     disturbance_rate: float = 0.04
-    """Chance, in each step, of a push of the hand while the plug is free: one or two in an episode."""
+    """Chance, in each step, that a push of the hand begins while the plug is free: one or two in an episode."""
     disturbance: float = 0.3
-    """Largest addition of a push to each axis of the action, as a share of the action's range."""
+    """Largest amount that a push adds to each axis of the action, as a share of the action's range. Chosen by eye."""
     disturbance_steps: int = 3
-    """Number of steps that a push lasts."""
+    """Number of steps that a push lasts. Chosen by eye."""
     free_height: float = 0.005
-    """Height of the plug's end over the rim, in m, above which the hand is disturbed."""
+    """Height of the plug's end over the rim, in m, above which the hand is pushed. Chosen by eye."""
 
     press_force: float = 10.0
     """Downward force that presses the plug in, in N. Tuned."""
@@ -55,7 +56,7 @@ class InsertionExpertConfig:
     force_step: float = 0.0012
     """Largest step under force, along each axis, in m. Tuned."""
     press_steps: int = 10_000
-    """Number of steps after which pressing ends: more than any episode has."""
+    """Number of steps after which pressing ends: more than an episode has."""
     keeps_hand: bool = False
     """Whether the hand keeps its orientation while it presses, instead of following a plug that slips in it."""
     progress: float = 1e-4
@@ -65,7 +66,7 @@ class InsertionExpertConfig:
     entered: float = 0.0008
     """Depth of the plug's end below the rim, in m, beyond which it is in the hole. Tuned."""
     astray: float = 0.004
-    """Distance of the plug's end from the perceived socket, in m, beyond which it slides about on top. Tuned."""
+    """Distance of the plug's end from the perceived socket, in m, beyond which it has slid away. Tuned."""
 
     wriggle_after: int = 4
     """Number of steps without progress after which the plug is wriggled. Tuned."""
@@ -74,11 +75,12 @@ class InsertionExpertConfig:
     wriggle_rate: float = 1.3
     """Angle on the wriggling circle, in rad per step. Tuned."""
     twist: float = 0.0
-    """Amplitude, in rad, of the rotation to and fro of a plug that sticks, until its teeth fall into gaps."""
+    """Amplitude, in rad, of the rotation to and fro of a plug that sticks, until its teeth find gaps; 0 if it has
+    none."""
     twist_rate: float = 0.15
-    """Phase of that rotation, in rad per step. Tuned."""
+    """Phase of the rotation to and fro, in rad per step. Tuned."""
     twist_growth: float = 50.0
-    """Number of steps without progress after which the amplitude has doubled, its limit. Tuned."""
+    """Number of steps without progress after which the amplitude `twist` has doubled, which is its limit. Tuned."""
 
 
 class InsertionExpert:
@@ -87,7 +89,11 @@ class InsertionExpert:
     Two things are read from the simulator instead of from images: the socket's position, with an error of up to
     `SkillConfig.sight_error`, and the plug's pose in the hand, with an error of its pitch of up to `grasp_error`.
 
-    While the plug is free, the hand is disturbed at random, so that the demonstrations show corrections.
+    While the plug is free, the hand is pushed at random, so that the demonstrations show corrections.
+
+    Args:
+        env: Environment that has just been reset.
+        seed: Seed of the episode.
     """
 
     config = InsertionExpertConfig()
@@ -112,7 +118,7 @@ class InsertionExpert:
     def _plug_in_tool(self) -> tuple[np.ndarray, Rotation]:
         """Pose of the plug in the tool's frame: the simulator's pose with a constant error of its pitch.
 
-        It stands for an estimate from the tactile images, which the demonstrator does not make.
+        It stands in for an estimate from the tactile images.
         """
         position, rotation = position_rotation((self.env.agent.tcp.pose.inv() * self.env.plug.pose).raw_pose)
         return position, self._pitch_error * rotation
@@ -143,7 +149,7 @@ class InsertionExpert:
     # ---------------------------------------------------------------- the demonstration
 
     def actions(self) -> Actions:
-        """Actions of one episode, without end: once the plug sits, the demonstrator goes on holding it down."""
+        """Actions of an episode, without end: once the plug is inserted, the demonstrator keeps holding it down."""
         for action in self._undisturbed():
             yield np.clip(action + self._disturb(), -1.0, 1.0)
 
@@ -171,7 +177,7 @@ class InsertionExpert:
             if not free or self._rng.uniform() > config.disturbance_rate:
                 return np.zeros(6)
             self._disturbance = self._rng.uniform(-config.disturbance, config.disturbance, 6)
-            self._disturbance[2] = abs(self._disturbance[2])  # up: a push down would ram the plug into the rim
+            self._disturbance[2] = abs(self._disturbance[2])  # upwards: a push down would ram the plug into the rim
             self._disturbed_steps = config.disturbance_steps
         self._disturbed_steps -= 1
         return self._disturbance
@@ -179,7 +185,7 @@ class InsertionExpert:
     def _press(self) -> Actions:
         """Press down and yield to sideways forces and tilts; wriggle where the plug sticks.
 
-        It ends only when the plug has not entered the hole, or slides about on top.
+        It ends only where the plug does not enter the hole, or slides away.
         """
         skills, config = self.skills, self.config
         stuck, best = 0, np.inf
@@ -195,7 +201,7 @@ class InsertionExpert:
             wanted = [0, 0, config.feel_press if gently else self._press_force(stuck)]
             move = np.clip(config.compliance * (load - wanted), -config.force_step, config.force_step)
             if aside.any():
-                move[:2] = aside  # against the friction of what it stands on
+                move[:2] = aside  # must overcome the friction under the plug
             if stuck > config.wriggle_after:
                 angle = config.wriggle_rate * step
                 move[:2] += config.wriggle * np.array([np.cos(angle), np.sin(angle)])

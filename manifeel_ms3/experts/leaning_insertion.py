@@ -32,11 +32,11 @@ class LeaningConfig(InsertionExpertConfig):
     """Depth of the leading corner below the rim, in m, beyond which it is in the hole. Tuned."""
 
     feel_force: float = 1.8
-    """Force on the plug, in N, that is a wall if the plug no longer moves: friction pushes back, too. Tuned."""
+    """Force on the plug, in N, that counts as a wall if the plug no longer moves; friction alone can be as large. Tuned."""
     wall_force: float = 4.5
-    """Force on the plug, in N, that is a wall in any case. Tuned."""
+    """Force on the plug, in N, that counts as a wall in any case. Tuned."""
     feel_step: float = 6e-4
-    """Step towards the walls, in m per step. Tuned."""
+    """Motion towards the walls, in m per step. Tuned."""
     stalled: float = 2e-4
     """Motion in one step, in m, below which the plug no longer moves. Tuned."""
     feel_steps: int = 60
@@ -52,7 +52,7 @@ class LeaningInsertionExpert(InsertionExpert):
     """Finds a hole with little play by touch.
 
     It leans the plug, so that one corner goes ahead into the hole, pushes it into the hole's own corner until both walls are
-    felt, stands the plug up in it, and presses it down: what people do with a tight fit.
+    felt, stands the plug up in it, and presses it down, as people do with a tight fit.
     """
 
     config = LeaningConfig()
@@ -120,6 +120,6 @@ class LeaningInsertionExpert(InsertionExpert):
 
 
 class LeaningGearExpert(LeaningInsertionExpert):
-    """Puts the bore over the shaft like a plug into a socket, with its rim against the shaft's side."""
+    """Puts a gear's bore over its shaft like a plug into a socket, feeling for the shaft's side with the bore's rim."""
 
     config = LeaningConfig(twist=0.10)  # tuned

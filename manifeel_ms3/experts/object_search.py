@@ -31,10 +31,10 @@ class ObjectSearchExpertConfig:
     grasp_tolerance: float = 1.5e-3
     """Distance from the grasp position at which the fingers close, in m. Tuned."""
     crossing_height: float = 0.11
-    """Height of the tool over the table on the way from one place to the other, in m; different from every
+    """Height of the tool over the table on the way from one place to the other, in m. It differs from every
     height on the way to the first place, so that a policy without memory can tell the two ways apart."""
     crossing_tolerance: float = 0.01
-    """Distance from the middle of that way at which the hand goes on, in m. Tuned."""
+    """Distance from the middle of the way between the places at which the hand goes on, in m. Tuned."""
     grip_steps: int = 6
     """Largest number of steps for which the fingers close. Tuned."""
 
@@ -43,8 +43,8 @@ class ObjectSearchExpertConfig:
 class ObjectSearchExpert:
     """Knows the two places, searches the one nearer to the robot first, and decides by the force on the pads.
 
-    Where its fingers close on nothing, it goes to the other place by a higher way than it came: in the middle it would else be
-    where it was at the start, and a policy without memory would begin anew.
+    Where its fingers close on nothing, it goes to the other place by a higher way than it came. Otherwise it would be back at
+    its start in the middle, and a policy without memory would begin anew.
     """
 
     config = ObjectSearchExpertConfig()
@@ -54,7 +54,7 @@ class ObjectSearchExpert:
         self.skills.gripper = 1.0
 
     def actions(self) -> Actions:
-        """Actions of one episode, without end: at last the demonstrator holds the battery up."""
+        """Actions of an episode, without end: in the end, the demonstrator holds the battery up."""
         skills, config = self.skills, self.config
         grasp_height = CONTAINER_FLOOR + BATTERY_SIZE / 2 + config.grasp_above_centre
         middle = np.array([*CONTAINER_XY, config.crossing_height])
@@ -64,6 +64,6 @@ class ObjectSearchExpert:
             yield from skills.reach(np.array([*over[:2], grasp_height]), DOWNWARD, config.grasp_tolerance)
             if (yield from skills.close_until_felt(-1.0, config.felt_force, config.grip_steps)):
                 break
-            skills.gripper = 1.0  # while the hand leaves: if it stood there with open fingers, it would be as before the grasp
+            skills.gripper = 1.0  # opens while the hand leaves: at the place, open fingers would look as before the grasp
             yield from skills.reach(middle, DOWNWARD, config.crossing_tolerance)
         yield from skills.lift_and_hold(config.lift_height, DOWNWARD)

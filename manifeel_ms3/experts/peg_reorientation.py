@@ -21,7 +21,7 @@ class PegReorientationConfig(LeaningConfig):
     """
 
     turned: float = float(np.deg2rad(1.5))
-    """Angle in the hand, in rad, that needs no turning: what is left of it turns in the hole. Tuned."""
+    """Angle in the hand, in rad, below which no push is needed: the hole turns the peg by the rest. Tuned."""
     beyond: float = float(np.deg2rad(0.5))
     """Angle, in rad, past upright at which the push ends, as the peg springs back a little. Tuned."""
     start_gap: float = 0.004
@@ -43,11 +43,11 @@ class PegReorientationConfig(LeaningConfig):
     slipped: float = float(np.deg2rad(4.0))
     """Angle in the hand, in rad, at which a peg outside the hole is turned again. Tuned."""
     in_hole: float = 0.003
-    """Depth of the peg's end in the hole, in m, at which what angle is left turns in the hole. Tuned."""
+    """Depth of the peg's end in the hole, in m, from which on the hole turns the peg by the rest of the angle. Tuned."""
     straight: float = float(np.deg2rad(0.7))
     """Angle in the hand, in rad, at which the peg in the hole is pressed down. Tuned."""
     straighten_steps: int = 20
-    """Number of steps after which it is pressed down at any angle. Tuned."""
+    """Number of steps after which the peg is pressed down at any angle. Tuned."""
     turns: int = 4
     """Number of pushes after which the peg is inserted as it is. Tuned."""
 
@@ -58,10 +58,10 @@ class PegReorientationExpert(LeaningInsertionExpert):
 
     It lowers the peg beside the rim, its end ahead, and moves towards the rim: the rim's outer edge pushes the peg's side near
     its end until the peg has slipped in the hand and stands. It moves away until the pads feel no force, reads the angle that
-    is left, and pushes again if need be, from the other side if the peg went too far. It inserts the peg like
-    `LeaningInsertionExpert`, but by the hand: what angle is left turns in the hole.
+    is left, and pushes again if necessary, from the other side if the peg went too far. It inserts the peg like
+    `LeaningInsertionExpert`, but keeps the hand upright instead of the peg: the hole turns the peg by the rest of the angle.
 
-    It reads the same two things from the simulator: the place of the rim, with an error of up to `SkillConfig.sight_error`, and
+    It reads two things from the simulator: the place of the rim, with an error of up to `SkillConfig.sight_error`, and
     the peg's pose in the hand, with an error of its pitch of up to `grasp_error`.
     """
 
@@ -92,7 +92,7 @@ class PegReorientationExpert(LeaningInsertionExpert):
         yield from self._straighten()
 
     def _straighten(self) -> Actions:
-        """Turn what angle is left in the hand, which the hole's walls do when the hand moves sideways."""
+        """Turn the peg by the angle that is left: the hole's walls do it when the hand moves sideways."""
         for _ in range(self.config.straighten_steps):
             angle = self._in_hand_angle()
             in_hole = self._place(self._end)[2] < self._rim - self.config.entered

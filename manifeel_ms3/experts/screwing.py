@@ -25,9 +25,9 @@ class ScrewingExpertConfig:
     hover_height: float = 0.010
     """Height over the first contact of the threads from which the part is lowered to contact, in m. Tuned."""
     clear_height: float = 0.020
-    """Further height, in m, above which the hand may move sideways. Tuned."""
+    """Height above the end of an approach, in m, at which the hand may move sideways. Tuned."""
     travel_tolerance: float = 4e-3
-    """Distance from the point at `clear_height` at which the hand goes on with the part, in m. Tuned."""
+    """Distance from the point at `clear_height` at which the hand goes on with the held part, in m. Tuned."""
     hover_tolerance: float = 1e-3
     """Distance from the point at `hover_height` at which the hand begins to lower the part, in m. Tuned."""
     approach_tolerance: float = 2e-3
@@ -42,9 +42,9 @@ class ScrewingExpertConfig:
     centre_force: float = 4.0
     """Downward force while the chamfer centres the part, in N. Tuned."""
     centre_steps: int = 3
-    """Number of steps between two checks whether the part still sinks. Tuned."""
+    """Number of steps between two checks of whether the part still sinks. Tuned."""
     centre_tries: int = 15
-    """Number of checks after which a part that stands on the rim is turned all the same. Tuned."""
+    """Number of checks after which even a part that stands on the rim is turned. Tuned."""
     centre_gain: float = 2.0
     """Compliance while the chamfer centres the part, as a multiple of `compliance`. Tuned."""
     sunk: float = 5e-5
@@ -89,6 +89,10 @@ class ScrewingExpert:
 
     Three things are read from the simulator instead of from images: the position of the fixed part, with an error of up to
     `SkillConfig.sight_error`, and the held part's height and lean.
+
+    Args:
+        env: Environment that has just been reset.
+        seed: Seed of the episode.
     """
 
     config = ScrewingExpertConfig()
@@ -106,14 +110,14 @@ class ScrewingExpert:
         return Rotation.from_euler("z", self.yaw) * DOWNWARD
 
     def actions(self) -> Actions:
-        """Actions of one episode, without end: once the part is tight, the demonstrator goes on holding it."""
+        """Actions of an episode, without end: once the part is tight, the demonstrator keeps holding it."""
         yield from self._begin()
         while True:
             yield from self._turn(WOUND_UP - self.config.sweep)
             yield from self._regrasp()
 
     def _begin(self) -> Actions:
-        """Bring the part between the fingers to where it can be turned."""
+        """Bring the part, held by the fingers, to where it can be turned."""
         yield from self._set_down()
 
     def _set_down(self) -> Actions:

@@ -1,7 +1,7 @@
 """Skills that the scripted demonstrators share: moving, pressing and sensing load.
 
-A skill is a generator of actions. It reads the state of the world again after each action that it yields. It commands the
-same controller as a policy does, within the same limits. The load that it acts on is the sum of the force fields of both pads.
+A skill is a generator of actions, which reads the present state after each action that it yields. It commands the same
+controller as a policy, within the same limits. The load that it acts on is the sum of the force fields of both pads.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from manifeel_ms3.tasks import VisuotactileEnv
 
 Actions = Iterator[np.ndarray]
+"""Actions of a demonstrator or of one of its skills."""
 DOWNWARD = Rotation.from_euler("x", np.pi)
-"""Orientation of a tool that points straight down, and of a plug in it: their frames have z down."""
+"""Orientation of a tool, or of a plug in it, that points straight down: its z axis points down."""
 SMALLEST_NORM = 1e-9
 """Norm, m or rad, below which a displacement has no direction; it keeps divisions finite."""
 
@@ -31,7 +32,7 @@ class SkillConfig:
     """
 
     move_gain: float = 0.4
-    """Share of the remaining distance that one step of a reach covers, so that it slows down towards its end. Tuned."""
+    """Share of the remaining distance that one step of a reach covers, so that the hand slows down at the end. Tuned."""
     top_speed: float = 0.008
     """Largest step of a reach, in m; the controller allows 0.01 (public code of the paper)."""
     top_turn: float = 0.04
@@ -43,7 +44,7 @@ class SkillConfig:
     sight_error: float = 0.0015
     """Largest error of a position that a demonstrator sees, in m: about two pixels of the wrist camera."""
     reach_tolerance: float = 5e-4
-    """Distance from the target, in m, at which a reach has arrived where the demonstrator names no other. Tuned."""
+    """Distance from the target, in m, at which a reach has arrived, unless the demonstrator gives another one. Tuned."""
     reach_steps: int = 80
     """Number of steps after which a reach ends although it has not arrived. Tuned."""
     gripper_steps: int = 6
@@ -51,7 +52,7 @@ class SkillConfig:
     hold_tolerance: float = 2e-3
     """Distance from the height to which a part is lifted, in m, at which it is held still. Tuned."""
     contact_force: float = 2.0
-    """Upward load, in N, at which a part that is lowered has met something. Tuned."""
+    """Upward load, in N, at which a part that is being lowered has made contact. Tuned."""
     lowering_speed: float = 0.002
     """Speed at which a part is lowered to contact, in m per step. Tuned."""
     settle_steps: int = 2
@@ -62,7 +63,7 @@ CONFIG = SkillConfig()
 
 
 class Skills:
-    """Motion and sensed load of one robot in one environment (`num_envs=1`); base frame, in m, rad and N."""
+    """Motion and sensed load of the robot of a single environment (`num_envs=1`); base frame, in m, rad and N."""
 
     def __init__(self, env: VisuotactileEnv):
         self.env = env
@@ -83,7 +84,7 @@ class Skills:
 
     @property
     def commanded(self) -> tuple[np.ndarray, Rotation]:
-        """Position and orientation that the next action is relative to."""
+        """Commanded position and orientation of the tool centre point, which the next action is relative to."""
         return position_rotation(self.arm.commanded_pose.raw_pose)
 
     @property
@@ -127,7 +128,7 @@ class Skills:
     # ---------------------------------------------------------------- moving
 
     def command(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        """Action (6,), or (7,) with a gripper, that sets the controller's target to a pose, or as near as the limits allow.
+        """Action (6,), or (7,) with a gripper, that moves the controller's target to a pose, or as near as the limits allow.
 
         The action is shorter where the controller turns about fewer axes.
         """
@@ -138,13 +139,13 @@ class Skills:
         return action if self.gripper is None else np.r_[action, self.gripper]
 
     def towards(self, rotation: Rotation, rate: float) -> Rotation:
-        """Orientation of the command, turned towards another one by at most `rate`, in rad."""
+        """The commanded orientation, turned towards another one by at most `rate`, in rad."""
         _, facing = self.commanded
         way = (rotation * facing.inv()).as_rotvec()
         return Rotation.from_rotvec(way * min(1.0, rate / max(np.linalg.norm(way), SMALLEST_NORM))) * facing
 
     def stride(self, position: np.ndarray, rotation: Rotation) -> np.ndarray:
-        """Action of one step of a reach towards a pose, which accelerates at first and slows down at the end."""
+        """Action for one step of a reach towards a pose; a reach accelerates at first and slows down at the end."""
         here, facing = self.commanded
         way, turn = position - here, (rotation * facing.inv()).as_rotvec()
         distance, angle = np.linalg.norm(way), np.linalg.norm(turn)
@@ -175,10 +176,15 @@ class Skills:
             yield self.command(*self.commanded)
 
     def close_until_felt(self, opening: float, force: float, steps: int) -> Generator[np.ndarray, None, bool]:
-        """Stay in place and command the gripper, for at most so many steps.
+        """Stay in place and close the gripper until both pads feel a force.
+
+        Args:
+            opening: Gripper command, from 1 (open) to -1 (closed).
+            force: Normal force on each pad, in N.
+            steps: Largest number of steps.
 
         Returns:
-            Whether both pads feel a normal force above `force`, in N; the fingers close no further then.
+            Whether both pads feel more than `force`; the fingers then close no further.
         """
         for _ in range(steps):
             yield from self.set_gripper(opening, steps=1)
@@ -187,7 +193,7 @@ class Skills:
         return False
 
     def move_fingers(self, opening: float, steps: int) -> Actions:
-        """Stay in place and move the gripper at a steady pace; then give it two steps to come to rest."""
+        """Stay in place and move the gripper to a command in so many steps, at a steady pace; then let it come to rest."""
         start = self.gripper or 0.0
         for step in range(steps + CONFIG.settle_steps):
             yield from self.set_gripper(start + (opening - start) * min((step + 1) / steps, 1.0), steps=1)

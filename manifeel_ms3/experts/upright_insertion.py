@@ -1,4 +1,4 @@
-"""Demonstrator of a fit with play: come over the hole upright, lower, slide to where the contact says, press."""
+"""Demonstrator of a fit with play: bring the plug over the hole upright, lower it, slide as the contact shows, press."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ class UprightConfig(InsertionExpertConfig):
     hover_height: float = 0.015
     """Height over the rim, in m, from which the plug is lowered. Tuned."""
     aim_error: float = 0.006
-    """Largest distance from the hole's axis, in m, to which the plug comes at that height. Tuned."""
+    """Largest distance from the hole's axis, in m, of the point at `hover_height` to which the plug comes first. Tuned."""
     centring: float = 0.3
     """Share of its distance from the axis by which the plug is moved in one step while it is lowered. Tuned."""
     slope: float = 1.5
@@ -37,27 +37,27 @@ class UprightConfig(InsertionExpertConfig):
     lowering: float = 0.003
     """Depth below the rim, in m, down to which the plug is lowered where nothing stops it. Tuned."""
     slide: float = 3e-4
-    """Motion of the plug away from what it stands on, in m per step. Tuned."""
+    """Motion of the plug away from the edge that it stands on, in m per step. Tuned."""
     sure_force: float = 1.5
     """Downward force, in N, from which the place of a contact can be told. Tuned."""
     unload_every: int = 10
     """Number of steps between changes of the force on a gear whose teeth stand on others. Tuned."""
     light_press: float = 1.0
-    """Downward force, in N, that takes turns with `press_force` on a gear whose teeth stand on others. Tuned."""
+    """Downward force, in N, that alternates with `press_force` on a gear whose teeth stand on others. Tuned."""
     slipped: float = float(np.deg2rad(3.0))
     """Lean of a gear, in rad, from which on it has slipped in the hand and is set down anew. Tuned."""
     shallow: float = 0.012
     """Depth of the gear's end below the shaft's tip, in m, up to which a gear that slipped is set down anew. Tuned."""
     centred: float = 0.0008
-    """Distance of the contact from the middle, in m, below which it says no direction. Tuned."""
+    """Distance of the contact from the middle, in m, below which it shows no direction. Tuned."""
 
 
 class UprightInsertionExpert(InsertionExpert):
     """Does what a person does with half a millimetre of play.
 
     It comes roughly over the hole, brings the plug to its axis while it lowers it, and presses. Where the plug stands on an
-    edge, the force comes from the side on which it overlaps; it slides away from there. In the hole it gives way to the walls.
-    Each action depends on what is seen and felt at that moment, so that a policy without memory can do the same.
+    edge, the force comes from the side on which it overlaps, and it slides away from there. In the hole it yields to the walls.
+    Each action depends only on what is seen and felt at that moment, so that a policy without memory can do the same.
     """
 
     config = UprightConfig()
@@ -96,7 +96,7 @@ class UprightInsertionExpert(InsertionExpert):
 
 
 class UprightGearExpert(UprightInsertionExpert):
-    """Lowers the bore over the shaft, and turns the gear to and fro until its teeth fall into gaps.
+    """Lowers a gear's bore over its shaft, and turns the gear to and fro until its teeth find gaps.
 
     Where teeth stand on teeth, it presses less now and then, so that the gear turns over its neighbours instead of with them.
     """
@@ -117,11 +117,11 @@ class UprightGearExpert(UprightInsertionExpert):
 
 @register_demonstrator("ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1")
 def insertion_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
-    """The demonstrator for the sizes of the parts: upright where they have play, leaning where they have not."""
+    """Make the demonstrator that fits the sizes of the parts: upright where they have play, leaning where they have not."""
     return (UprightInsertionExpert if env.fit.goes_in_upright else LeaningInsertionExpert)(env, seed)
 
 
 @register_demonstrator("ManiFeel-GearAssembly-v1")
 def gear_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
-    """The demonstrator of the gear for the sizes of the parts."""
+    """Make the demonstrator of the gear that fits the sizes of the parts."""
     return (UprightGearExpert if env.fit.goes_in_upright else LeaningGearExpert)(env, seed)

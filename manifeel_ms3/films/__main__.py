@@ -36,11 +36,13 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
 from .shots import FilmingWrapper, Take, View, filming_env, shown_steps
 
 log = logging.getLogger(__name__)
+SMALLEST = dict(max_frames=2, fps=1, width=64)
+"""Smallest values of the arguments: a film has a first and a last frame, and captions must be readable (chosen)."""
 
 
 @dataclass
 class Args:
-    """Arguments of the command."""
+    """Make a film of recorded or evaluated episodes."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
     """Paths of trajectory files (.h5), or of results of evaluations (.json); the film shows one episode of each."""
@@ -61,9 +63,9 @@ class Args:
     checkpoint: Path | None = None
     """Checkpoint folder of the policy of a result; checkpoints/last beside the result if not given."""
     policy: str | None = None
-    """Policy of a result that is no checkpoint: a class ("module:Class"), or the address of a server."""
+    """Policy of a result, if it is not a checkpoint: a class ("module:Class"), or the address of a server."""
     policy_kwargs: str = "{}"
-    """Keyword arguments of the --policy, as json."""
+    """Keyword arguments of --policy, as json."""
 
 
 @dataclass(frozen=True)
@@ -79,8 +81,9 @@ class Source:
     entry: dict[str, Any]
     """The episode's entry in the header of the trajectory file, or in the result."""
     is_result: bool
+    """Whether the file is a result of an evaluation, and not a trajectory file."""
     inference: dict[str, Any]
-    """Device and batch size of the policy of a result."""
+    """Device and batch size of the policy of a result; empty for a trajectory file."""
 
     @property
     def seed(self) -> int:
@@ -125,13 +128,13 @@ def _check(args: Args) -> None:
     """Check the arguments before anything is rendered.
 
     Raises:
-        InvalidArgumentError: One is not allowed.
+        InvalidArgumentError: An argument is not allowed.
     """
     if not args.files:
         raise InvalidArgumentError("no file is given; give a trajectory file (.h5) or a result of `manifeel eval` (.json)")
     one_of("--camera", args.camera, (None, *CAMERAS))
     one_of("--pad", args.pad, SIDES)
-    for name, least in (("max_frames", 2), ("fps", 1), ("width", 64)):
+    for name, least in SMALLEST.items():
         value = getattr(args, name)
         if value is not None and value < least:
             raise InvalidArgumentError(f"--{name.replace('_', '-')} {value} is too small; give {least} or more")
@@ -160,7 +163,7 @@ def _film(source: Source, args: Args) -> Take:
     """Run an episode again and film it.
 
     Raises:
-        DemonstrationError: The recorded actions succeed no longer, or do so only now.
+        DemonstrationError: The recorded actions now fail where they succeeded before, or the other way round.
     """
     spec = task_spec(source.env_id)
     view = View(args.camera or spec.policy_camera, args.pad)
@@ -202,10 +205,10 @@ def _policy(source: Source, args: Args) -> Policy:
 
 
 def _name_difference(source: Source, success: bool) -> None:
-    """Say that an episode has come out otherwise than before.
+    """Report that an episode has another outcome than before.
 
     Raises:
-        DemonstrationError: It is of a trajectory file, whose actions alone decide the outcome.
+        DemonstrationError: The episode is of a trajectory file, whose actions alone decide the outcome.
     """
     outcome = "succeeds" if success else "does not succeed"
     if source.is_result:
@@ -218,7 +221,7 @@ def _name_difference(source: Source, success: bool) -> None:
 
 
 def next_step(_args: Args, made: Path) -> str:
-    """What the command made, and what one can do with it."""
+    """Sentence about what the command has made, and what one can do with it."""
     return f"{made} ({made.stat().st_size / 1e6:.1f} MB) plays in any browser"
 
 

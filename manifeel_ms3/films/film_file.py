@@ -12,24 +12,25 @@ from manifeel_ms3.evaluation.video import encode_mp4
 from manifeel_ms3.files import atomic_write
 
 SUFFIXES = (".mp4", ".webp", ".gif")
+"""Suffixes of the formats in which films are written."""
 BLOCK = 2
 """Widths and heights are cut to multiples of this number of pixels, which H.264 needs."""
 WEBP_QUALITY = 70
-"""Quality of the WebP encoding from 0 to 100 (chosen; captions stay sharp)."""
+"""Quality of the WebP encoding from 0 to 100 (chosen by eye: captions stay sharp)."""
 WEBP_EFFORT = 4
-"""Effort of the WebP encoding from 0 to 6; the largest takes longer, and yields the smallest file."""
+"""Effort of the WebP encoding, from 0 (fast) to 6 (smallest file); chosen."""
 END_SECONDS = 1.5
 """Time for which the last frame of each episode is shown, in s (chosen)."""
 
 
 def check_film_path(path: Path) -> None:
-    """Check that the path ends in a known suffix and is no folder.
+    """Check that a path ends in a known suffix and is not a folder.
 
     Raises:
-        InvalidArgumentError: It does not, or is one.
+        InvalidArgumentError: The path has another suffix, or is a folder.
     """
     if path.suffix.lower() not in SUFFIXES or path.is_dir():
-        raise InvalidArgumentError(f"--out {path} is no path of a film; give a file that ends in {', '.join(SUFFIXES)}")
+        raise InvalidArgumentError(f"--out {path} is not a path of a film; give a file that ends in {', '.join(SUFFIXES)}")
 
 
 def write_film(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:

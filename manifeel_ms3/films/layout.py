@@ -1,4 +1,7 @@
-"""The layout of a film: title above, scene at the left, camera, touch and the curve of the force at the right."""
+"""The layout of a film: the title on top, the scene at the left, and camera, touch and the force curve at the right.
+
+Sizes and colours are chosen by eye.
+"""
 
 from collections.abc import Iterator
 
@@ -28,17 +31,18 @@ TITLE_INSET, SUCCESS_INSET = 12, 90
 CAPTION_AT = (8, 6)
 """Place of a caption in its tile, in pixels."""
 CAPTION_PADDING = (5, 4)
-"""Width of the dark ground around a caption at its sides, and above and below it, in pixels."""
+"""Margin of the dark background of a caption at the sides, and above and below, in pixels."""
 LIMIT_LIFT = 3
-"""Distance of its text above the line of the limit, in pixels."""
+"""Height of the text of the force limit over the limit's line, in pixels."""
 POINT_RADIUS = 3
 """Radius of the point at the end of the curve, in pixels."""
 HEADROOM = 1.1
 """Upper end of the axis of forces, as a multiple of the largest force."""
 SMALLEST_AXIS = 5.0
-"""Smallest end of the axis of forces, in N: less is noise of the contacts."""
+"""Smallest upper end of the axis of forces before `HEADROOM`, in N: smaller forces are noise of the contacts."""
 GROUND, PAPER, INK, FAINT = (18, 20, 24), (30, 33, 39), (236, 238, 242), (128, 134, 146)
 CURVE, SUCCESS, LIMIT = (255, 170, 70), (110, 210, 130), (200, 90, 90)
+"""RGB colours of the background, tiles, text and faint text and lines; of the force curve, success and force limit."""
 
 
 def film_frames(take: Take) -> Iterator[Image.Image]:
@@ -48,7 +52,7 @@ def film_frames(take: Take) -> Iterator[Image.Image]:
 
 
 def film_frame(take: Take, shot: Shot) -> Image.Image:
-    """One frame."""
+    """One frame of a film: an image of `SIZE` for a shot of a take."""
     frame = Image.new("RGB", SIZE, GROUND)
     _draw_title(ImageDraw.Draw(frame), take, shot.step)
     images = dict(shot.images)
@@ -74,7 +78,7 @@ def _draw_title(draw: ImageDraw.ImageDraw, take: Take, step: int) -> None:
 
 
 def _fitted(image: np.ndarray, width: int, height: int) -> Image.Image:
-    """An image as large as fits, in the middle of a tile."""
+    """Tile with an image (H, W, 3) in its middle, as large as fits; sizes in pixels."""
     picture = Image.fromarray(image)
     scale = min(width / picture.width, height / picture.height)
     size = (round(picture.width * scale), round(picture.height * scale))
@@ -92,7 +96,7 @@ def _draw_caption(draw: ImageDraw.ImageDraw, caption: str) -> None:
 
 
 def _force_curve(take: Take, step: int) -> Image.Image:
-    """The contact force from the start up to a step, over the whole length of the episode."""
+    """Tile with the curve of the contact force up to a step; its time axis spans the whole episode."""
     tile = Image.new("RGB", (NARROW, TILE), PAPER)
     draw = ImageDraw.Draw(tile)
     left, top, right, bottom = MARGINS[0], MARGINS[1], NARROW - MARGINS[2], TILE - MARGINS[3]

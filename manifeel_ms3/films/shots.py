@@ -1,4 +1,4 @@
-"""What a film shows of an episode, taken while the episode runs."""
+"""Shots of a film: images, forces and success of an episode, taken while it runs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,15 +13,15 @@ from manifeel_ms3.tasks.obs_modes import PAD
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 SCENE_SIZE = 480
-"""Width and height of the picture of the scene, in pixels."""
+"""Width and height of the image of the scene, in pixels; chosen by eye."""
 
 
 @dataclass(frozen=True)
 class View:
-    """What a film shows beside the scene and the force."""
+    """The camera and the pad that a film shows beside the scene and the contact force."""
 
     camera: str
-    """Name of the camera."""
+    """Name of the camera: front, side or wrist."""
     pad: str
     """Side of the finger pad, "left" or "right"."""
 
@@ -38,17 +38,18 @@ class Shot:
 
 @dataclass
 class Take:
-    """What is filmed of one episode."""
+    """Everything that a film needs of one episode."""
 
     title: str
     """Task, origin and seed of the episode."""
     force_limit: float | None
     """Largest contact force of a gentle success of the task, in N; None if not known."""
     shots: list[Shot] = field(default_factory=list)
+    """Shots of the steps that are shown, in their order."""
     forces: list[float] = field(default_factory=list)
-    """Contact force of every control step, in N; 0 at the start."""
+    """Contact force at the start, where it is 0, and of every control step, in N."""
     successes: list[bool] = field(default_factory=list)
-    """Whether the task has succeeded, for every control step."""
+    """Whether the task has succeeded, for the start and every control step."""
 
 
 class FilmingWrapper(gym.Wrapper):
@@ -56,10 +57,10 @@ class FilmingWrapper(gym.Wrapper):
 
     Args:
         env: Environment of `filming_env`.
-        take: What the shots, forces and successes are added to.
+        take: Take to which the shots, forces and successes are added.
         view: Camera and pad to show.
         steps: Numbers of the control steps that are shown.
-        on_step: Called after the reset and after every step.
+        on_step: Function that is called after the reset and after every step.
     """
 
     def __init__(self, env: gym.Env, take: Take, view: View, steps: set[int], on_step: Callable[[], None]):

@@ -1,4 +1,4 @@
-"""Shapes of the tasks' parts: one description for drawing, collision and touch."""
+"""Shapes of the tasks' parts; one description of each serves drawing, collision and touch."""
 
 from .fits import FITS as FITS
 from .fits import Fit as Fit

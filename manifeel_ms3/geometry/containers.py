@@ -6,23 +6,35 @@ from manifeel_ms3.rendering.looks import BRASS, CARDBOARD, Look
 
 from .part import Box, Cylinder, Hulls, Part, ring_of_wedges
 
-CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004  # m
-CONTAINER_FLOOR = 0.004  # m, thickness
-BATTERY_SIZE = 0.025  # m
-TERMINAL_HEIGHT = 0.001  # m
-BATTERY_LOOK = Look((0.05, 0.25, 0.10))  # green, chosen by eye
-BATTERY_DENSITY = 2000.0  # kg/m^3: an alkaline block 6LR61 has 45 g in 48.5 x 26.5 x 17.5 mm (data sheets)
-BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010  # m, inside; the floor's thickness
-BOWL_WALL, BOWL_WEDGES = 0.005, 16  # m; number of convex pieces of the round wall
+CONTAINER_OUTER, CONTAINER_HEIGHT, CONTAINER_WALL = (0.322, 0.281), 0.161, 0.004
+"""Outer size of the container along x and y, its height, and the thickness of its walls, in m. Set once; not tuned."""
+CONTAINER_FLOOR = 0.004
+"""Thickness of the container's floor, in m. Set once; not tuned."""
+BATTERY_SIZE = 0.025
+"""Side of the cube-shaped battery, in m. Set once; not tuned."""
+TERMINAL_SIZE, TERMINAL_HEIGHT = BATTERY_SIZE / 3, 0.001
+"""Side and height of the battery's contact, in m. Chosen by eye."""
+BATTERY_LOOK = Look((0.05, 0.25, 0.10))
+"""Look of the battery: green, chosen by eye."""
+BATTERY_DENSITY = 2000.0
+"""Density of the battery, in kg/m^3: an alkaline block 6LR61 has 45 g in 48.5 x 26.5 x 17.5 mm (data sheets)."""
+BOWL_RADIUS, BOWL_HEIGHT, BOWL_FLOOR = 0.045, 0.035, 0.010
+"""Inner radius and height of a bowl, and the thickness of its floor, in m. Chosen by eye."""
+BOWL_WALL, BOWL_WEDGES = 0.005, 16
+"""Thickness of a bowl's round wall, in m, and number of its convex pieces. Chosen by eye."""
 
 
 def container(front_drawn: bool) -> Part:
-    """Opaque container in which the battery lies."""
+    """Opaque container in which the battery lies.
+
+    Args:
+        front_drawn: Whether the front, at +x, is drawn; it collides in any case.
+    """
     return open_box(CONTAINER_OUTER, CONTAINER_HEIGHT, front_drawn)
 
 
 def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Part:
-    """Opaque box, open above; its frame in the middle of its underside.
+    """Opaque box, open above. Its frame is in the middle of its underside.
 
     Args:
         outer: Outer size along x and y, in m.
@@ -42,7 +54,7 @@ def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Pa
 def battery() -> Part:
     """Cube-shaped battery block with its contact in the middle of one face."""
     size = BATTERY_SIZE
-    terminal = Box((size / 3, size / 3, TERMINAL_HEIGHT), (0.0, 0.0, size / 2 + TERMINAL_HEIGHT / 2))
+    terminal = Box((TERMINAL_SIZE, TERMINAL_SIZE, TERMINAL_HEIGHT), (0.0, 0.0, size / 2 + TERMINAL_HEIGHT / 2))
     return Part(
         "battery",
         (Box((size, size, size)), terminal),
@@ -53,7 +65,7 @@ def battery() -> Part:
 
 
 def bowl(name: str, look: Look) -> Part:
-    """Round bowl with an upright wall; its frame in the middle of its underside."""
+    """Round bowl with an upright wall. Its frame is in the middle of its underside."""
 
     def rim(angles: np.ndarray) -> np.ndarray:
         return np.full_like(angles, BOWL_RADIUS + BOWL_WALL)

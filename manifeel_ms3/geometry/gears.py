@@ -1,4 +1,4 @@
-"""Spur gears that mesh: involute teeth on a ring of wedges around the bore, and the base whose shafts they turn on."""
+"""Spur gears that mesh, with involute teeth on a ring of convex wedges, and the base with the shafts on which they turn."""
 
 import functools
 from dataclasses import dataclass
@@ -11,33 +11,54 @@ from .fits import ABOVE_RIM, Fit, Lead
 from .materials import ABS, ALUMINIUM
 from .part import Box, Cylinder, Hulls, Part, Piece, extruded, lofted, ring_of_wedges
 
-MODULE = 0.002  # m: pitch diameter per tooth
+MODULE = 0.002
+"""Pitch diameter per tooth, in m (measured in the meshes of the public code)."""
 PRESSURE_ANGLE = np.deg2rad(20.0)
-BACKLASH = 4e-4  # m along the pitch circle, by which each gear's teeth are thinner than half the pitch
-TEETH = {"small": 9, "medium": 19, "large": 29}  # 22, 42 and 62 mm across
-THICKNESS = {"small": 0.014, "medium": 0.020, "large": 0.014}  # m
-SHAFT_HEIGHT = 0.018  # m
-RING_HEIGHT = 0.005  # m, between the medium gear and its handle
-BASE_SIZE = (0.15, 0.075, 0.025)  # m
-HANDLE_SIZE = (0.020, 0.030, 0.040)  # m; narrower than a pad, so that touch sees its edges
-GRIP = -0.004  # m, from the handle's middle
-WEDGES = 16  # number of convex pieces of the ring around the bore
-DEDENDUM = 1.25  # modules, from the pitch circle to the root (ISO 53)
-RING_OVERLAP = 2e-4  # m, of the ring and the teeth, so that no gap is between them
-NECK_RADIUS = 0.010  # m, of the ring between the gear and its handle
-LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))  # along x and y, with which the bore's rim goes ahead; tuned
-GEAR_FRICTION = 0.15  # greased
-BESIDE = 0.0022  # m from the shaft's side to where the bore's rim is set down; tuned
-TIP_POINTS = 24  # number of corners of a shaft's chamfer; 0.04 mm inside its circle at most
+"""Pressure angle of the teeth, in rad (ISO 53)."""
+BACKLASH = 4e-4
+"""Length on the pitch circle, in m, by which each gear's teeth are thinner than half the pitch. Set once; not tuned."""
+TEETH = {"small": 9, "medium": 19, "large": 29}
+"""Numbers of teeth; the gears are 22, 42 and 62 mm across, as in the public code."""
+THICKNESS = {"small": 0.014, "medium": 0.020, "large": 0.014}
+"""Thickness of the gears, in m. Set once; not tuned."""
+SHAFT_HEIGHT = 0.018
+"""Height of the shafts over the base, in m. Set once; not tuned."""
+RING_HEIGHT = 0.005
+"""Height of the ring between the medium gear and its handle, in m. Chosen by eye."""
+BASE_SIZE = (0.15, 0.075, 0.025)
+"""Size of the base, in m. Chosen by eye."""
+HANDLE_SIZE = (0.020, 0.030, 0.040)
+"""Size of the handle, in m; it is narrower than a pad, so that the pad feels its edges."""
+GRIP = -0.004
+"""Distance of the middle between the pads from the handle's middle along the plug's z, in m. Set once; not tuned."""
+WEDGES = 16
+"""Number of convex pieces of the ring around the bore."""
+DEDENDUM = 1.25
+"""Distance from the pitch circle to the root, in modules (ISO 53)."""
+RING_OVERLAP = 2e-4
+"""Distance by which the ring around the bore and the teeth overlap, in m, so that no gap is between them."""
+NECK_RADIUS = 0.010
+"""Radius of the ring between the medium gear and its handle, in m. Chosen by eye."""
+LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))
+"""Lean along x and along y, in rad, with which the bore's rim goes ahead. Tuned."""
+GEAR_FRICTION = 0.15
+"""Coulomb's friction coefficient of greased gears."""
+BESIDE = 0.0022
+"""Distance from the shaft's side to where the bore's rim is set down, in m. Tuned."""
+TIP_POINTS = 24
+"""Number of corners of a shaft's chamfer, which lies at most 0.04 mm inside its circle."""
 FLANK_POINTS = 5
-# along the base: neighbours at the distance of their pitch circles
+"""Number of straight pieces of a tooth's flank. Set once; not tuned."""
 SHAFT_X = {
     "small": -MODULE * (TEETH["small"] + TEETH["medium"]) / 2,
     "medium": 0.0,
     "large": MODULE * (TEETH["medium"] + TEETH["large"]) / 2,
 }
-BASE_SHIFT = -0.010  # m: the base's middle, seen from the medium shaft
+"""Positions of the shafts along the base, in m; the pitch circles of neighbouring gears touch."""
+BASE_SHIFT = -0.010
+"""Position of the medium shaft along x, seen from the base's middle, in m. Chosen by eye."""
 LOOKS = {"small": Look((0.62, 0.10, 0.05)), "medium": Look((0.85, 0.55, 0.05)), "large": Look((0.06, 0.35, 0.12))}
+"""Looks of the gears: red, yellow and green. Chosen by eye."""
 
 
 @dataclass(frozen=True)
@@ -51,17 +72,22 @@ class ShaftSizes:
     bore: float
     """Radius of a gear's bore."""
     clearance: float
-    """Largest distance from the shaft's axis at which the gear counts as on it; chosen by hand."""
+    """Largest distance from the shaft's axis at which the gear counts as on it. Our choice."""
 
 
 SHAFTS = {
     "paper": ShaftSizes(0.0045, 0.0038, 0.0050, 1e-3),  # measured in the meshes of the public code
-    "tight": ShaftSizes(0.0050, 0.0050, 0.00515, 5e-4),
+    "tight": ShaftSizes(0.0050, 0.0050, 0.00515, 5e-4),  # set once; not tuned
 }
+"""Sizes of the shafts by the name of the fit."""
 
 
 def tooth_polygon(teeth: int) -> np.ndarray:
-    """Outline (n, 2), m, of the tooth about the x axis, from root to tip: involutes of the base circle (ISO 53 proportions)."""
+    """Outline (n, 2), in m, of the tooth around the x axis: involutes of the base circle from root to tip (ISO 53 proportions).
+
+    Args:
+        teeth: Number of the gear's teeth.
+    """
     pitch = MODULE * teeth / 2
     base, tip, root = pitch * np.cos(PRESSURE_ANGLE), pitch + MODULE, pitch - DEDENDUM * MODULE
     radius = np.linspace(root, tip, FLANK_POINTS + 1)
@@ -75,7 +101,14 @@ def tooth_polygon(teeth: int) -> np.ndarray:
 
 
 def gear_hulls(teeth: int, bore: float, bottom: float, top: float) -> Hulls:
-    """Gear about z with a bore of this radius, in m, between two heights, in the phase that has a tooth at +x."""
+    """Gear about z that has a tooth at +x.
+
+    Args:
+        teeth: Number of teeth.
+        bore: Radius of the bore, in m.
+        bottom: Height of the underside, in m.
+        top: Height of the upper side, in m.
+    """
     root = MODULE * teeth / 2 - DEDENDUM * MODULE
     pieces = []
     for k in range(teeth):
@@ -88,7 +121,12 @@ def gear_hulls(teeth: int, bore: float, bottom: float, top: float) -> Hulls:
 
 @functools.cache
 def neighbour_gear(name: str, fit: str = "paper") -> Part:
-    """The "small" or the "large" gear, which turns on its shaft; its frame on the axis, in the underside."""
+    """Gear that turns freely on its shaft. Its frame lies on the axis, in the underside.
+
+    Args:
+        name: "small" or "large".
+        fit: Name of the fit, which decides the bore.
+    """
     return Part(
         f"{name}_gear",
         (gear_hulls(TEETH[name], SHAFTS[fit].bore, 0.0, THICKNESS[name]),),
@@ -102,7 +140,7 @@ def gear_fit(fit: str = "paper") -> Fit:
     """The medium gear on its handle, and the base; the gear is held by its handle, and the bore's rim finds the shaft.
 
     Args:
-        fit: "paper" for bores with 0.5 mm of play on each side and chamfered shafts; "tight" for 0.15 mm and blunt ones.
+        fit: "paper" for bores with 0.5 mm of play on each side and chamfered shafts; "tight" for 0.15 mm and blunt shafts.
     """
     sizes = SHAFTS[fit]
     top = HANDLE_SIZE[2] / 2 + RING_HEIGHT
@@ -136,7 +174,11 @@ def gear_fit(fit: str = "paper") -> Fit:
 
 
 def gear_base(fit: str = "paper") -> Part:
-    """Plate with three shafts; its frame below the middle shaft, in the plate's underside."""
+    """Plate with three shafts. Its frame is below the middle shaft, in the plate's underside.
+
+    Args:
+        fit: Name of the fit, which decides the shafts.
+    """
     sizes = SHAFTS[fit]
     plate = Box(BASE_SIZE, (-BASE_SHIFT, 0.0, BASE_SIZE[2] / 2))
     shafts = [piece for x in SHAFT_X.values() for piece in _shaft(sizes, x)]

@@ -1,4 +1,4 @@
-"""Densities, in kg/m^3, of the materials that parts are drawn as: handbook values (CRC Handbook; data sheets for ABS)."""
+"""Densities of the parts' materials, in kg/m^3: values of the CRC Handbook, and of data sheets for ABS."""
 
 ABS = 1050.0
 ALUMINIUM = 2700.0

@@ -21,13 +21,15 @@ from manifeel_ms3.sensors.depth.surfaces import give_relief
 from .materials import ABS
 
 MILLIMETRES = (1e-3, 1e-3, 1e-3)
-"""Unit of mesh files: the engine merges what lies within 0.7 thousandths of a unit of a plane, teeth and threads included."""
-UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]  # wxyz: SAPIEN's cylinders lie along x, ours stand along z
+"""Unit of the mesh files of convex hulls, in m. The engine flattens whatever lies within 0.7 thousandths of a unit of a plane:
+in metres, that would flatten teeth and threads."""
+UPRIGHT = [np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]
+"""Quaternion, w first, that turns SAPIEN's cylinders, which lie along x, to stand along z."""
 
 
 @dataclass(frozen=True)
 class Box:
-    """Axis-aligned box in the part's frame, m."""
+    """Axis-aligned box in the part's frame; sizes in m."""
 
     size: tuple[float, float, float]
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -41,7 +43,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Round pin along the part's z, m."""
+    """Cylinder along the z of the part's frame; sizes in m."""
 
     radius: float
     length: float
@@ -56,7 +58,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Ball:
-    """Sphere in the part's frame, m."""
+    """Sphere in the part's frame; sizes in m."""
 
     radius: float
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -70,7 +72,7 @@ class Ball:
 
 @dataclass(frozen=True, eq=False)
 class Hulls:
-    """Convex hulls of several sets of points (n, 3), m."""
+    """Convex hulls of several sets of points (n, 3) in the part's frame, in m."""
 
     points: tuple[np.ndarray, ...]
 
@@ -82,13 +84,13 @@ class Hulls:
 
     @cached_property
     def file(self) -> Path:
-        """File with the hulls as meshes, which is the form that the engine takes."""
+        """Path of a file with the hulls as meshes, which the engine reads."""
         return _cached_obj([trimesh.convex.convex_hull(points / MILLIMETRES[0]) for points in self.points])
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A triangle mesh, in m, of a fixed part, which collides with convex ones."""
+    """Triangle mesh of a fixed part, in the part's frame, in m; it collides with convex shapes only."""
 
     mesh: trimesh.Trimesh
 
@@ -100,7 +102,7 @@ class Solid:
 
     @cached_property
     def file(self) -> Path:
-        """File with the mesh, which is the form that the engine takes."""
+        """Path of a file with the mesh, which the engine reads."""
         return _cached_obj([self.mesh])
 
 
@@ -108,7 +110,7 @@ Piece = Box | Cylinder | Ball | Hulls | Solid
 
 
 def _cached_obj(meshes: list[trimesh.Trimesh]) -> Path:
-    """File in the cache with these meshes as its objects; written once."""
+    """Path of a file in the cache that has these meshes as its objects; it is written once."""
     lines, first = [], 1
     for k, mesh in enumerate(meshes):
         lines.append(f"o piece{k}")
@@ -133,7 +135,7 @@ class Part:
     """Density in kg/m^3 of a dynamic part: that of the material it is drawn as. A light part between stiff pads needs a high
     physics rate; see `VisuotactileEnv.physics_rate`."""
     friction: float = 0.5
-    """Coulomb's coefficient."""
+    """Coulomb's friction coefficient; that of the public code for held parts by default."""
     other_looks: dict[int, Look] = field(default_factory=dict)
     """Looks of single pieces, by index in `pieces`."""
     other_densities: dict[int, float] = field(default_factory=dict)
@@ -146,7 +148,13 @@ class Part:
     """Surface that the pads touch, where it has details too fine for cameras and contacts."""
 
     def build(self, scene: ManiSkillScene, body_type: str, initial_pose: sapien.Pose) -> Actor:
-        """Add the part to a scene as a "dynamic", "kinematic" or "static" actor."""
+        """Add the part to a scene.
+
+        Args:
+            scene: Scene in which the actor is made.
+            body_type: "dynamic", "kinematic" or "static".
+            initial_pose: Pose of the actor when the scene starts.
+        """
         builder = scene.create_actor_builder()
         for k, piece in enumerate(self.pieces):
             look = None
@@ -164,24 +172,24 @@ class Part:
 
 
 def lofted(sections: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
-    """Points (m, 3) of several outlines (n, 2), each at its height; all in m."""
+    """Points (m, 3) of several outlines (n, 2), each at its own height; all in m."""
     return np.concatenate([np.c_[outline, np.full(len(outline), z)] for outline, z in sections])
 
 
 def extruded(outline: np.ndarray, bottom: float, top: float) -> np.ndarray:
-    """Points (2 n, 3) of an outline (n, 2) at two heights."""
+    """Points (2 n, 3) of an outline (n, 2) at two heights; all in m."""
     return lofted([(outline, bottom), (outline, top)])
 
 
 def ring_of_wedges(
     count: int, bore: float, rim: Callable[[np.ndarray], np.ndarray], bottom: float, top: float
 ) -> list[np.ndarray]:
-    """Points (8, 3) of each convex wedge of a ring about z, whose flats touch the bore's circle.
+    """Points (8, 3), in m, of each convex wedge of a ring about z, whose inner faces touch the bore's circle.
 
     Args:
         count: Number of wedges.
         bore: Radius of the bore, in m.
-        rim: Outer radii, in m, at angles (n,), in rad.
+        rim: Function from angles (n,), in rad, to the outer radii there, in m.
         bottom: Height of the underside, in m.
         top: Height of the top, in m.
     """

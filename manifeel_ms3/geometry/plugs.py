@@ -1,4 +1,4 @@
-"""Pegs with their sockets: the 12 mm peg of the paper's public code, and the peg of the reorientation task."""
+"""Pegs with their sockets: the peg of the paper's public code, and that of the reorientation task."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,8 @@ from . import materials
 from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .part import Box, Part, block_with_chamfered_holes, block_with_holes
 
-PEG_SIZE = (0.01196, 0.00791, 0.050)  # m
+PEG_SIZE = (0.01196, 0.00791, 0.050)
+"""Size of the peg, in m (measured in the mesh of the public code; its length is set once)."""
 
 
 @dataclass(frozen=True)
@@ -22,16 +23,19 @@ class PegSocket:
     chamfer: float
     """Width of the chamfer around the hole's mouth."""
     plate: tuple[float, float]
-    """Side and thickness of the square plate below the block, which is the hole's floor; the table is where it is 0 thick."""
+    """Side and thickness of the square plate below the block, which is the hole's floor; where it is 0 thick, the
+    table is the floor."""
     grip: float
-    """Distance of the middle between the pads from the peg's middle; the fingers stay clear of the block."""
+    """Distance of the middle between the pads from the peg's middle, so that the fingers stay clear of the block."""
 
 
 PEG_SOCKETS = {
     "paper": PegSocket((0.0130, 0.0090), 0.025, 0.001, (0.040, 0.003), 0.022),  # measured in the mesh of the public code
     "tight": PegSocket((0.012, 0.008), 0.009, 0.0, (0.025, 0.0), 0.014),  # 0.04 and 0.09 mm wider than the peg
 }
-PEG_BLOCK = (0.025, 0.025)  # m
+"""Sizes of the peg's socket by the name of the fit."""
+PEG_BLOCK = (0.025, 0.025)
+"""Size of the socket's block along x and y, in m. Chosen by eye."""
 
 
 def peg_fit(fit: str = "paper") -> Fit:
@@ -59,14 +63,19 @@ def peg_fit(fit: str = "paper") -> Fit:
     )
 
 
-REORIENTATION_PEG = (0.016, 0.010, 0.050)  # m
-REORIENTATION_GAP, RIM_DEPTH, RIM_BOTTOM = 2e-4, 0.015, 0.005  # m
-RIM_SIZE = (0.03, 0.03)  # m, outside
-REORIENTATION_GRIP = -0.018  # m, from the peg's middle; the fingers stay clear of the rim at 30 degrees
+REORIENTATION_PEG = (0.016, 0.010, 0.050)
+"""Size of the reorientation task's peg, in m. Set once; not tuned."""
+REORIENTATION_GAP, RIM_DEPTH, RIM_BOTTOM = 2e-4, 0.015, 0.005
+"""Gap on each side of the peg in the rim, depth of the rim, and thickness of its bottom, in m. Set once; not tuned."""
+RIM_SIZE = (0.03, 0.03)
+"""Outer size of the rim along x and y, in m. Set once; not tuned."""
+REORIENTATION_GRIP = -0.018
+"""Distance of the middle between the pads from the peg's middle, in m: the fingers stay clear of the rim at a pitch of 30
+degrees."""
 
 
 def reorientation_fit() -> Fit:
-    """Peg 16 x 10 x 50 mm and a rim 15 mm deep around its place, 0.2 mm wider on each side."""
+    """Peg of 16 x 10 x 50 mm, and a rim 15 mm deep that takes it with a gap of 0.2 mm on each side."""
     x, y, z = REORIENTATION_PEG
     hole = (x + 2 * REORIENTATION_GAP, y + 2 * REORIENTATION_GAP)
     base = Box((*RIM_SIZE, RIM_BOTTOM), (0.0, 0.0, RIM_BOTTOM / 2))

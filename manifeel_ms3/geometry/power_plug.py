@@ -11,43 +11,43 @@ from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
 ARC_POINTS = 8
-"""Number of points of the round side of the U-shaped ground pin."""
+"""Number of points of the round side of the U-shaped ground pin. Set once; not tuned."""
 
 
 @dataclass(frozen=True)
 class PowerPlugSizes:
-    """Sizes in m. The blades are wide along x and thin along y; the ground pin lies at positive x."""
+    """Sizes of plug and socket, in m. The blades are wide along x and thin along y; the ground pin lies at positive x."""
 
     blade: tuple[float, float, float]
-    """Each blade: wide, thin, long."""
+    """Width, thickness and length of each blade."""
     blade_tip: float
-    """Length over which a blade narrows to `TIP_SHARE` of its section; 0 for a blunt one."""
+    """Length over which a blade narrows to `TIP_SHARE` of its section; 0 for a blunt blade."""
     spacing: float
     """Distance of the blades' middles, along y."""
     offset: float
     """Distance of the ground pin from the line between the blades, along x."""
     ground: tuple[float, float, float]
-    """Ground pin: along x, along y, long."""
+    """Size of the ground pin along x and y, and its length."""
     ground_tip: tuple[float, float]
-    """Size of the ground pin's end along y, and the length over which it narrows to it; 0 long for a blunt one."""
+    """Size of the ground pin's end along y, and the length over which the pin narrows to it; 0 for a blunt pin."""
     blade_hole: tuple[float, float]
-    """Each blade's hole: along x, along y."""
+    """Size of each blade's hole along x and y."""
     ground_hole: tuple[float, float]
-    """The ground pin's hole: along x, along y."""
+    """Size of the ground pin's hole along x and y."""
     depth: float
     """Depth of the holes."""
     chamfer: float
     """Width of the chamfer around the holes' mouths."""
     block: tuple[float, float, float]
-    """The socket's block."""
+    """Size of the socket's block."""
     handle: tuple[float, float, float]
-    """Size of the handle, which the fingers hold, in m."""
+    """Size of the handle, which the fingers hold."""
     head: tuple[float, float, float] | None = None
-    """Broad body at the handle's end, within its length, from which the prongs come."""
+    """Size of the broad body from which the prongs come, at the handle's end and within its length; None if there is none."""
 
 
 TIP_SHARE = 0.6
-"""Share of a blade's section that is left at its tip; by eye."""
+"""Share of a blade's section that is left at its tip. Chosen by eye."""
 SIZES = {
     # 1.8 times NEMA 5-15, measured in the meshes of the public code
     "paper": PowerPlugSizes(
@@ -81,14 +81,16 @@ SIZES = {
         handle=(0.019, 0.032, 0.055),
     ),
 }
-GRIP = -0.006  # m, from the handle's middle
+"""Sizes by the name of the fit."""
+GRIP = -0.006
+"""Distance of the middle between the pads from the handle's middle along the plug's z, in m. Set once; not tuned."""
 
 
 def power_fit(fit: str = "paper") -> Fit:
     """NEMA 5-15 plug on a handle and a socket that looks up.
 
     Args:
-        fit: "paper" for a plug of 1.8 times the standard with 0.5 to 0.8 mm of play on each side; "tight" for the standard.
+        fit: "paper" for 1.8 times the standard's size with 0.5 to 0.8 mm of play on each side; "tight" for the standard's size.
     """
     sizes = SIZES[fit]
     half = sizes.handle[2] / 2
@@ -145,7 +147,7 @@ def _prong(levels: list[tuple[np.ndarray, float]], place: tuple[float, float], b
 
 
 def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
-    """Slab with the ground hole and, at one x, two blade holes: one wide hole, and a bar between the blades in it."""
+    """Slab with the ground hole and two blade holes, which are one wide hole with a bar in its middle."""
     (x, y), rim = sizes.blade_hole, sizes.block[2]
     at, middle = -sizes.offset / 2, rim - sizes.depth / 2
     holes: Holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]

@@ -21,12 +21,14 @@ Height = TypeVar("Height", float, np.ndarray, torch.Tensor)
 class Screw:
     """A held part with a thread, and the fixed one that it is screwed onto or into.
 
-    Frames: the held part's on its axis, in the middle of what is held, z up when it is in place; the fixed part's in the middle
-    of its underside, z up. Lengths in m.
+    Frames: the held part's has its origin on the part's axis, midway between the pads, and z up when the part is in place; the
+    fixed part's lies in the middle of its underside, z up. Lengths are in m.
     """
 
     held: Part
+    """The part that the hand turns."""
     fixed: Part
+    """The part on the table."""
     grip_width: float
     """Width that the pads close on."""
     engaged: float
@@ -34,7 +36,7 @@ class Screw:
     pitch: float
     """Height of one turn of the thread."""
     seated: float
-    """Height of the held part's origin over the underside of the fixed one where it is far enough in."""
+    """Height of the held part's origin over the underside of the fixed one at which it is far enough in."""
     tightening: float
     """Angle, in rad, by which the held part is turned further once it is at the height `seated`."""
     reach: float
@@ -45,23 +47,45 @@ class Screw:
     """Force of each pad, in N."""
 
 
-GREASED_FRICTION = 0.15  # Coulomb's coefficient of greased steel
-M16 = iso_metric(0.008, 0.002)  # ISO 261, coarse pitch
-M16_POINT = 0.006  # m: radius of the flat point (ISO 4753)
-BOLT_FOOT, BOLT_LENGTH = 0.030, 0.024  # m: plate and head; thread
-NUT_ACROSS_FLATS, NUT_HEIGHT, NUT_WALL = 0.024, 0.013, 0.0083  # m; the wall is the ridge's root
-PLATE_SIZE, PLATE_HEIGHT, HEAD_BORE = 0.06, 0.02, 0.001  # m; the head is a ring of wedges around a pinhole
-PIECES_PER_TURN = 24  # convex pieces of one turn of a ridge
-HEX_WEDGES = 12  # two convex pieces for each side of a hexagon
-BOLT_TURN = np.deg2rad(-15)  # so that the threads meet soon after the hand begins to turn
-NUT_GAP, NUT_CREST_GAP, NUT_TURNS, NUT_MOUTH = 1e-4, 2e-4, 2.0, 0.0015  # m; the mouth is below the ridge
-NUT_DESCENT = 1.5  # pitches from the first contact of the threads to the goal
-NUT_TIGHTENING, NUT_SYMMETRY, NUT_GRIP_FORCE = np.deg2rad(40), np.deg2rad(60), 27.0  # rad; rad, of a hexagon; N
-NUT_ENGAGED = 0.0018  # m: its middle over the bolt's end, where the ridge's lower end just passes under the end of the crest
+GREASED_FRICTION = 0.15
+"""Coulomb's friction coefficient of greased steel."""
+M16 = iso_metric(0.008, 0.002)
+"""Thread of nut and bolt (ISO 261, coarse pitch)."""
+M16_POINT = 0.006
+"""Radius of the bolt's flat point, in m (ISO 4753)."""
+BOLT_FOOT, BOLT_LENGTH = 0.030, 0.024
+"""Height at which the bolt's thread begins, above plate and head, and length of the thread, in m. Set once; not tuned."""
+NUT_ACROSS_FLATS, NUT_HEIGHT = 0.024, 0.013
+"""Width of the nut across flats, and its height, in m (DIN 934)."""
+NUT_WALL = 0.0083
+"""Radius of the bore between the turns of the nut's ridge, in m: just wider than the bolt. Set once; not tuned."""
+PLATE_SIZE, PLATE_HEIGHT = 0.06, 0.02
+"""Side and height of the plate below the bolt, in m. Chosen by eye."""
+HEAD_BORE = 0.001
+"""Radius of the pinhole in the bolt's head, in m: the head is a ring of convex wedges, which needs one."""
+PIECES_PER_TURN = 24
+"""Number of convex pieces of one turn of a ridge. Set once; not tuned."""
+HEX_WEDGES = 12
+"""Number of convex pieces of a hexagon: two for each side."""
+BOLT_TURN = np.deg2rad(-15)
+"""Rotation of the bolt about its axis, in rad, with which the threads meet soon after the hand begins to turn."""
+NUT_GAP, NUT_CREST_GAP = 1e-4, 2e-4
+"""Gaps between nut and bolt, in m: along the axis at each flank, and at the ridge's crest. Set once; not tuned."""
+NUT_TURNS, NUT_MOUTH = 2.0, 0.0015
+"""Number of turns of the nut's ridge, and height of the free mouth below it, in m. Set once; not tuned."""
+NUT_DESCENT = 1.5
+"""Descent of the nut from the first contact of the threads to the goal, in pitches. Our choice."""
+NUT_TIGHTENING, NUT_SYMMETRY = np.deg2rad(40), np.deg2rad(60)
+"""Angle by which the nut is turned further at the end, tuned, and the symmetry of a hexagon, in rad."""
+NUT_GRIP_FORCE = 27.0
+"""Force of each pad on the nut, in N. Set once; not tuned."""
+NUT_ENGAGED = 0.0018
+"""Height of the nut's middle over the bolt's end, in m, at which the ridge's lower end just passes under the end of
+the crest."""
 
 
 def hexagon(across_flats: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Radius (n,) of a hexagon, one flat facing y, at angles (n,)."""
+    """Function from angles (n,), in rad, to the radii of a hexagon there, one of whose flats faces y; lengths in m."""
     return lambda angles: across_flats / 2 / np.cos(angles % (np.pi / 3) - np.pi / 6)
 
 
@@ -82,7 +106,7 @@ def m16_bolt() -> Part:
 
 
 def m16_nut() -> Part:
-    """Hexagon nut, 24 mm across flats, two turns of ridge in its lower half."""
+    """M16 hexagon nut, 24 mm across flats, whose thread is a ridge of two turns in its lower half."""
     inner, root = M16.minor_radius + NUT_CREST_GAP, NUT_WALL / np.cos(np.pi / (2 * HEX_WEDGES))
 
     def half_width(radius: float) -> float:
@@ -96,7 +120,7 @@ def m16_nut() -> Part:
 
 
 def nut_and_bolt() -> Screw:
-    """The M16 nut and its bolt."""
+    """M16 nut and its bolt."""
     return Screw(
         held=m16_nut(),
         fixed=m16_bolt(),
@@ -111,34 +135,63 @@ def nut_and_bolt() -> Screw:
     )
 
 
-# IEC 60061-1: cap 7004-21, holder 7005-20, both in the middle of their tolerances
 E27 = edison(major_radius=0.013125, pitch=0.003629, arc=0.001025, points=3)
-E27_GAP, GUIDE = 2.0e-4, 1.0e-3  # m, radial: between the threads, and of the smooth wall around them
+"""Thread of bulb and holder (IEC 60061-1: cap 7004-21, holder 7005-20, both in the middle of their tolerances)."""
+E27_GAP, GUIDE = 2.0e-4, 1.0e-3
+"""Radial gaps, in m: between the two threads, and of the holder's smooth wall around its thread. Set once; not tuned."""
 GLASS_RADIUS = 0.030
-CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066  # m, heights under the glass's middle
+"""Radius of the glass, in m. Chosen by eye."""
+CAP_TOP, CAP_FOOT, CAP_TIP = -0.036, -0.058, -0.066
+"""Heights of the cap's upper end, of its lower end and of the contact's end, in m over the glass's middle."""
 CAP_RIDGE, CAP_TURNS = -0.056, 1.5
-RIDGE_OVERLAP = 5e-4  # m, by which the cap's ridge reaches into its core, so that no gap is between them
-NECK_RADIUS, NECK_TOP = 0.018, -0.024  # m; where the neck meets the glass's sphere, from its middle
-FOOT_RADIUS = 0.005  # m: the insulator narrows to it
-TIP_RADIUS, TIP_HEIGHT = 0.004, 0.003  # m: the contact at the foot
-TIP_OVERHANG = 0.001  # m, by which the contact stands out of the insulator
-CONE_CORNERS = 24  # of the convex pieces of neck, cap and foot
-HOLDER_SECTIONS = 64  # straight sides of the holder's round wall
-THREAD_OVERLAP = 1e-4  # m, by which the holder's thread reaches into its wall, so that no gap is between them
-HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035  # m
-CONTACT_HEIGHT = 0.012  # m, over the underside
-BORE = (0.018, 0.0288)  # m: the thread's ends, the upper one with the mouth's chamfer
-BORE_TURN = np.deg2rad(-10)  # the hand turns by 80 degrees before the threads meet, while the cap finds its place in the mouth
-CONTACT_SPRING = 5e4  # N/m at each contact point: tightening by a tenth of a turn makes 0.3 N m of the thread
-DRY_FRICTION = 0.35  # Coulomb's coefficient of brass on brass, neither greased nor polished
-LEAD_IN = 0.25  # turns over which the cap's ridge rises
-BULB_TIGHTENING, BULB_SYMMETRY, BULB_GRIP_FORCE = np.deg2rad(120), np.deg2rad(15), 12.0  # rad, tuned; rad; N
-BULB_DENSITY = 400.0  # kg/m^3, of the whole, which is hollow: 53 g, of the 50 to 60 g of an LED lamp of this size (data sheets)
+"""Height of the lower end of the cap's ridge, in m over the glass's middle, and number of its turns."""
+RIDGE_OVERLAP = 5e-4
+"""Length by which the cap's ridge reaches into its core, in m, so that no gap is between them."""
+NECK_RADIUS, NECK_TOP = 0.018, -0.024
+"""Radius and height at which the neck meets the glass's sphere, in m from its middle: on a radius of 30 mm."""
+FOOT_RADIUS = 0.005
+"""Radius to which the insulator at the cap's foot narrows, in m. Chosen by eye."""
+TIP_RADIUS, TIP_HEIGHT = 0.004, 0.003
+"""Radius and height of the contact at the cap's foot, in m. Chosen by eye."""
+TIP_OVERHANG = 0.001
+"""Length by which the contact stands out of the insulator, in m. Chosen by eye."""
+CONE_CORNERS = 24
+"""Number of corners of the convex pieces of neck, cap and foot. Set once; not tuned."""
+HOLDER_SECTIONS = 64
+"""Number of straight sides of the holder's round wall. Set once; not tuned."""
+THREAD_OVERLAP = 1e-4
+"""Length by which the holder's thread reaches into its wall, in m, so that no gap is between them."""
+HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035
+"""Outer radius and height of the holder, in m. Chosen by eye."""
+CONTACT_HEIGHT = 0.012
+"""Height of the holder's contact over the underside, in m. Chosen by eye."""
+BORE = (0.018, 0.0288)
+"""Heights of the lower and the upper end of the holder's thread over the underside, in m; the mouth's chamfer is part of it."""
+BORE_TURN = np.deg2rad(-10)
+"""Rotation of the holder's thread about its axis, in rad. The hand turns by 80 degrees before the threads meet, while
+the cap finds its place in the mouth."""
+CONTACT_SPRING = 5e4
+"""Stiffness of the holder's contact, in N/m at each contact point: a tenth of a turn tightens the thread by 0.3 N m."""
+DRY_FRICTION = 0.35
+"""Coulomb's friction coefficient of brass on brass, neither greased nor polished."""
+LEAD_IN = 0.25
+"""Number of turns over which the cap's ridge rises. Set once; not tuned."""
+BULB_TIGHTENING, BULB_SYMMETRY = np.deg2rad(120), np.deg2rad(15)
+"""Angle by which the bulb is turned further at the end, tuned, and step of the angles at which the round bulb is
+grasped, in rad."""
+BULB_GRIP_FORCE = 12.0
+"""Force of each pad on the bulb, in N. Set once; not tuned."""
+BULB_DENSITY = 400.0
+"""Density of the whole bulb, which is hollow, in kg/m^3: it has 53 g; LED lamps of this size have 50 to 60 g (data sheets)."""
 BULB_SEATED = CONTACT_HEIGHT - CAP_TIP
-BULB_TRAVEL = 0.0034  # m down from where the ridge's lower end just passes under the bore's crest
+"""Height of the glass's middle over the holder's underside, in m, at which the two contacts meet."""
+BULB_TRAVEL = 0.0034
+"""Descent of the bulb to `BULB_SEATED`, in m, from where the ridge's lower end just passes under the crest of the
+holder's thread."""
 
 
 def _cone(radii: tuple[float, float], heights: tuple[float, float]) -> np.ndarray:
+    """Points (n, 3), in m, of a cone about z with a radius at each of two heights."""
     angle = 2 * np.pi * np.arange(CONE_CORNERS) / CONE_CORNERS
     return np.concatenate(
         [np.c_[r * np.cos(angle), r * np.sin(angle), np.full(CONE_CORNERS, z)] for r, z in zip(radii, heights, strict=True)]
@@ -146,7 +199,7 @@ def _cone(radii: tuple[float, float], heights: tuple[float, float]) -> np.ndarra
 
 
 def bulb_yaw(height: Height) -> Height:
-    """Yaw, in rad, of a bulb whose ridge lies in the middle of the holder's groove.
+    """Yaw, in rad, at which a bulb's ridge lies in the middle of the holder's groove.
 
     Args:
         height: Height of the glass's centre over the holder's underside, in m.
@@ -196,7 +249,7 @@ def e27_holder() -> Part:
 
 
 def bulb_and_holder() -> Screw:
-    """The E27 bulb and its holder."""
+    """E27 bulb and its holder."""
     return Screw(
         held=e27_bulb(),
         fixed=e27_holder(),

@@ -1,6 +1,7 @@
-"""Threads that turn by contact. The fixed side of a pair is a triangle mesh, the held side a row of convex ridge pieces.
+"""Threads that turn by contact. The fixed part has a triangle mesh as its thread, the held part a row of convex pieces.
 
-Triangle meshes collide with convex shapes alone, and only fixed bodies can have them. All threads are right-handed.
+In the engine, triangle meshes collide with convex shapes only, and only fixed bodies can have them. All threads are
+right-handed.
 """
 
 from dataclasses import dataclass
@@ -10,13 +11,15 @@ import trimesh
 
 FLANK = np.tan(np.deg2rad(30.0))
 """Slope of a flank: half of the thread angle of 60 degrees (ISO 68-1)."""
+BOLT_COLUMNS, BORE_COLUMNS = 32, 48
+"""Numbers of columns of vertices around the mesh of an external thread, and of an internal one. Set once; not tuned."""
 MERGED_DIGITS = 9
 """Decimals, in m, to which vertices must agree to be merged: a nanometre, below which only rounding differs."""
 
 
 @dataclass(frozen=True)
 class Thread:
-    """Outer surface of a thread about z: its radius along one pitch, periodic, turned into a helix. Lengths in m."""
+    """Outer surface of a thread about z: a periodic profile of its radius, which winds along a helix. Lengths are in m."""
 
     pitch: float
     """Height of one turn."""
@@ -34,19 +37,31 @@ class Thread:
         return min(radius for _, radius in self.profile)
 
     def wider(self, gap: float) -> "Thread":
-        """The thread with its surface `gap` further out: the bore that this one runs in."""
+        """Bore that this thread runs in: the same thread with its surface `gap`, in m, further out."""
         return Thread(self.pitch, tuple((height, radius + gap) for height, radius in self.profile))
 
 
 def iso_metric(major_radius: float, pitch: float) -> Thread:
-    """ISO 68-1: 60 degrees, crest flat of an eighth of the pitch, root flat of a quarter."""
+    """ISO metric thread (ISO 68-1): 60 degrees, crest flat of an eighth of the pitch, root flat of a quarter.
+
+    Args:
+        major_radius: Radius of the crest, in m.
+        pitch: Height of one turn, in m.
+    """
     minor = major_radius - (0.5 - 1 / 16 - 1 / 8) * pitch / FLANK
     places = np.array([-1 / 16, 1 / 16, 6 / 16, 10 / 16]) * pitch
     return Thread(pitch, tuple(zip(places, (major_radius, major_radius, minor, minor), strict=True)))
 
 
 def edison(major_radius: float, pitch: float, arc: float, points: int = 4) -> Thread:
-    """Edison screw (IEC 60061-1): crest and root are arcs of one radius, tangent to each other."""
+    """Edison screw (IEC 60061-1): crest and root are arcs of one radius, tangent to each other.
+
+    Args:
+        major_radius: Radius of the crest, in m.
+        pitch: Height of one turn, in m.
+        arc: Radius of the arcs, in m.
+        points: Number of straight pieces of each arc.
+    """
     drop = 2 * arc - np.sqrt(4 * arc**2 - pitch**2 / 4)  # from crest to root
     height = np.linspace(-pitch / 4, pitch / 4, points + 1)
     sag = arc - np.sqrt(arc**2 - height**2)
@@ -55,10 +70,16 @@ def edison(major_radius: float, pitch: float, arc: float, points: int = 4) -> Th
     return Thread(pitch, (*crest, *list(root)[1:-1]))
 
 
-def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: int = 32) -> trimesh.Trimesh:
+def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: int = BOLT_COLUMNS) -> trimesh.Trimesh:
     """Closed surface of an external thread from z = 0 to `length`, its crest at z = 0 at angle 0.
 
-    Its top is chamfered by 45 degrees, down to `tip_radius`.
+    Its top is chamfered by 45 degrees.
+
+    Args:
+        thread: The thread.
+        length: Length along z, in m.
+        tip_radius: Radius of the flat end that the chamfer leaves, in m.
+        per_turn: Number of columns of vertices around the axis.
     """
     rim = _helix(thread, length, per_turn)
     chamfer = tip_radius + length - rim[..., 1]
@@ -72,10 +93,16 @@ def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: in
     return _clean(np.r_[vertices, [[0, 0, 0], [0, 0, length]]], faces)
 
 
-def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: int = 48) -> trimesh.Trimesh:
-    """Surface of a bore with this thread from z = 0 to `length`, seen from its axis; open at its ends and behind.
+def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: int = BORE_COLUMNS) -> trimesh.Trimesh:
+    """Surface of a bore with this thread from z = 0 to `length`, facing its axis; it is open at its ends and has no back.
 
-    Its mouth, at the top, is chamfered by 45 degrees, out to `mouth_radius`.
+    Its mouth, at the top, is chamfered by 45 degrees.
+
+    Args:
+        thread: The thread.
+        length: Length along z, in m.
+        mouth_radius: Radius of the mouth, in m.
+        per_turn: Number of columns of vertices around the axis.
     """
     rim = _helix(thread, length, per_turn)
     rim[..., 0] = np.maximum(rim[..., 0], mouth_radius - (length - rim[..., 1]))
@@ -115,14 +142,14 @@ def _clean(vertices: np.ndarray, faces) -> trimesh.Trimesh:
 
 
 def ridge(section: np.ndarray, pitch: float, turns: float, per_turn: int, lead_in: float = 0.0) -> list[np.ndarray]:
-    """Convex pieces (2 m, 3) of a ridge that winds up from z = 0.
+    """Points (2 m, 3), in m, of each convex piece of a right-handed ridge that winds up from z = 0.
 
     Args:
         section: Corners (m, 2) of its cross-section, (radius, height), in m.
         pitch: Height of one turn, in m.
         turns: Number of turns.
         per_turn: Number of pieces of one turn.
-        lead_in: Number of turns over which the ridge rises from its foot, the smallest radius.
+        lead_in: Number of turns over which the ridge rises from the smallest radius of its cross-section.
     """
     foot = section[:, 0].min()
 

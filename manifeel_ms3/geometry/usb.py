@@ -1,4 +1,4 @@
-"""A USB-A plug on a handle, and the port that takes it one way round alone."""
+"""A USB-A plug on a handle, and the port that takes it only one way round."""
 
 from dataclasses import dataclass
 
@@ -8,34 +8,42 @@ from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
 from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
-HANDLE = (0.012, 0.030, 0.070)  # m; narrower than a pad, so that touch sees its edges
-GRIP = -0.012  # m, from the handle's middle
-ABOVE_TONGUE = 0.0005  # m over the tongue's end, from which on the plug may meet it; chosen by hand
-BLOCK, RIM = (0.066, 0.066), 0.037  # m: the port's block, and its height
+HANDLE = (0.012, 0.030, 0.070)
+"""Size of the handle, in m; it is narrower than a pad, so that the pad feels its edges."""
+GRIP = -0.012
+"""Distance of the middle between the pads from the handle's middle along the plug's z, in m. Set once; not tuned."""
+ABOVE_TONGUE = 0.0005
+"""Height over the tongue's end, in m, from which on the plug may meet it. Chosen by hand."""
+BLOCK, RIM = (0.066, 0.066), 0.037
+"""Size of the port's block along x and y, and its height, in m. Set once; not tuned."""
 
 
 @dataclass(frozen=True)
 class USBSizes:
-    """Sizes in m. "Wide" and "thin" are the two directions of the shell's section; the insulator lies at negative thin."""
+    """Sizes of plug and port, in m.
+
+    "Wide" and "thin" are the two directions of the shell's section; the insulator lies towards negative thin.
+    """
 
     shell: tuple[float, float, float]
-    """Outside of the shell: wide, thin, and its length."""
+    """Outer size of the shell along wide and thin, and its length."""
     wall: float
     """Thickness of the shell's sheet."""
     insulator: tuple[float, float]
-    """Insulator in the shell: wide, thin."""
+    """Size of the insulator in the shell along wide and thin."""
     port: tuple[float, float, float]
-    """Port: wide, thin, and its depth."""
+    """Size of the port along wide and thin, and its depth."""
     tongue: tuple[float, float]
-    """The port's tongue: wide, thin."""
+    """Size of the port's tongue along wide and thin."""
     tongue_at: float
-    """Place of the tongue's middle along thin; it fits into the shell's free half."""
+    """Position of the tongue's middle along thin; the tongue fits into the shell's free half."""
     recess: float
     """Distance of the tongue's end from the port's mouth."""
     wide_axis: int
     """Axis along which the shell is wide: 0 for x, 1 for y, the fingers' closing axis."""
     windows: tuple[float, float, float, float] | None = None
-    """The two latch windows in each broad face: their ends along the shell, their width, and the place of their middles."""
+    """The two latch windows in each broad face: where they begin and end along the shell, their width, and the distance of
+    their middles from the shell's middle; None if there are none."""
 
 
 SIZES = {
@@ -50,7 +58,7 @@ SIZES = {
         tongue_at=0.0010,
         recess=0.0015,
         wide_axis=1,
-        windows=(0.0075, 0.0100, 0.0045, 0.0046),  # their width and place by eye
+        windows=(0.0075, 0.0100, 0.0045, 0.0046),  # their width and distance are chosen by eye
     ),
     # USB-A plug (USB 2.0, 6.7) with 0.1 mm of play on each side
     "tight": USBSizes(
@@ -64,13 +72,14 @@ SIZES = {
         wide_axis=0,
     ),
 }
+"""Sizes by the name of the fit."""
 
 
 def usb_fit(fit: str = "paper") -> Fit:
-    """USB-A plug on a handle 12 x 30 x 70 mm, and a port in a block 66 x 66 x 37 mm. It goes in one way round alone.
+    """USB-A plug on a handle 12 x 30 x 70 mm, and a port in a block 66 x 66 x 37 mm. It goes in only one way round.
 
     Args:
-        fit: "paper" for a plug of 1.8 times the standard with 0.4 to 0.7 mm of play on each side; "tight" for the standard.
+        fit: "paper" for 1.8 times the standard's size with 0.4 to 0.7 mm of play on each side; "tight" for the standard's size.
     """
     sizes = SIZES[fit]
     floor = RIM - sizes.port[2]
@@ -80,7 +89,7 @@ def usb_fit(fit: str = "paper") -> Fit:
     base = Box((*BLOCK, floor), (0.0, 0.0, floor / 2))
     length = sizes.port[2] - sizes.recess
     tongue = _box(sizes, (*sizes.tongue, length), (0.0, sizes.tongue_at, floor + length / 2))
-    # a plug that points down has its y turned over, so the tongue stands mirrored in y
+    # the y axis of a plug that points down is reversed, so that the tongue must be mirrored in y
     tongue = Box(tongue.size, (tongue.centre[0], -tongue.centre[1], tongue.centre[2]))
     pieces: tuple[Piece, ...] = (Box(HANDLE), *shell)
     sheets = dict.fromkeys(range(2, len(pieces)), STEEL)

@@ -1,4 +1,4 @@
-"""The renderer that this process can use, and what to do where it has none."""
+"""The renderer that this process can use, and messages for users where it has none or starts slowly."""
 
 import functools
 import gc
@@ -16,22 +16,26 @@ NO_RENDERER = (
     "`apt install mesa-vulkan-drivers libvulkan1 libegl1 libgl1`); `scripts/setup.sh` does it. With an NVIDIA GPU, install its "
     "driver and libvulkan1. What needs no image works without: obs_mode='state' or 'tacff', render_backend='none'."
 )
-
-
+"""Message where no renderer was found; `wanted` is what needs one."""
 FORKED = (
     "{wanted} needs a renderer, and this process was forked from one that has its own, which does not survive a fork. Start "
     "it anew: multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no image works here: "
     "obs_mode='state' or 'tacff'."
 )
+"""Message in a process that was forked from one with a renderer; `wanted` is what needs a renderer."""
 _IMPORTED_IN = os.getpid()
+"""Id of the process that has imported this module; a forked process has another one."""
 _renders_in: int | None = None
-"""Id of the process whose renderer this is; a fork copies this answer, but not the renderer."""
+"""Id of the process that has a renderer, None if none has; a fork copies this number, but not the renderer."""
 
 
 def available_render_backend(asked: str = "auto") -> str:
     """The `render_backend` to use: "gpu", "cpu" or "none".
 
     A process that was forked from one with a renderer has none.
+
+    Args:
+        asked: "gpu", "cpu" or "none", or "auto" for the first of them that works.
     """
     global _renders_in
     if asked == "none" or renderer_lost():
@@ -45,9 +49,9 @@ def available_render_backend(asked: str = "auto") -> str:
 
 @functools.cache
 def _keep_inherited_objects_after_fork() -> None:
-    """Let no forked process collect what it inherits.
+    """Keep forked processes from collecting the objects that they inherit.
 
-    To destroy the parent's Vulkan objects, it would wait for ever for their driver's threads, which a fork loses.
+    If they destroyed the parent's Vulkan objects, they would wait for ever for the driver's threads, which a fork loses.
     """
     os.register_at_fork(after_in_child=gc.freeze)
 
@@ -58,21 +62,21 @@ def renderer_lost() -> bool:
 
 
 def use_one_thread_after_fork() -> None:
-    """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's threads, which a fork loses."""
+    """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's other threads."""
     if os.getpid() != _IMPORTED_IN:
         torch.set_num_threads(1)
 
 
 @functools.cache
 def announce_first_image(backend: str) -> None:
-    """Say once, in the main process, why the first image on a CPU takes long: SAPIEN prepares its renderer in each process."""
+    """Log once, in the main process, why the first image on a CPU takes long: SAPIEN prepares its renderer in each process."""
     if backend == "cpu" and multiprocessing.parent_process() is None:
         log.warning("Preparing the renderer on the CPU, once in this process; this takes about 10 seconds.")
 
 
 @functools.cache
 def announce_first_images_of_workers(asked: str = "auto") -> None:
-    """Say the same once of worker processes that are about to render, without starting a renderer in this process.
+    """Log once, in the main process, why the first images of worker processes take long, without starting a renderer here.
 
     Args:
         asked: The `render_backend` of their environments.

@@ -12,30 +12,30 @@ from mani_skill.utils.structs import Actor, Link
 from sapien.render import RenderBodyComponent
 from sapien.render import RenderDirectionalLightComponent as Lamp
 
-AMBIENT_LIGHT, KEY_LIGHT = 0.42, 1.9  # intensities, chosen by eye
+AMBIENT_LIGHT, KEY_LIGHT = 0.42, 1.9
+"""Intensities of the light from all sides and of the lamp; chosen by eye."""
 KEY_DIRECTION = (-0.35, 0.45, -1.0)
-"""Direction in which the lamp shines, from above, in front and the right of the robot; chosen by eye."""
-
+"""Direction in which the lamp shines, base frame: from above, from in front of the robot and its right; chosen by eye."""
 SHADOW_CENTRE = (0.5, 0.0, 0.0)
-"""Middle of what the lamp's shadow covers, in m: that of the tasks' parts."""
+"""Middle of the area that the lamp's shadow map covers, in m, base frame: that of the tasks' parts."""
 
 
 @dataclass(frozen=True)
 class Shadow:
-    """Map of what the lamp reaches, around `SHADOW_CENTRE`."""
+    """Shadow map of the lamp, around `SHADOW_CENTRE`; its sizes are chosen by eye."""
 
     size: int
-    """Width and height, in pixels."""
+    """Width and height of the map, in pixels."""
     half_extent: float
-    """Half of the width that it covers, in m."""
+    """Half of the width that the map covers, in m."""
     near: float = -1.0
-    """Distance from the centre towards the lamp from which it is drawn, in m, negative."""
+    """Distance from the centre at which the map begins, in m; negative, since it is towards the lamp."""
     far: float = 1.5
-    """Distance from the centre away from the lamp to which it is drawn, in m."""
+    """Distance from the centre at which the map ends, in m, away from the lamp."""
 
 
 SHADOWS = {"normal": Shadow(512, 0.45), "fast": None}
-"""Shadow by the quality of the policy's images; half of a picture's time goes into a larger one."""
+"""Shadow by the quality of the policy's images; a larger map would take half of the time of an image."""
 PRESENTATION_SHADOW = Shadow(4096, 0.8)
 """Shadow of the images for people."""
 
@@ -48,7 +48,7 @@ def add_lights(
     Args:
         scene: Scene to be lit.
         level: Share of the normal light.
-        shadow: Shadow of the lamp, if it casts one.
+        shadow: Shadow of the lamp; None if it casts none.
 
     Returns:
         The lamp of each environment.
@@ -69,7 +69,7 @@ def add_lights(
 
 
 def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
-    """Let a lamp cast this shadow, or none."""
+    """Let a lamp cast a shadow, or none if it is None."""
     lamp.shadow = shadow is not None
     if shadow is not None:
         lamp.shadow_map_size, lamp.shadow_half_size = shadow.size, shadow.half_extent
@@ -77,13 +77,13 @@ def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
 
 
 def aim_lamp(lamp: Lamp, direction: Sequence[float] | np.ndarray) -> None:
-    """Let a lamp shine in a direction, over the middle of what its shadow covers."""
+    """Let a lamp shine in a direction (x, y, z), base frame, through the middle of the area that its shadow map covers."""
     unit = np.asarray(direction) / np.linalg.norm(direction)
     lamp.local_pose = sapien.Pose(SHADOW_CENTRE, sapien.math.shortest_rotation(np.array([1.0, 0.0, 0.0]), unit))
 
 
 def cast_no_shadow(bodies: Iterable[Actor | Link]) -> None:
-    """Leave bodies out of the lamp's shadow, whose shadows no camera sees: each costs its share of every image."""
+    """Leave bodies whose shadows no camera sees out of the shadow map, which saves time in every image."""
     for body in bodies:
         for entity in (obj if isinstance(obj, sapien.Entity) else obj.entity for obj in body._objs):
             component = entity.find_component_by_type(RenderBodyComponent)

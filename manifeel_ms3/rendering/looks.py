@@ -1,8 +1,11 @@
-"""What surfaces look like: colour, and how metallic and rough they are. All values are chosen by eye."""
+"""Looks of surfaces: their colour, and how metallic and rough they are. All values are chosen by eye."""
 
 from dataclasses import dataclass
 
 from sapien.render import RenderMaterial
+
+SPECULAR = 0.5
+"""Specular reflection of all surfaces, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -10,15 +13,16 @@ class Look:
     """Look of a surface."""
 
     colour: tuple[float, float, float]
-    """Linear RGB in [0, 1]; of a metal, that of its reflections."""
+    """Colour in linear RGB, in [0, 1]; for a metal, that of its reflections."""
     metallic: float = 0.0
-    """1 for metals, 0 for all else."""
+    """1 for metals, 0 for all other materials."""
     roughness: float = 0.45
-    """From 0, polished, to 1, matt."""
+    """Roughness, from 0 (polished) to 1 (matt)."""
 
     def material(self) -> RenderMaterial:
-        """The look as a material of SAPIEN, which can be made only where there is a renderer."""
-        return RenderMaterial(base_color=[*self.colour, 1.0], metallic=self.metallic, roughness=self.roughness, specular=0.5)
+        """Make a material of SAPIEN with this look, which works only where there is a renderer."""
+        colour = [*self.colour, 1.0]
+        return RenderMaterial(base_color=colour, metallic=self.metallic, roughness=self.roughness, specular=SPECULAR)
 
 
 BRASS = Look((0.86, 0.62, 0.22), metallic=1.0, roughness=0.30)

@@ -12,9 +12,9 @@ from .lights import PRESENTATION_SHADOW, Lamp, Shadow, cast_shadow
 from .shader_pack import camera_shader
 
 SIZE = 768
-"""Width and height of the images, in pixels."""
+"""Width and height of the images, in pixels; chosen by eye."""
 SUPERSAMPLING = 2
-"""Width and height, in drawn pixels, of the square that becomes one pixel."""
+"""Width and height, in drawn pixels, of the square that becomes one pixel; chosen by eye."""
 
 
 def presentation_shader() -> ShaderConfig:
@@ -33,7 +33,7 @@ def drawn_sizes(configs: Mapping[str, Any]) -> dict[str, Any]:
 
     Args:
         configs: The argument `human_render_camera_configs` of ManiSkill's environments: fields of all cameras, and dicts of
-            fields by a camera's name. Where shaders are given, too, images are drawn as large as they are.
+            fields by a camera's name. Where shaders are given, too, images are not drawn larger.
     """
     if "shader_pack" in configs or "shader_config" in configs:
         return dict(width=SIZE, height=SIZE) | dict(configs)
@@ -44,7 +44,12 @@ def drawn_sizes(configs: Mapping[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def fine_shadow(lamps: list[Lamp], usual: Shadow | None) -> Iterator[None]:
-    """Let lamps cast the shadow of the images for people, and afterwards their usual one again."""
+    """Let lamps cast `PRESENTATION_SHADOW`, and their usual shadow again afterwards.
+
+    Args:
+        lamps: Lamps of the scene.
+        usual: Shadow that they cast otherwise; None if they cast none.
+    """
     for lamp in lamps:
         cast_shadow(lamp, PRESENTATION_SHADOW)
     try:

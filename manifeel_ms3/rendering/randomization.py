@@ -18,26 +18,27 @@ from .lights import KEY_DIRECTION, Lamp, aim_lamp
 from .table import wood_texture
 
 TABLE, FLOOR = "table", "floor"
+"""Names of the actors that are not parts of a task."""
 STREAM = 29
-"""Set beside an episode's seed, so that looks take no numbers from those that place the parts; chosen at random."""
+"""Number beside an episode's seed from which looks are drawn, so that they do not change where parts are placed; arbitrary."""
 
 
 @dataclass(frozen=True)
 class VisualRandomization:
-    """Half ranges of the uniform distributions of the scene's looks; 0 leaves a thing as it is."""
+    """Half ranges of the uniform distributions of the scene's looks; with 0, nothing changes."""
 
     light_direction: float = 0.0
-    """Slant of the lamp's direction on each horizontal axis, as a share of its height: 0.5 are 27 degrees from the vertical."""
+    """Slant of the lamp's direction on each horizontal axis, as a share of its height; 0.5 is 27 degrees."""
     light_level: float = 0.0
-    """Share by which all light is brighter or darker."""
+    """Change of the brightness of all light, as a share of it."""
     part_colour: float = 0.0
-    """Linear RGB that is added to each part's colour; every part has its own."""
+    """Change of each channel of a part's colour, in linear RGB in [0, 1]; every part has its own."""
     table_colour: float = 0.0
-    """Share by which each channel of the table's colour is brighter or darker."""
+    """Change of each channel of the table's colour, as a share of it."""
     table_texture: float = 0.0
-    """Number of other boards that the table may be made of, beside the usual ones; all are equally likely."""
+    """Number of other textures that the table may have, besides the usual one; all are equally likely."""
     camera_position: float = 0.0
-    """Position of each camera on each of its axes, in m."""
+    """Displacement of each camera along each of its axes, in m."""
     camera_rotation: float = 0.0
     """Rotation of each camera about each of its axes, in rad."""
 
@@ -51,7 +52,7 @@ LARGEST = dict(
     camera_position=(0.03, "a camera would be inside the robot"),
     camera_rotation=(0.3, "the task would be out of sight"),
 )
-"""The largest value of each field, and what happens beyond it."""
+"""Largest value of each field of `VisualRandomization`, and what happens beyond it; chosen by eye."""
 
 
 class RandomLooks:
@@ -72,7 +73,7 @@ class RandomLooks:
         cameras: dict[str, sapien.render.RenderCameraComponent],
     ):
         self.ranges, self.scene, self.lamp, self.cameras = ranges, scene, lamp, cameras
-        self.episodes = 0  # drawn in this scene: ManiSkill's seed stays the same until the next reset with a seed
+        self.episodes = 0  # number drawn in this scene: without a new seed, ManiSkill keeps the last one in a reset
         self.light = np.array(scene.ambient_light), np.array(lamp.color)
         self.poses = {name: camera.local_pose for name, camera in cameras.items()}
         parts = {name: actor for name, actor in scene.actors.items() if name not in (TABLE, FLOOR)}
@@ -89,7 +90,7 @@ class RandomLooks:
         self.episodes += 1
 
         def stream(name: str) -> np.random.Generator:
-            return np.random.default_rng([*start, crc32(name.encode())])  # so that nothing depends on what else is random
+            return np.random.default_rng([*start, crc32(name.encode())])  # each stream is independent of what else is random
 
         def uniform(name: str, half_range: float, size: int) -> np.ndarray:
             return half_range * stream(name).uniform(-1, 1, size)

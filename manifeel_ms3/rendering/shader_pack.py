@@ -1,6 +1,6 @@
-"""The pack's own shaders, which SAPIEN compiles when the first camera is made, and the cameras' configuration for them.
+"""The package's own shaders, which SAPIEN compiles when the first camera is made, and the configuration of cameras for them.
 
-They are written for any Vulkan driver. They were tried with Mesa's lavapipe, on the CPU; where a driver does not take them,
+They are written for any Vulkan driver, and tested with Mesa's lavapipe, on the CPU. Where a driver does not compile them,
 `gym.make(..., sensor_configs=dict(shader_pack="minimal"))` renders with ManiSkill's own.
 """
 
@@ -10,6 +10,7 @@ import sapien
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, ShaderConfig
 
 SHADER_PACK = str(Path(__file__).parent / "shaders")
+"""Path of the folder with the shaders."""
 _PICTURE_FORMATS = {
     "Color": "r8g8b8a8unorm",
     "ColorRaw": "r8g8b8a8unorm",

@@ -1,4 +1,4 @@
-"""The table top of wooden boards: its texture, painted here, and its mesh with the texture's coordinates."""
+"""The table top of wooden boards: its texture, which is painted here, and its mesh with the texture's coordinates."""
 
 import functools
 from dataclasses import dataclass
@@ -10,15 +10,18 @@ from sapien.render import RenderMaterial, RenderTexture2D
 
 from manifeel_ms3.paths import derived_file
 
+from .looks import SPECULAR
+
 TILE = 0.8
-"""Side of the square, in m, that the texture covers; it repeats beyond."""
+"""Side of the square, in m, that the texture covers; it repeats beyond. Chosen by eye."""
 PIXELS = 1024
+"""Width and height of the texture, in pixels; a power of 2."""
 ROWS = 8
-"""Number of rows of boards across a tile."""
+"""Number of rows of boards across a tile; chosen by eye."""
 WOOD = (0.68, 0.59, 0.49)
-"""Mean colour of the boards, sRGB in [0, 1]."""
-ROUGHNESS, SPECULAR = 0.5, 0.5
-"""Roughness and specular reflection of the surface, in [0, 1]; chosen by eye."""
+"""Mean colour of the boards, sRGB in [0, 1]; chosen by eye."""
+ROUGHNESS = 0.5
+"""Roughness of the surface, in [0, 1]; chosen by eye."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class BoardsConfig:
     end_jitter: int = 100
     """Largest shift, in pixels, of one end of a board from half a tile beyond the other end."""
     ring_turns: float = 1.3
-    """Growth rings that one standard deviation of the broad grain makes."""
+    """Number of growth rings for one standard deviation of the broad grain."""
     ring_phases: float = 3.0
     """Number of rings by which those of one board may be shifted against those of another."""
     board_contrast: float = 0.055
@@ -51,7 +54,7 @@ BOARDS = BoardsConfig()
 
 
 def wood() -> RenderMaterial:
-    """Surface of the table; only where there is a renderer."""
+    """Make the material of the table, which works only where there is a renderer."""
     material = RenderMaterial(roughness=ROUGHNESS, specular=SPECULAR)
     material.base_color_texture = wood_texture(0)
     return material
@@ -65,7 +68,7 @@ def wood_texture(seed: int) -> RenderTexture2D:
 
 
 def boards(seed: int) -> np.ndarray:
-    """Image uint8 (PIXELS, PIXELS, 3) of boards along its rows, which continues on the opposite side."""
+    """Image uint8 (PIXELS, PIXELS, 3) of boards along its rows; its opposite sides fit together."""
     rng = np.random.default_rng(seed)
     fine, broad = _streaks(rng, *BOARDS.fine_grain), _streaks(rng, *BOARDS.broad_grain)
     brightness = np.empty((PIXELS, PIXELS))
@@ -98,7 +101,11 @@ def _streaks(rng: np.random.Generator, length: float, width: float) -> np.ndarra
 
 
 def table_mesh(size: tuple[float, float, float]) -> Path:
-    """File with a box of this size, in m, about the origin, whose texture's coordinates are lengths on each face."""
+    """Path of a file with a box about the origin, with the coordinates of its texture.
+
+    Args:
+        size: Size of the box, in m.
+    """
     return derived_file(f"parts/table-{'x'.join(f'{side:g}' for side in size)}-{TILE:g}.obj", lambda: _box_obj(size))
 
 

@@ -1,4 +1,4 @@
-"""Configuration of a gel-based tactile sensor: pad, gel, image, taxels, optics and what is randomised."""
+"""Configuration of a gel-based tactile sensor: pad, gel, image, taxels, optics and randomization."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,12 +19,12 @@ from .imperfection_config import ImperfectionConfig
 
 DEPTH_BACKENDS = ("auto", "raycast", "sapien")
 UNITS = ("newton", "tacsl")
-ROUNDING = 1e-9  # m: an extent may exceed the gel's by this much, which is rounding and not geometry
+ROUNDING = 1e-9  # m: an extent may exceed the gel's by this much, which is a rounding error
 
 
 @dataclass
 class GelConfig:
-    """The elastomer as an elastic layer bonded to a rigid back."""
+    """The elastomer, modelled as an elastic layer that is bonded to a rigid back."""
 
     size: tuple[float, float] = positive((0.024, 0.032))
     """Extent across and along the finger, m (elastomer of TacSL's GelSight R1.5 asset: 23.98 mm x 32 mm)."""
@@ -74,7 +74,7 @@ class GelConfig:
 
 @dataclass
 class HousingConfig:
-    """The part of the finger that carries the gel, a box; the hand's mount and the tool centre point stay where they are."""
+    """The box-shaped part of the finger that carries the gel. The tool centre point does not depend on its sizes."""
 
     width: float = positive(0.030)
     """Extent across the finger, m (GelSight R1.5 finger)."""
@@ -108,7 +108,7 @@ class LightsConfig:
 
 @dataclass
 class OpticsConfig:
-    """From the height of the gel's surface to an RGB image."""
+    """Optics of the sensor, which turn the height of the gel's surface into an RGB image."""
 
     calibration: Path = field(default_factory=lambda: data_dir() / "gelsight_r15_shader.npz")
     """Path of the compact shader's coefficients (written by `optics.fit_shader`), or of a `polycalib.npz` in Taxim's format."""

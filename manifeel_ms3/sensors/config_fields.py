@@ -36,12 +36,17 @@ def within(default: Any, low: float, high: float) -> Any:
 
 
 def amount(high: float) -> Any:
-    """Dataclass field for an amount from 0 to `high`: a pair of which each episode draws its own, or one number for all."""
+    """Dataclass field for an amount from 0 to `high`: a pair (least, most) for each episode to draw from, or one number."""
     return field(default=(0.0, 0.0), metadata={"bounds": Bounds(0.0, high), "amount": True})
 
 
 def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
-    """Check the fields of a dataclass, and of those in it, against their bounds.
+    """Check the fields of a dataclass, and of the dataclasses in it, against their bounds.
+
+    Args:
+        config: The dataclass.
+        uid: Name of the sensor in messages.
+        prefix: Start of the fields' names in messages.
 
     Raises:
         InvalidArgumentError: A number is out of its bounds, or a pair is not in rising order; the message names the field.
@@ -59,7 +64,7 @@ def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
 
 
 def with_option(config: Any, path: Sequence[str], value: Any, name: str) -> Any:
-    """A dataclass with one field changed.
+    """Copy of a dataclass with one field changed.
 
     Args:
         config: The dataclass.
@@ -86,7 +91,7 @@ def with_option(config: Any, path: Sequence[str], value: Any, name: str) -> Any:
 
 
 def with_options(config: Any, options: Mapping[str, Any]) -> Any:
-    """A dataclass with some fields changed, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
+    """Copy of a dataclass with some fields changed, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
 
     Raises:
         UnknownNameError: A name is not that of a field.

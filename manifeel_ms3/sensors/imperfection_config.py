@@ -12,11 +12,11 @@ from manifeel_ms3.errors import InvalidArgumentError
 from .config_fields import amount
 from .draws import uniform_draws
 
-FULL_SCALE_FORCE = 0.6  # N per taxel: the normal force that is drawn at full brightness (`visualisation.NORMAL_SCALE`)
+FULL_SCALE_FORCE = 0.6  # N per taxel (chosen: images of the force field draw it at full brightness)
 FULL_SCALE_LEVEL = 255.0  # grey levels
 DRIFT_STEPS = 100  # control steps in which the drift reaches its amount: 10 s at the tasks' 10 Hz
-MOST_DELAY = 50  # control steps
-STREAM = 16  # first of the streams of `uniform_draws` that imperfections use
+MOST_DELAY = 50  # control steps (chosen: 5 s at the tasks' 10 Hz)
+STREAM = 16  # first of the streams of `uniform_draws` that imperfections use; arbitrary
 
 
 def _pair(name: str, given: Any) -> tuple[float, float]:
@@ -33,18 +33,18 @@ class ImperfectionConfig:
 
     Full scale is 0.6 N for each component of a taxel's force (gel.max_penetration with units="tacsl"), and 255 grey levels.
 
-    Of the observation's `penetration`, `delay` and `dead_taxels` alone say something: it stays free of hysteresis, crosstalk,
-    drift, noise and gain, so that a policy whose robustness is tested must not read it.
+    Only `delay` and `dead_taxels` affect the observation's `penetration`. It stays free of hysteresis, crosstalk, drift, noise
+    and gain, so that a policy whose robustness is tested must not read it.
 
     Raises:
-        InvalidArgumentError: An amount is neither a number nor a pair of numbers, or a delay is no whole number.
+        InvalidArgumentError: An amount is neither a number nor a pair of numbers, or a delay is not a whole number.
     """
 
     hysteresis: tuple[float, float] = amount(0.9)
     """Area between loading and unloading, as a share of the area under the loading curve. The reading goes up with the load,
     stays when the load falls, and goes down once it is 1 / (1 - hysteresis) times the load (a play operator)."""
     delay: tuple[float, float] = amount(MOST_DELAY)
-    """Control steps by which force field, penetration and image are late; a whole number."""
+    """Number of control steps by which force field, penetration and image are late; a whole number."""
     crosstalk: tuple[float, float] = amount(0.8)
     """Share of a taxel's force that its four neighbours feel instead, a quarter each; sums are kept."""
     dead_taxels: tuple[float, float] = amount(1.0)

@@ -4,7 +4,7 @@
 """Imperfections of N pads: what `ImperfectionConfig` asks for, applied to the true signal.
 
 The force field passes, in this order, through hysteresis, crosstalk, gain, drift, noise and dead taxels; the image through
-hysteresis of the gel's surface, drift of the colours and noise; and everything at last through the delay. The penetration is
+hysteresis of the gel's surface, drift of the colours and noise. All outputs then pass through the delay. The penetration is
 zero at dead taxels, and true at the others.
 """
 
@@ -18,7 +18,7 @@ from .optics.tacrgb import Optics
 from .warp_device import warp_device
 
 MIN_LOAD = 1e-12  # N or m: avoids a division by zero
-NOISE_KEY = 0x5BD1E995  # makes the force field's noise another one than the image's, which has the same seed
+NOISE_KEY = 0x5BD1E995  # makes the force field's noise differ from the image's, which has the same seed; arbitrary
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,14 +77,14 @@ class Imperfections:
             self._surface[pads] = 0.0
 
     def recovered_surface(self, penetration: torch.Tensor) -> torch.Tensor:
-        """Penetration (N, H, W), m, of a gel that rises late, of which `penetration` is what presses now."""
+        """Penetration (N, H, W), m, of a gel that recovers late; `penetration` is that of the object that presses now."""
         if self._surface is None:
             self._surface = torch.zeros_like(penetration)
         self._surface = self._play(self._surface, penetration)
         return self._surface
 
     def _play(self, held: torch.Tensor, load: torch.Tensor) -> torch.Tensor:
-        """The play operator: `held` where it lies between the load and its share above it, else the nearer of the two."""
+        """The play operator: `held`, clipped to the range from the load to 1 / (1 - hysteresis) times the load."""
         factor = 1.0 / (1.0 - self._amount("hysteresis", load.ndim))
         return torch.maximum(load, torch.minimum(held, factor * load))
 
@@ -104,7 +104,7 @@ class Imperfections:
         return noisy.view_as(field).masked_fill(self._drawn["dead_taxels"][..., None], 0.0)
 
     def sense_penetration(self, penetration: torch.Tensor) -> torch.Tensor:
-        """Penetration (N, rows, cols), m, that the taxels report: dead ones say nothing of it, either."""
+        """Penetration (N, rows, cols), m, that the taxels report; it is zero at dead taxels."""
         return penetration.masked_fill(self._drawn["dead_taxels"], 0.0)
 
     def _mixed(self, field: torch.Tensor) -> torch.Tensor:
@@ -126,7 +126,7 @@ class Imperfections:
         optics.noise.copy_((self.config.optics.noise**2 + read**2).sqrt())
 
     def delayed(self, obs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The observation of some steps ago, or the episode's first one; the last call of every step."""
+        """Observation of `delay` steps ago, or the episode's first one; call it once, at the end of every step."""
         slots = int(self.config.imperfections.delay[1]) + 1
         first = self._frame == 0
         self._frame += 1

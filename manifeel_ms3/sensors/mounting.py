@@ -1,4 +1,4 @@
-"""A pad on a link of any robot: its pose from the directions in which it lies, and grids that cover a gel of any size."""
+"""Helpers for a pad on a link of any robot: its pose, from two directions, and grids that cover a gel of any size."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,8 +10,10 @@ from manifeel_ms3.errors import InvalidArgumentError
 
 from .config import TactileSensorConfig
 
+CELL_ROUNDING = 1e-6
+"""Share of a pixel or taxel by which a gel may seem too small, through rounding, and still hold it."""
 SMALLEST_SINE = 0.5
-"""Smallest sine of the angle between two directions that are to define a pose: 30 degrees."""
+"""Smallest sine of the angle between two directions that define a pose: 30 degrees (chosen)."""
 
 
 def pad_pose(facing: Sequence[float], tip: Sequence[float], at: Sequence[float]) -> sapien.Pose:
@@ -19,8 +21,8 @@ def pad_pose(facing: Sequence[float], tip: Sequence[float], at: Sequence[float])
 
     Args:
         facing: Direction, in the link's frame, in which the gel's face looks, towards what it touches.
-        tip: Direction towards the finger's tip; the part of it that is along `facing` is left out.
-        at: Centre of the untouched face, in m.
+        tip: Direction towards the finger's tip, in the link's frame; its component along `facing` is ignored.
+        at: Centre of the untouched face, in the link's frame, in m.
 
     Raises:
         InvalidArgumentError: The two directions are nearly parallel, or one has no length.
@@ -49,7 +51,7 @@ def grids_for(size: Sequence[float]) -> dict[str, Any]:
         InvalidArgumentError: The gel is smaller than one taxel.
     """
     pitches = dict(image_shape=TactileSensorConfig.pixel_size, taxel_shape=TactileSensorConfig.taxel_pitch)
-    shapes = {name: tuple(int(extent / pitch + 1e-6) for extent in size) for name, pitch in pitches.items()}
+    shapes = {name: tuple(int(extent / pitch + CELL_ROUNDING) for extent in size) for name, pitch in pitches.items()}
     if min(shapes["taxel_shape"]) < 1:
         raise InvalidArgumentError(f"a gel of {tuple(size)} m is smaller than a taxel, {pitches['taxel_shape']} m; give metres")
     return shapes

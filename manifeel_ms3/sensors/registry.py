@@ -25,8 +25,10 @@ from .config_fields import with_options
 
 MakeSensor = Callable[[str, str], TactileSensorConfig]
 """Function from the name of a pad in observations, and the name of the link that carries its gel, to its configuration."""
-TAXEL_PITCH = 1.6e-3  # m, of sensors without a published field (chosen: near the R1.5's, so that policies see alike fields)
+TAXEL_PITCH = 1.6e-3
+"""Pitch, m, of sensors without a published force field (chosen: near the R1.5's, so that policies see similar fields)."""
 DEFAULT_SENSOR = "gelsight_r15"
+"""Name of the paper's sensor."""
 
 
 def gelsight_r15(uid: str, link: str) -> TactileSensorConfig:
@@ -49,7 +51,7 @@ def gelsight_mini(uid: str, link: str) -> TactileSensorConfig:
         pixel_size=5.9e-5,
         taxel_pitch=TAXEL_PITCH,
         optics=OpticsConfig(calibration=data_dir() / "gelsight_mini_shader.npz"),
-        # outer size of the data sheet, 28 mm across, 32 mm along, 24 mm deep
+        # outer size of the data sheet: 28 mm across, 32 mm along and, with the gel's 3 mm, 24 mm deep
         housing=HousingConfig(width=0.028, depth=0.021, beyond_gel=(0.032 - gel.size[1]) / 2),
     )
 
@@ -73,7 +75,7 @@ def digit(uid: str, link: str) -> TactileSensorConfig:
         pixel_size=0.019 / 320,
         taxel_pitch=TAXEL_PITCH,
         optics=OpticsConfig(lights=LightsConfig(tuple(around))),
-        # 18 mm deep without its gel (Lambeta et al. 2020); width and tip are chosen
+        # 18 mm deep without its gel (Lambeta et al. 2020); width, tip and protrusion are chosen, the last above the dome's sag
         housing=HousingConfig(width=0.026, depth=0.018, beyond_gel=0.003, protrusion=0.008),
     )
 
@@ -97,7 +99,7 @@ def sensor_config(name: str, uid: str, link: str, **changes: Any) -> TactileSens
         changes: Fields to replace, such as `pad_pose`.
 
     Raises:
-        UnknownNameError: No sensor has this name; the message lists those that there are.
+        UnknownNameError: No sensor has this name; the message lists the known ones.
         PluginError: A plug-in has the name of one of the package's own sensors, or does not return a configuration.
         InvalidArgumentError: A field has a value that is not allowed.
     """
@@ -125,7 +127,7 @@ def task_sensor(
         imperfections: Amounts of the imperfections, by name.
 
     Raises:
-        UnknownNameError: A sensor, field or imperfection is unknown; the message lists those that there are.
+        UnknownNameError: A sensor, field or imperfection is unknown; the message lists the known ones.
         InvalidArgumentError: A value is not allowed.
     """
     config = with_options(sensor_config(name, uid, link), options or {})

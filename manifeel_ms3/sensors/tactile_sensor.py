@@ -19,7 +19,7 @@ from .visualisation import force_field_images
 
 log = logging.getLogger(__name__)
 LARGEST_PULL = 1.0
-"""Pull on a gel, in N, that is taken for a wrong pose: above the inertia of a pad, below a grip."""
+"""Pull on a gel, in N, from which the pose is taken to be wrong: more than the inertia of a pad, less than a grip (chosen)."""
 
 
 class TactileSensor(BaseSensor):
@@ -97,7 +97,12 @@ class TactileSensor(BaseSensor):
         return self.model.drawn_imperfections
 
     def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None) -> None:
-        """Begin an episode in these environments without shear; noise and randomization follow from the seeds (0)."""
+        """Begin an episode in these environments, without shear.
+
+        Args:
+            env_idx: Indices (n,) of the environments.
+            seeds: Seeds (n,) of noise and randomization; 0 if not given.
+        """
         self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
 
     def forget_readings(self, env_idx: torch.Tensor) -> None:
@@ -116,7 +121,7 @@ class TactileSensor(BaseSensor):
         self._obs = self.model.observe(self._depth, wrench)
 
     def _warn_of_wrong_side(self, wrench: torch.Tensor) -> None:
-        """Warn once if the gel is pulled, which nothing that it touches can do; on the CPU, where looking costs nothing."""
+        """Warn once if the gel is pulled, which nothing that it touches can do; only on the CPU, where the check is cheap."""
         if self._warned or wrench.device.type != "cpu" or (pull := wrench[:, 2].max().item()) < LARGEST_PULL:
             return
         self._warned = True

@@ -1,4 +1,4 @@
-"""From depth and wrench to the observations of a gel-based sensor, for N pads at once, in any scene or in none."""
+"""From depth and wrench to the observations of a gel-based sensor, for N pads at once, with or without a scene."""
 
 from dataclasses import dataclass
 from typing import Protocol, cast
@@ -16,7 +16,7 @@ from .optics.tacrgb import Optics
 from .warp_device import use_torch_threads_for_warp
 
 CONTACT_CELL = 3.5e-4  # m: puts the contact's outline within a tenth of a millimetre; 6,279 cells on the R1.5
-LOOK_MARGIN = 5.0e-4  # m: pixels are computed where a cell, or one beside it, is nearer to the gel (chosen above one cell)
+LOOK_MARGIN = 5.0e-4  # m: pixels are computed where an object is nearer than this at a cell or at one beside it (chosen)
 OUTPUTS = ("rgb", "force_field")
 
 
@@ -118,9 +118,8 @@ class TouchModel:
     def contact_plane(self, height: torch.Tensor, wrench: torch.Tensor) -> torch.Tensor:
         """Depth and tilts (N, 3) at which the gel carries the wrench, for heights from `heights` (`solve_indentation`)."""
         gel = self.config.gel
-        slope = max(
-            c * extent / 2 for c, extent in zip(gel.curvature, gel.size, strict=True)
-        )  # an object may lie on a dome's side
+        # an object may lie on a dome's side
+        slope = max(c * extent / 2 for c, extent in zip(gel.curvature, gel.size, strict=True))
         return solve_indentation(height, wrench, self.grid, self._gel.normal_stiffness, MAX_TILT + slope)
 
     def _observe(self, depth: Depth, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -173,7 +172,7 @@ class TouchModel:
         return dict(force_field=tacsl_field(below, velocity).unflatten(1, shape), penetration=below.unflatten(1, shape))
 
     def _pixel_penetration(self, depth: Depth, plane: torch.Tensor, below: torch.Tensor) -> torch.Tensor:
-        """Penetration (N, H, W), m, at the pixels; depth is taken only where the cells say that something may be near."""
+        """Penetration (N, H, W), m, at the pixels; depth is measured only where the cells show something near."""
         nearest = F.max_pool2d(below.float().unflatten(1, self.grid.shape)[:, None], 3, stride=1, padding=1)[:, 0]
         window = Window(nearest > -LOOK_MARGIN, self.config.gel.size)
         height = _over_face(depth.heights(self.pixels, window), self._pixel_sag)

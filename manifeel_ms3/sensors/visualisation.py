@@ -7,12 +7,14 @@ import numpy as np
 import torch
 from mani_skill.utils import common
 
-NORMAL_SCALE = 0.6  # N per taxel, drawn at full brightness (chosen)
+from .imperfection_config import FULL_SCALE_FORCE
+
+NORMAL_SCALE = FULL_SCALE_FORCE  # N per taxel, drawn at full brightness
 SHEAR_SCALE = 0.1  # N per taxel, drawn as an arrow as long as the taxels' pitch (chosen)
-MAX_ARROW = 2  # pitches: length along each axis at which arrows are cut
-MIN_ARROW = 1  # pixel: shorter arrows are not drawn
-ARROW_COLOUR = (255, 90, 60)  # RGB
-ARROW_HEAD = 0.35  # share of the arrow's length
+MAX_ARROW = 2  # taxel pitches: length along each axis at which arrows are cut (chosen)
+MIN_ARROW = 1  # pixels: shorter arrows are not drawn
+ARROW_COLOUR = (255, 90, 60)  # RGB, chosen by eye
+ARROW_HEAD = 0.35  # share of the arrow's length, chosen by eye
 
 
 def force_field_images(force_field: torch.Tensor, size: tuple[int, int] = (240, 320)) -> torch.Tensor:

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 import warp as wp
 
-STDERR = 2  # file descriptor
-MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since handing them over takes longer (chosen)
+STDERR = 2  # number of the file descriptor of the standard error
+MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since that would take longer (chosen)
 
 _threads = 1  # that `launch_split` may use, changed by `use_torch_threads_for_warp`
 
@@ -37,7 +37,7 @@ def _start_warp() -> None:
 
 
 def warp_device(device: torch.device):
-    """Warp's device that corresponds to torch's."""
+    """Warp's device that corresponds to a device of torch; warp is started first."""
     _start_warp()
     return wp.device_from_torch(device)
 

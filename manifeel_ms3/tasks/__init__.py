@@ -1,4 +1,4 @@
-"""The benchmark's tasks. Importing this package registers them, in the paper's order; `registry` says all about each."""
+"""The benchmark's tasks. Importing this package registers them, in the paper's order; `registry` describes each."""
 
 # ruff: noqa: I001  (the order of registration is the paper's)
 from .visuotactile_env import VisuotactileEnv as VisuotactileEnv

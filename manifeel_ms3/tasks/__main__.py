@@ -1,4 +1,4 @@
-"""Show the tasks: `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
+"""Show all tasks, `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
 
 import inspect
 import sys
@@ -17,10 +17,10 @@ from .registry import PREFIX, SUFFIX, all_tasks, description_of, task_spec
 
 @dataclass
 class Args:
-    """Show what a task is, what is random in it and what counts as success; or all tasks in a table."""
+    """Show a table of all tasks, or what one task is, what is random in it and what counts as success."""
 
     task: Annotated[str | None, tyro.conf.Positional] = None
-    """Id or short name of a task, such as PegInsertion; all tasks in a table if not given."""
+    """Id or short name of a task, such as PegInsertion; a table of all tasks is shown if not given."""
 
 
 def main(args: Args) -> None:
@@ -41,7 +41,7 @@ def main(args: Args) -> None:
 
 
 def _summary(env_class: type) -> str:
-    """The first line of a task's documentation."""
+    """First line of the docstring of a task's class."""
     return (inspect.getdoc(env_class) or "").partition("\n")[0]
 
 

@@ -11,7 +11,7 @@ from manifeel_ms3.arguments import by_name, is_number
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 
 Limits = Mapping[str, tuple[float, str]]
-"""The largest half range that can be played, by the name of a randomization's field, and what happens beyond it."""
+"""By the name of a field of a randomization: its largest playable half range, in m or rad, and what happens beyond it."""
 
 
 def checked_randomization(
@@ -23,12 +23,12 @@ def checked_randomization(
         env_name: Name of the task's class, for messages.
         kind: Dataclass of the randomization.
         overrides: Half ranges by field name.
-        limits: Largest half ranges by field name.
+        limits: Largest half ranges by field name, and what happens beyond them.
         argument: Name of the argument that holds the fields, for messages.
         example: Name of a field, for messages.
 
     Raises:
-        InvalidArgumentError: A field is unknown, or its value is no number, negative or too large.
+        InvalidArgumentError: A field is unknown, or its value is not a number, negative or too large.
     """
     known = kind.__dataclass_fields__
     for name, value in by_name(argument, overrides, f"dict({example}=0.01)").items():
@@ -46,8 +46,8 @@ def check_num_envs(num_envs: Any) -> None:
     """Check the number of environments that are simulated at once.
 
     Raises:
-        InvalidArgumentError: It is not a whole number of at least 1.
-        MachineError: It is more than 1, and this machine has no CUDA GPU.
+        InvalidArgumentError: The number is not a whole number of at least 1.
+        MachineError: The number is more than 1, and this machine has no CUDA GPU.
     """
     if type(num_envs) is not int or num_envs < 1:
         raise InvalidArgumentError(f"num_envs={num_envs!r} must be a whole number of at least 1")
@@ -62,7 +62,7 @@ def check_seed(seed: Any) -> None:
     """Check a seed, or one seed for each environment.
 
     Raises:
-        InvalidArgumentError: One of them is not a whole number from 0 to 2**32 - 1.
+        InvalidArgumentError: A seed is not a whole number from 0 to 2**32 - 1.
     """
     seeds = seed if isinstance(seed, list | tuple | np.ndarray) else [seed]
     if seed is not None and not all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds):
@@ -75,13 +75,13 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
     """Split ManiSkill's `sensor_configs` into those of the cameras and those of the tactile pads.
 
     Args:
-        given: Fields to change by the name of a sensor, and fields to change of every camera. Fields of a pad are nested dicts
-            or have dotted names.
+        given: Fields to change of one sensor, as a dict by its name, and fields to change of every camera. Fields of a pad are
+            nested dicts or have dotted names.
         cameras: Names of the cameras.
         pads: Names of the pads.
 
     Returns:
-        The cameras' part, and for each pad its fields by dotted name.
+        The part of the cameras, and the fields of each pad by dotted name.
 
     Raises:
         InvalidArgumentError: A name is neither that of a sensor nor of a camera's field.
@@ -96,7 +96,7 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
             of_cameras[name] = dict(by_name(f"sensor_configs[{name!r}]", value, example))  # a copy, which ManiSkill changes
             if unknown := [key for key in value if key not in fields]:
                 raise InvalidArgumentError(
-                    f"sensor_configs[{name!r}]: {unknown} are no fields of a camera; choose from {fields}"
+                    f"sensor_configs[{name!r}]: {unknown} are not fields of a camera; choose from {fields}"
                 )
         elif name in fields:
             of_cameras[name] = value

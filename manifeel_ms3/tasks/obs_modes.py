@@ -8,20 +8,25 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import announce_first_images_of_workers
 
 PAD = "tactile_"
-"""Start of the names of tactile pads among the sensors of an observation."""
+"""Prefix of the names of tactile pads among the sensors of an observation."""
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
+"""Outputs of a tactile sensor by their tokens in an observation mode."""
 STATE_TOKENS = ("state", "state_dict")
+"""ManiSkill's tokens of the state, as a vector and as nested dicts."""
 WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")
-"""ManiSkill's names of whole modes; "rgbd" and "pointcloud" may be joined with touch."""
+"""ManiSkill's modes that are not joined with its other tokens; "rgbd" and "pointcloud" may be joined with touch."""
 
 
 def has_images(own_mode: str) -> bool:
     """Whether ManiSkill's own part of an `obs_mode` holds images of cameras."""
-    return own_mode not in ("none", "state", "state_dict")
+    return own_mode not in ("none", *STATE_TOKENS)
 
 
 def announce_images_of_workers(env_kwargs: dict[str, Any]) -> None:
-    """Say, before worker processes make environments with these arguments, why their first image takes long, if it does.
+    """Log why the first image of worker processes takes long, if it does; call it before they make their environments.
+
+    Args:
+        env_kwargs: Arguments of their environments.
 
     Raises:
         InvalidArgumentError: The `obs_mode` is not allowed.
@@ -43,12 +48,12 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
         if token not in known:
             raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {token!r} is unknown; join any of {list(known)} by '+'")
     if repeated := {token for token in tokens if tokens.count(token) > 1}:
-        raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} stands more than once")
+        raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} is given more than once")
     own = ["rgb+depth" if token == "rgbd" and len(tokens) > 1 else token for token in tokens if token not in TACTILE_TOKENS]
     alone = [token for token in own if token in WHOLE_MODES]
     if alone and len(tokens) > 1 and own != ["pointcloud"]:
         raise InvalidArgumentError(
-            f"obs_mode={obs_mode!r}: {alone[0]!r} stands alone; join 'rgb', 'depth', ... with touch instead"
+            f"obs_mode={obs_mode!r}: {alone[0]!r} cannot be joined with these; join 'rgb', 'depth', ... with touch instead"
         )
     touch = tuple(output for token, output in TACTILE_TOKENS.items() if token in tokens)
     return "+".join(own) or "none", touch

@@ -1,4 +1,4 @@
-"""Every task, and all that this package says of it: one `TaskSpec` per task.
+"""The registry of all tasks: one `TaskSpec` per task holds all that this package says of it.
 
 A task registers itself with one decorator, which also makes its id known to `gym.make`:
 
@@ -29,8 +29,9 @@ Demonstrator = TypeVar("Demonstrator", bound=Callable[..., Any])
 FIRST_EVALUATION_SEED = 100_000
 """Episodes from this seed on are for evaluation, as in the paper's public code; demonstrations use the seeds below it."""
 DESCRIPTION = "**Task Description:**"
-"""What introduces the description in the docstring of a task's class."""
+"""Heading of the description in the docstring of a task's class."""
 PREFIX, SUFFIX = "ManiFeel-", "-v1"
+"""What the id of one of this package's tasks has before and after its short name."""
 
 
 @dataclass
@@ -47,17 +48,17 @@ class TaskSpec:
     """Time limit of an episode, in control steps: about twice the mean length of demonstrations, and at least 1.5 times that of
     the longest."""
     paper_demos: int
-    """Number of demonstrations that the paper recorded; what `manifeel dataset` records."""
+    """Number of demonstrations in the paper; `manifeel dataset` records as many."""
     instruction: str = ""
     """The task as one plain English sentence that tells a robot what to do, for policies that take language; "" if none."""
     paper_tables: tuple[str, ...] = ()
     """Tables of the paper that report the task: "I", "II", "III"."""
     revision: int = 1
-    """Raised by one whenever the task's outcomes change; results of different revisions cannot be compared."""
+    """Number of the task's version, raised whenever its outcomes change; results of different revisions cannot be compared."""
     demo_megabytes: float = 13.0
-    """Size of one demonstration with every observation, in MB, rounded up; to see whether the disk has room."""
+    """Size of one demonstration with every observation, in MB, rounded up, by which free disk space is checked."""
     force_limit: float | None = None
-    """Largest contact force of a gentle success, in N: twice the median over demonstrations of their largest force. None if not
+    """Largest contact force of a gentle success, in N: twice the median of the demonstrations' largest forces; None if not
     known."""
     demo_steps: float | None = None
     """Mean number of control steps of a demonstration, over the seeds that docs/tasks.md names; None if not known."""
@@ -73,7 +74,7 @@ class TaskSpec:
 
     @property
     def gym_id(self) -> str:
-        """Id after the module that gymnasium is to import for it, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
+        """Id with the module that gymnasium imports first, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
         return gym_id(self.env_id, self.env_class)
 
     @property
@@ -105,8 +106,8 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
                 f"give one of them another id. Registered are {list(_SPECS)}"
             )
         register_env(env_id, max_episode_steps=max_episode_steps, override=known is not None)(env_class)
-        # by the class's name instead of ManiSkill's function, which knows the task only where it was imported: processes that
-        # gymnasium spawns import nothing else
+        # ManiSkill's entry point works only in processes that have imported the task, and those that gymnasium spawns have not;
+        # the name of the class makes gymnasium import it
         gym.registry[env_id].entry_point = f"{env_class.__module__}:{env_class.__qualname__}"
         _SPECS[env_id] = TaskSpec(env_id, env_class, max_episode_steps=max_episode_steps, **about)
         return env_class
@@ -138,7 +139,7 @@ def task_spec(env_id: str) -> TaskSpec:
 
     Args:
         env_id: Id of the task, or its short name, such as "PegInsertion". A module before a colon, as in the id of ManiSkill's
-            files ("manifeel_ms3:ManiFeel-PegInsertion-v1"), is left aside: it is never imported.
+            files ("manifeel_ms3:ManiFeel-PegInsertion-v1"), is ignored, and never imported.
 
     Raises:
         UnknownNameError: The task is not registered; the message lists those that are.
@@ -205,7 +206,7 @@ def evaluation_seeds(count: int) -> list[int]:
 
 
 def gym_id(env_id: str, env_class: type) -> str:
-    """Id after the module that gymnasium is to import for it, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
+    """Id with the module that gymnasium imports first, such as "manifeel_ms3:ManiFeel-PegInsertion-v1"."""
     package, module = __name__.partition(".")[0], env_class.__module__
     return f"{package if module.startswith(f'{package}.') else module}:{env_id}"
 

@@ -1,4 +1,4 @@
-"""What every task's cameras see: bench, light, cameras, and their randomization."""
+"""What the cameras of every task see: bench and light, and the cameras and random looks themselves."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (ManiSkill annotates its own poses alone, sizes as tuples, and sensors by their base class)
@@ -30,17 +30,19 @@ LIGHTING = {"normal": 1.0, "dim": 0.05}
 QUALITIES = tuple(SHADOWS)
 """Qualities of the policy's images."""
 FILM_CAMERA_AT, FILM_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
-"""Place of the films' camera and the point that it looks at, base frame, in m. Chosen by eye."""
+"""Position of the films' camera, and the point that it looks at, base frame, in m. Chosen by eye."""
 FILM_FIELD_OF_VIEW = np.deg2rad(45)
 """Field of view of the films' camera, in rad. Chosen by eye."""
 NEAREST = 0.01
-"""Smallest distance that the cameras draw, in m."""
+"""Smallest distance that the cameras draw, in m. Set once; not tuned."""
 TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
+"""Table top, base frame, in m; its upper face is at z = 0. Chosen by eye."""
 TABLE_FRICTION = 0.5
-"""Coulomb's coefficient."""
+"""Coulomb's friction coefficient of the table top. Set once; not tuned."""
 FLOOR = Part("floor", (Box((8.0, 8.0, 0.02), (0.0, 0.0, -0.76)),), CONCRETE)
+"""Floor, base frame, in m, 0.75 m under the table's upper face. Chosen by eye."""
 FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
-"""Links whose shadow falls beside what the shadow map covers."""
+"""Links whose shadows fall outside the area that the shadow map covers."""
 
 
 class SceneryEnv(SensingEnv):
@@ -63,7 +65,7 @@ class SceneryEnv(SensingEnv):
         )
         if randomization and num_envs != 1:
             raise InvalidArgumentError(
-                f"visual_randomization={randomization!r} needs num_envs=1, not {num_envs}: the environments of one process "
+                f"visual_randomization={randomization!r} needs num_envs=1, not {num_envs}: all environments of one process "
                 "look alike; use several processes"
             )
 
@@ -118,7 +120,7 @@ class SceneryEnv(SensingEnv):
         super()._setup_sensors(options)
 
     def _make_random_looks(self) -> None:
-        """Remember how the scene looks, so that an episode's looks can be drawn around it."""
+        """Remember how the scene looks: random looks are drawn around that."""
         self._random_looks, self._looks = None, dict[str, torch.Tensor]()
         if self.visual_randomization != VisualRandomization() and self.scene.can_render():
             cameras = {name: self._sensors[name].camera._render_cameras[0] for name in self._camera_names}

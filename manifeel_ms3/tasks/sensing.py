@@ -30,10 +30,10 @@ class SensingEnv(BaseEnv):
     _touch_is_fresh: bool
     """Whether the pads have been read in the present state. They are read once per state, since shear has a history."""
     renders_cameras = True
-    """Whether observations hold the cameras' images. They are left out while a policy does not look, which saves their time."""
+    """Whether observations hold the cameras' images. They are left out where a policy does not use them, to save time."""
 
     def _make_tactile_sensors(self) -> None:
-        # not in _setup_sensors, which runs only with a renderer: touch works without one
+        # not called from _setup_sensors, which runs only with a renderer: touch works without one
         self._tactile_sensors = {
             uid: TactileSensor(config, self.scene, self.agent.robot, self._tactile_outputs)
             for uid, config in self._tactile_configs.items()
@@ -42,7 +42,7 @@ class SensingEnv(BaseEnv):
         self._touch_is_fresh = False
 
     def _drawn_imperfections(self) -> dict[str, dict[str, dict[str, torch.Tensor]]]:
-        """An entry `imperfections` of `info`: what the episodes drew, by pad and name; nothing for perfect sensors."""
+        """Entry "imperfections" of `info`: what the episodes drew, by pad and name; none for perfect sensors."""
         drawn = {name: sensor.drawn_imperfections for name, sensor in self._tactile_sensors.items()}
         return dict(imperfections=drawn) if any(drawn.values()) else {}
 
@@ -55,7 +55,7 @@ class SensingEnv(BaseEnv):
         return obs if unflattened else self._flatten_raw_obs(obs)
 
     def _flatten_raw_obs(self, obs: Any):
-        if self._tactile_outputs and self.obs_mode_struct.state:  # plain "state" would flatten touch, too
+        if self._tactile_outputs and self.obs_mode_struct.state:  # ManiSkill would make touch a part of the state vector
             tree = dict(agent=obs["agent"], extra=obs["extra"])
             state = common.flatten_state_dict(tree, use_torch=True, device=self.device)
             return {name: data for name, data in obs.items() if name not in tree} | dict(state=state)

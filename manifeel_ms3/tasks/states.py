@@ -12,7 +12,7 @@ Tree = Mapping[str, Any]
 
 
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
-    """The tree of tensors whose columns, in their order, a flat state has.
+    """Tree of tensors (N, D) that a flat state holds side by side, in the tree's order.
 
     Args:
         state: Flat states (N, D), as ManiSkill's `get_state` returns them.
@@ -28,7 +28,7 @@ def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
 
 
 def is_part_of(state: Tree, whole: Tree) -> bool:
-    """Whether all that a tree of tensors or arrays, (N, D) or (D,), holds is the same, bit for bit, in another tree (N, D)."""
+    """Whether a tree (N, D) holds everything that another one of tensors or arrays, (N, D) or (D,), holds, bit for bit."""
     return all(_is_same(value, whole.get(name)) for name, value in state.items())
 
 

@@ -38,15 +38,16 @@ CONTROL_FREQ = 10
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
 HOLD_SECONDS = 0.5
-"""Time for which a goal must hold until the episode is a success, in s."""
+"""Time for which a goal must hold until the episode is a success, in s. Our choice."""
 SETTLE_SECONDS = 0.2
-"""Time in which the grip settles before the first observation, in s."""
+"""Time in which the grip settles before the first observation, in s. Set once; not tuned."""
 MAX_CONTACTS, MAX_PATCHES = 2**21, 2**19
-"""Contacts and contact patches that the engine reserves memory for on a GPU: many environments with threads and teeth."""
+"""Numbers of contacts and contact patches for which the engine reserves memory on a GPU: enough for many environments with
+threads and teeth."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
-    solver_position_iterations=25,
+    solver_position_iterations=25,  # with the physics rate, what a held light part needs (docs/sensor.md)
     sleep_threshold=0.0,  # a sleeping body's contacts freeze
 )
 """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
@@ -64,8 +65,8 @@ class VisuotactileEnv(SceneryEnv):
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
     (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
-    the last control step, between the held object and the rest of the world) and the task's own measures. That of a reset also
-    holds `language_instruction`, the task as a sentence for each environment.
+    the last control step, between the held object and the rest of the world) and the task's own measures. The `info` of a reset
+    also holds `language_instruction`, the task as a sentence for each environment.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
 
@@ -205,7 +206,7 @@ class VisuotactileEnv(SceneryEnv):
     # ---------------------------------------------------------------- for tasks to define
 
     def _largest_ranges(self) -> dict[str, tuple[float, str]]:
-        """The largest half range that can be played, by the name of a field of `Randomization`, and what happens beyond it."""
+        """By the name of a field of `Randomization`: its largest playable half range, and what happens beyond it."""
         return {}
 
     def _load_task(self) -> None:
@@ -229,11 +230,11 @@ class VisuotactileEnv(SceneryEnv):
         return None
 
     def failed(self, measures: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Whether the episode cannot be won any more, (N,) bool."""
+        """Whether the episode can no longer succeed, (N,) bool."""
         raise NotImplementedError
 
     def shortcomings(self, measures: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """What an episode can lack that ends without success, (N,) bool each; an evaluation counts the first that holds."""
+        """Reasons, by name, why an episode has not succeeded, (N,) bool each; an evaluation counts the first that holds."""
         return {}
 
     def _privileged_state(self) -> dict[str, torch.Tensor]:
@@ -255,7 +256,7 @@ class VisuotactileEnv(SceneryEnv):
         )
 
     def _load_agent(self, options: dict):
-        # not by its name in `robot_uids`, by which ManiSkill makes robots without arguments
+        # not from its name in `robot_uids`: ManiSkill makes robots by name without further arguments
         self.agent = PandaGelSight(
             self.scene, self._control_freq, self._control_mode, initial_pose=sapien.Pose(), finger=self._finger
         )
@@ -291,7 +292,7 @@ class VisuotactileEnv(SceneryEnv):
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
         self._settle(env_idx)
         for sensor in self._tactile_sensors.values():
-            sensor.forget_readings(env_idx)  # those before the grip had settled
+            sensor.forget_readings(env_idx)  # which are from before the grip had settled
         info = self.get_info() | dict(reconfigure=info["reconfigure"], language_instruction=self.get_language_instruction())
         self._last_obs = self.get_obs(info)
         return self._last_obs, info
@@ -347,9 +348,10 @@ class VisuotactileEnv(SceneryEnv):
         self._pad_forces.append(self.agent.pad_joint_forces)
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None):
-        """Set the state; one that is the present state already changes nothing, also not what the engine knows of contacts.
+        """Set the state. Setting the present state again changes nothing.
 
-        No state holds that knowledge, on which the last bits of an episode depend.
+        In particular, it keeps the engine's memory of contacts, which no state holds, and on which the last bits of an episode
+        depend.
         """
         if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
             return

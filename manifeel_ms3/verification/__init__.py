@@ -1,1 +1,1 @@
-"""Tests of a tactile sensor by known loads, for any sensor: `manifeel verify-sensor`."""
+"""Verification of any tactile sensor by known loads: `manifeel verify-sensor`."""

@@ -1,8 +1,8 @@
 """Verify a tactile sensor: `manifeel verify-sensor gelsight_r15 --report sensor.html`.
 
-Known loads are pressed on the simulated pad, and one page says what the sensor reports of them: applied against reported force,
-centre of pressure, shear, hysteresis, depth, and the worst case of each beside its bound. The exit code is not 0 if a bound is
-broken.
+Objects are pressed on the simulated pad by known loads, and one page shows what the sensor reports: applied against reported
+force, centre of pressure, shear, hysteresis, depth, and the worst case of each beside its bound. The exit code is not 0 if a
+bound is broken.
 """
 
 import base64
@@ -38,14 +38,18 @@ with missing_extras_named():
 log = logging.getLogger(__name__)
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 COLOURS = ("#3a74c7", "#c7793a", "#4a9a5b", "#9a4a8f", "#8a8f98")
-"""Colours of the shapes in the figure."""
+"""Colours of the shapes in the figure; chosen by eye."""
 FIGURE_SIZE = (12.0, 7.5)
-"""Width and height of the figure, in inches."""
+"""Width and height of the figure, in inches; chosen by eye."""
+DOT, THIN, MIDDLE, LEGEND, SMALL_LEGEND = 4, 0.6, 0.8, 8, 7
+"""Size of dots, widths of reference lines and of the law of the layer, and sizes of the legends' text, in points; by eye."""
+LEAST_FORCE, LEAST_DISTANCE = 1e-6, 1e-8
+"""Smallest force, in N, and distance, in m, that are drawn on logarithmic axes, which cannot show 0."""
 
 
 @dataclass
 class Args:
-    """Arguments of the command."""
+    """Verify a tactile sensor by known loads."""
 
     sensor: tyro.conf.Positional[str] = DEFAULT_SENSOR
     """Name of the sensor: gelsight_r15, gelsight_mini, digit, or one that another package registers."""
@@ -56,7 +60,7 @@ class Args:
     imperfections: str = "{}"
     """Amounts of the sensor's imperfections, as json by name."""
     loads: tuple[float, ...] = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
-    """Normal loads in N. A ball, which has one contact point, gets those that the gel carries alone."""
+    """Normal loads in N. A ball, which has one contact point, is pressed only by loads that the gel can carry there."""
 
 
 def main(args: Args) -> int:
@@ -69,7 +73,7 @@ def main(args: Args) -> int:
         FileWriteError: The page cannot be written.
     """
     with missing_extras_named():
-        import matplotlib as _  # noqa: F401  (asked for before the first load)
+        import matplotlib as _  # noqa: F401  (fails before the first load if it is missing)
     tactile, imperfections = json_object("--tactile", args.tactile), json_object("--imperfections", args.imperfections)
     if not args.loads or min(args.loads) <= 0:
         raise InvalidArgumentError(f"--loads {args.loads} must be positive forces in N, such as 1 10")
@@ -97,7 +101,14 @@ def _line(check: Check) -> str:
 
 
 def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list[Check]) -> str:
-    """The page as HTML that needs no other file."""
+    """The page as HTML that needs no other file.
+
+    Args:
+        sensor: Name of the sensor.
+        changes: Changed fields and imperfections of the sensor, by name.
+        found: Measurements.
+        checks: Checks of the measurements.
+    """
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
@@ -137,45 +148,46 @@ def figure(found: Measurements) -> str:
     for name, colour in zip(SHAPES, COLOURS, strict=True):
         rows = [reading for reading in found.readings if reading.shape == name]
         load = [reading.applied[0] for reading in rows]
-        axes[0, 1].loglog(load, [1e3 * max(reading.centre_error, 1e-8) for reading in rows], "o-", color=colour, label=name)
+        errors = [1e3 * max(reading.centre_error, LEAST_DISTANCE) for reading in rows]
+        axes[0, 1].loglog(load, errors, "o-", color=colour, label=name)
         for k, mark in ((1, "o"), (2, "s")):
-            axes[0, 2].plot([r.applied[k] for r in rows], [r.reported[k] for r in rows], mark, color=colour, ms=4)
-        axes[1, 0].plot([1e3 * r.applied[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=4)
+            axes[0, 2].plot([r.applied[k] for r in rows], [r.reported[k] for r in rows], mark, color=colour, ms=DOT)
+        axes[1, 0].plot([1e3 * r.applied[3] for r in rows], [1e3 * r.reported[3] for r in rows], "o", color=colour, ms=DOT)
     axes[0, 1].set(title="centre of pressure", xlabel="normal load, N", ylabel="distance, mm")
     axes[0, 2].set(title="shear: rows (dots), columns (squares)", xlabel="applied, N", ylabel="reported, N")
     axes[1, 0].set(title="moment about the normal", xlabel="applied, N mm", ylabel="reported, N mm")
     for axis in (axes[0, 2], axes[1, 0]):
-        axis.axline((0, 0), slope=1, color="black", lw=0.6)
+        axis.axline((0, 0), slope=1, color="black", lw=THIN)
     top = int(found.loop[:, 0].argmax())
     axes[1, 1].plot(*found.loop[: top + 1].T, "o-", color=COLOURS[0], label="loading")
     axes[1, 1].plot(*found.loop[top:].T, "s--", color=COLOURS[1], label="unloading")
     axes[1, 1].set(title="loading and unloading", xlabel="applied, N", ylabel="reported, N")
     axes[1, 2].plot(found.depths[:, 0], 1e3 * found.depths[:, 1], "o", color=COLOURS[0], label="sensor")
-    axes[1, 2].plot(found.depths[:, 0], 1e3 * found.depths[:, 2], "-", color="black", lw=0.8, label="law of the layer")
+    axes[1, 2].plot(found.depths[:, 0], 1e3 * found.depths[:, 2], "-", color="black", lw=MIDDLE, label="law of the layer")
     axes[1, 2].set(title="depth of the ball", xlabel="normal load, N", ylabel="depth, mm")
     for axis in (axes[1, 1], axes[1, 2]):
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=LEGEND)
     text = io.StringIO()
     drawn.savefig(text, format="svg")
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 
 def _draw_forces(axis: Any, found: Measurements) -> None:
-    """Reported against applied normal force, and what the penalty field says, scaled to newtons by one factor for all."""
+    """Draw reported against applied normal force, and the sums of the penalty field, scaled to newtons by one common factor."""
     pairs = [(r.penalty_sum, r.applied[0]) for r in found.readings if r.penalty_sum > 0]
     scale = float(np.exp(np.mean([np.log(load / indented) for indented, load in pairs]))) if pairs else 1.0
     for name, colour in zip(SHAPES, COLOURS, strict=True):
         rows = [reading for reading in found.readings if reading.shape == name]
         load = [reading.applied[0] for reading in rows]
-        axis.loglog(load, [max(reading.reported[0], 1e-6) for reading in rows], "o", color=colour, label=name)
-        axis.loglog(load, [max(scale * reading.penalty_sum, 1e-6) for reading in rows], ":", color=colour, lw=1)
-    axis.axline((1, 1), (10, 10), color="black", lw=0.6)
+        axis.loglog(load, [max(reading.reported[0], LEAST_FORCE) for reading in rows], "o", color=colour, label=name)
+        axis.loglog(load, [max(scale * reading.penalty_sum, LEAST_FORCE) for reading in rows], ":", color=colour, lw=1)
+    axis.axline((1, 1), (10, 10), color="black", lw=THIN)
     axis.set(title='normal force; dotted: units="tacsl", scaled', xlabel="applied, N", ylabel="sum of the field, N")
-    axis.legend(fontsize=7)
+    axis.legend(fontsize=SMALL_LEGEND)
 
 
 def next_step(args: Args, broken: int) -> str:
-    """What the command made, and what one can do with it."""
+    """Sentence about what the command has made, and what one can do with it."""
     tasks = f"`manifeel record TASK --sensor {args.sensor}` records with this sensor"
     outcome = "its broken bounds say what to change in the sensor" if broken else f"every bound holds, and {tasks}"
     return f"{args.report} is a page to open in a browser; {outcome}"

@@ -1,4 +1,7 @@
-"""What a sensor must hold, and the worst of what was measured beside it."""
+"""The bounds that a sensor must keep, and the worst measured value beside each.
+
+The bounds are chosen: what users may rely on, not what the sensor reaches at best.
+"""
 
 from dataclasses import dataclass
 
@@ -13,7 +16,7 @@ from .published_colours import worst_similarity
 FORCE_BOUND = 0.01
 """Largest relative error of the force field's sums."""
 CENTRE_BOUND = 0.5e-3
-"""Largest distance of the centre of pressure from the load's, and of the moment over the load, in m."""
+"""Largest error of the centre of pressure, and of the moment over the load, in m."""
 LOOP_BOUND = 0.01
 """Largest area between loading and unloading, as a share of the area under the loading curve."""
 DEPTH_BOUND = 2e-5
@@ -24,27 +27,33 @@ SIMILARITY_BOUND = 0.90
 
 @dataclass(frozen=True)
 class Check:
-    """One claim."""
+    """One claim about a sensor, and whether it holds."""
 
     claim: str
+    """What is compared with what."""
     worst: float
     """Worst value that was measured."""
     bound: float | None
-    """Bound that the worst value must keep; none for a known limit, which is shown and not judged."""
+    """Bound that the worst value must keep; None for a known limit, which is shown and not judged."""
     unit: str
+    """Unit of both values."""
     at_least: bool = False
     """Whether the value must be at least the bound; otherwise at most."""
 
     @property
     def holds(self) -> bool:
-        """Whether the bound is kept; a value that is no number breaks it."""
+        """Whether the bound is kept; NaN breaks it."""
         if self.bound is None:
             return True
         return bool(self.worst >= self.bound if self.at_least else self.worst <= self.bound)
 
 
 def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
-    """The checks of a sensor; a claim of which nothing was measured is left out.
+    """The checks of a sensor; claims for which nothing was measured are left out.
+
+    Args:
+        found: Measurements on the sensor.
+        config: Configuration of the sensor.
 
     Raises:
         InvalidArgumentError: The gel carries none of the loads.
@@ -81,7 +90,7 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
 
 
 def _known_limits(readings: list[Reading]) -> list[Check]:
-    """The errors of the centre of pressure that no bound holds."""
+    """The errors of the centre of pressure for which there is no bound."""
     return [
         Check(f"known limit: centre of pressure, {r.shape} at {r.applied[0]:g} N", 1e3 * r.centre_error, None, "mm")
         for r in readings
@@ -89,12 +98,16 @@ def _known_limits(readings: list[Reading]) -> list[Check]:
 
 
 def _centre(claim: str, errors: list[float]) -> list[Check]:
-    """The check of distances, m, of the centre of pressure, if there are any."""
+    """The check of errors of the centre of pressure, m, if there are any."""
     return [Check(claim, 1e3 * max(errors), 1e3 * CENTRE_BOUND, "mm")] if errors else []
 
 
 def loop_area(loop: np.ndarray) -> float:
-    """Area between loading and unloading (n, 2) as a share of the area under loading."""
+    """Area between loading and unloading as a share of the area under the loading curve.
+
+    Args:
+        loop: Applied and reported force (n, 2), N; the applied force rises to its largest value, and falls again.
+    """
     top = int(loop[:, 0].argmax())
     up, down = loop[: top + 1], loop[top:]
     areas = [abs(float(np.sum(np.diff(part[:, 0]) * (part[1:, 1] + part[:-1, 1]) / 2))) for part in (up, down)]
@@ -102,6 +115,6 @@ def loop_area(loop: np.ndarray) -> float:
 
 
 def has_published_colours(config: TactileSensorConfig) -> bool:
-    """Whether a published table of the sensor's colours is at hand: that of the GelSight R1.5."""
+    """Whether the sensor has the colours of the only published table at hand, that of the GelSight R1.5."""
     default = OpticsConfig()
     return config.optics.lights is None and config.optics.calibration == default.calibration

@@ -1,4 +1,7 @@
-"""Known loads on a sensor: what was applied, what the sensor reports, and what a penalty field would say."""
+"""Known loads on a sensor: what was applied, what the sensor reports, and what a penalty field would report.
+
+Sizes and loads are chosen, to cover what the tasks do to a pad.
+"""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -30,18 +33,18 @@ LOOP_LOADS = (2.0, 4.0, 6.0, 8.0, 10.0)
 DEPTH_LOADS = (1.0, 3.0, 10.0)
 """Loads, in N, of a ball whose depth is compared with the law of the gel layer."""
 MOST_SLIDING = 2e-3
-"""Distance, in m, from which an object counts as having slid off: the load then no longer acts where it was put."""
+"""Distance, in m, from which an object counts as having slid: the load then no longer acts where it was applied."""
 HOUSING_SHARE = 0.9
-"""Share of the gel's protrusion to which an object may press the gel in: beyond, the housing would carry
-a part of the load. Chosen."""
+"""Share of the gel's protrusion by which an object may press the gel in: beyond it, the housing would carry a part of
+the load."""
 FLAT_CONTACT_POINTS = 4
-"""Contact points of PhysX between the gel and a shape that is no ball."""
+"""Number of contact points of PhysX between the gel and a shape that is not a ball."""
 LOOP_SECONDS = 0.05
-"""Time that each load of the loop acts, in s."""
+"""Time in which the load changes from one value of the loop to the next, in s."""
 LAYER_POINTS = 401
-"""Points on each side of the grid over which the law of the layer is summed."""
+"""Number of points along each side of the grid over which the law of the layer is summed."""
 CLEARANCE = 2e-4
-"""Height over the pad at which an object begins, in m."""
+"""Height of an object over the pad before it is pressed, in m."""
 SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "ball, 10 mm": (dict(radius=BALL_RADIUS), BALL_RADIUS),
     "ball, 6 mm": (dict(radius=0.006), 0.006),
@@ -49,7 +52,7 @@ SHAPES: dict[str, tuple[dict[str, Any], float]] = {
     "box, 8 x 10 mm": (dict(half_size=[0.004, 0.005, 0.004]), 0.004),
     "plate, 12 x 16 mm": (dict(half_size=[0.006, 0.008, 0.004]), 0.004),
 }
-"""Indenters: arguments of `indenter`, and the height of the body's origin over the face when it touches, in m."""
+"""Indenters by name: arguments of `indenter`, and the height of the body's origin over the face when it touches, in m."""
 KNOWN_LIMITS: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
     "edge of a box": (
         dict(half_size=[0.006, 0.004, 0.004], rotation=rotation_matrix(np.pi / 4, [1, 0, 0])),
@@ -62,25 +65,29 @@ KNOWN_LIMITS: dict[str, tuple[dict[str, Any], float, tuple[float, ...]]] = {
         (10.0,),
     ),
 }
-"""Shapes whose centre of pressure is read less exactly, as in `SHAPES`, and the loads, in N, under which it is.
+"""Shapes whose centre of pressure is reported less exactly, as in `SHAPES`, and the loads, in N, at which this happens.
 
-The engine's moment there is more than the shape can carry on the gel within the sensor's largest tilt, 5 degrees."""
+The moment that the engine carries there would tilt the shape in the gel by more than the sensor allows, 5 degrees."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One load and what the sensor says of it. Loads are normal, shear along rows and columns (N), moment (N m)."""
+    """One load, and what the sensor reports of it.
+
+    Loads (4,) are the normal force, the shear along rows and columns, N, and the moment about the normal, N m.
+    """
 
     shape: str
+    """Name of the shape that is pressed."""
     applied: np.ndarray
-    """The load that pushes the object, (4,); its moment is about the pad's origin."""
+    """Load (4,) that pushes the object; its moment is about the pad's origin."""
     on_pad: np.ndarray
-    """The load that the engine carries through the pad's joint, (4,)."""
+    """Load (4,) that the engine carries through the pad's joint."""
     reported: np.ndarray
-    """The sums over the force field, (4,)."""
+    """Sums (4,) over the force field."""
     centre_error: float
-    """Distance of the field's centre of pressure, m: for a ball from its middle, for others from that of the force on the
-    pad, since their tilt is locked, so that only the engine knows where its force acts."""
+    """Error of the field's centre of pressure, m: its distance from a ball's middle, and for other shapes from the centre of
+    the force on the pad. Their tilt is locked, so that only the engine knows where its force acts."""
     penalty_sum: float
     """Sum of the normal components of the field with units="tacsl", m."""
 
@@ -95,10 +102,11 @@ class Picture:
     """TacRGB and force field under one load."""
 
     shape: str
+    """Name of the shape that is pressed."""
     rgb: np.ndarray
-    """(H, W, 3) uint8."""
+    """TacRGB image (H, W, 3) uint8."""
     force_field: np.ndarray
-    """(rows, cols, 3), N."""
+    """Force field (rows, cols, 3), N."""
 
 
 @dataclass
@@ -106,11 +114,13 @@ class Measurements:
     """Everything that was measured on one sensor."""
 
     readings: list[Reading]
+    """Readings of every shape under every load."""
     pictures: list[Picture]
+    """Images of every shape."""
     loop: np.ndarray
-    """Loading and unloading (n, 2): applied and reported normal force, N."""
+    """Applied and reported normal force (n, 2), N, during loading and unloading."""
     depths: np.ndarray
-    """A ball in the middle of the pad (n, 3): load in N, depth, and depth by the law of the layer, m."""
+    """Load, N, depth, and depth by the law of the layer, m, (n, 3), of a ball in the middle of the pad."""
     limits: list[Reading] = field(default_factory=list)
     """Readings of `KNOWN_LIMITS`."""
     left_out: list[str] = field(default_factory=list)
@@ -131,7 +141,7 @@ def measure(
         loads: Normal loads, N.
         tactile: Fields of the sensor's configuration to change, by dotted name.
         imperfections: Amounts of its imperfections, by name.
-        on_shape: Called with the name of each shape before it is pressed.
+        on_shape: Function that is called with the name of each shape before it is pressed.
 
     Raises:
         UnknownNameError: The sensor, a field or an imperfection is unknown.
@@ -215,9 +225,14 @@ def _depths(press: Press, touching: float) -> np.ndarray:
 
 
 def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
-    """Depth, m, to which a load, N, presses a ball of a radius, m, into the middle of the gel, by the law of the layer.
+    """Depth, m, to which a load presses a ball into the middle of the gel, by the law of the layer.
 
     The pressure is `gel.normal_stiffness` times the penetration, summed over a finer grid than the sensor's.
+
+    Args:
+        gel: The gel.
+        radius: Radius of the ball, m.
+        load: Normal load, N.
     """
     sides = [np.linspace(-extent / 2, extent / 2, LAYER_POINTS) for extent in gel.size]
     x, y = np.meshgrid(*sides, indexing="ij")
@@ -228,5 +243,5 @@ def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
     def excess(depth: float) -> float:
         return gel.normal_stiffness * area * np.maximum(depth - gap, 0.0).sum() - load
 
-    root: Any = brentq(excess, 0.0, radius / 2)  # typed as the full output, too, which is not asked for
+    root: Any = brentq(excess, 0.0, radius / 2)  # its annotation includes the full output, which is not requested
     return float(root)

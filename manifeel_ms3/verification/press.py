@@ -1,4 +1,7 @@
-"""Objects pressed on the right pad by known forces, through the engine's own contacts."""
+"""Objects pressed on the right pad by known forces, through the engine's own contacts.
+
+Times, drags, masses and friction are set once; not tuned.
+"""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOperatorIssue=false
 # (ManiSkill and SAPIEN annotate poses and bodies by their base classes)
@@ -19,22 +22,22 @@ SETTLE_SECONDS = 0.5
 RAMP_SECONDS = 0.4
 """Time in which a load changes, in s."""
 DRAG = 20.0
-"""Drag of the pressed object, in N s/m. At rest it does nothing; PhysX's own damping takes its share of a steady force."""
+"""Drag of the pressed object, in N s/m. It has no effect at rest, where PhysX's own damping would take a share of the force."""
 TWIST_DRAG = 0.01
 """Drag of the pressed object's rotation, in N m s."""
 FRICTION = 0.8
-"""Coulomb's coefficient of an indenter: with the gel's 0.5 a contact has 0.65."""
+"""Coulomb's friction coefficient of an indenter: averaged with the gel's 0.5, that of the contact is 0.65."""
 MASS, INERTIA = 0.1, 1e-4
 """Mass, in kg, and moments of inertia, in kg m^2, of an indenter."""
 
 
 @dataclass
 class NoRandomization:
-    """A bench has nothing that is random."""
+    """Randomization of a bench, which has nothing random."""
 
 
 class PadBench(VisuotactileEnv):
-    """The robot with what is put in front of its right pad; nothing is rewarded and nothing fails.
+    """The robot, with objects in front of its right pad; there are no rewards and no failures.
 
     Args:
         build: Function that adds actors to the environment, which become `objects`.
@@ -71,7 +74,7 @@ class PadBench(VisuotactileEnv):
 
 
 def indenter(name: str, rotation: np.ndarray | None = None, **shape) -> Callable[[PadBench], list[Actor]]:
-    """A builder of one body: a sphere, box or cylinder by the arguments of its collision shape.
+    """Builder of one body: a sphere, a box or a cylinder, as the arguments of its collision shape tell.
 
     Args:
         name: Name of the body.
@@ -97,9 +100,10 @@ def indenter(name: str, rotation: np.ndarray | None = None, **shape) -> Callable
 
 
 class Press:
-    """A bench with an object that moves freely, or without tilting if `upright`, and to which `push` applies a load.
+    """A bench with an object that moves freely, or without tilting if `upright`; `push` applies a load to it.
 
-    The right pad's normal is the world's y axis, so that locking the turns about x and z leaves the twist about the normal.
+    The right pad's normal is the world's y axis, so that an object whose rotations about x and z are locked can still twist
+    about the normal.
 
     Args:
         build: Builder of the object.
@@ -119,7 +123,13 @@ class Press:
         self.load = np.zeros(4)
 
     def place(self, height: float, x: float = 0.0, y: float = 0.0) -> None:
-        """Put the object's origin over a point of the pad, m; a new episode of touch begins."""
+        """Put the object's origin over a point of the pad, and begin a new episode of the sensor.
+
+        Args:
+            height: Height over the untouched face, m.
+            x: Position of the point across the finger, pad frame, m.
+            y: Position of the point along the finger, pad frame, m.
+        """
         self.env.place(self.actor, sapien.Pose([x, y, height]))
         self.body.set_linear_velocity([0, 0, 0])
         self.body.set_angular_velocity([0, 0, 0])
@@ -131,7 +141,15 @@ class Press:
     def push(
         self, normal: float, rows: float = 0.0, cols: float = 0.0, twist: float = 0.0, seconds: float = RAMP_SECONDS
     ) -> None:
-        """Change the load on the gel, N and N m, evenly to this one, sensing at the control rate, and let it settle."""
+        """Change the load on the gel evenly to a new one, sensing at the control rate, and let it settle.
+
+        Args:
+            normal: Normal force into the gel, N.
+            rows: Shear along rows, N.
+            cols: Shear along columns, N.
+            twist: Moment about the normal, N m.
+            seconds: Time in which the load changes, s.
+        """
         target, start = np.array([normal, rows, cols, twist]), self.load
         rate, every = self.env._sim_freq, self.env._sim_steps_per_control
         ramp = round(seconds * rate)
@@ -174,19 +192,19 @@ class Press:
 
     @property
     def sums(self) -> np.ndarray:
-        """Normal, shear along rows and columns, N; moment about the normal, N m: of the field."""
+        """Sums (4,) over the field: normal force, shear along rows and columns, N, and moment about the normal, N m."""
         moment = self.taxels[..., 0] * self.field[..., 2] - self.taxels[..., 1] * self.field[..., 1]
         return np.array([*self.field.sum((0, 1)), moment.sum()])
 
     @property
     def wrench(self) -> np.ndarray:
-        """The engine's, as `sums`: normal into the gel."""
+        """Load (4,) that the engine carries through the pad's joint, in the order of `sums`; normal is into the gel."""
         w = self.sensor.wrench()[0].numpy()
         return np.array([-w[2], w[0], w[1], w[5]])
 
     @property
     def applied(self) -> np.ndarray:
-        """The load that pushes the object, as `sums`: its moment is about the pad's origin, whatever the sensor measures."""
+        """Load (4,) that pushes the object, in the order of `sums`; its moment is about the pad's origin."""
         normal, rows, cols, twist = self.load
         x, y = self.at
         return np.array([normal, rows, cols, twist + x * cols - y * rows])
@@ -199,21 +217,21 @@ class Press:
 
     @property
     def centre_error(self) -> float:
-        """Distance along an axis of the field's centre of pressure from that of the force on the pad, m."""
+        """Largest distance, along x or y, of the field's centre of pressure from that of the force on the pad, m."""
         wrench = self.sensor.wrench()[0].numpy()
         return float(np.abs(self.centre - np.array([wrench[4], -wrench[3]]) / -wrench[2]).max())
 
     @property
     def ball_error(self) -> float:
-        """Distance along an axis of the field's centre of pressure from the middle of a ball, m.
+        """Largest distance, along x or y, of the field's centre of pressure from the middle of a ball, m.
 
-        A ball presses where it is; the engine carries the moment of any other shape, whose tilt is locked, at its corners.
+        A ball presses where it is. Any other shape, whose tilt is locked, can carry a moment at its corners.
         """
         return float(np.abs(self.centre - self.at).max())
 
     @property
     def at(self) -> np.ndarray:
-        """Place (2,) of the object's origin on the face of the robot's pad, m."""
+        """Position (2,) of the object's origin in the plane of the pad's face, m."""
         return (self.env.agent.gels["right"].pose.sp.inv() * self.actor.pose.sp).p[:2]
 
     @property

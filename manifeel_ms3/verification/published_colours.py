@@ -1,4 +1,4 @@
-"""The published calibration of the GelSight R1.5, read with interpolation, and how similar the sensor's images are to it."""
+"""Similarity of a sensor's images with those of the published calibration of the GelSight R1.5, read with interpolation."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +17,9 @@ from manifeel_ms3.sensors.touch_model import CONTACT_CELL
 CALIBRATION = data_dir() / "gelsight_r15_polycalib_subset.npz"
 """The slope bins up to 1.2 rad of Taxim's table of a GelSight R1.5 (NOTICE), in int16."""
 DIMPLE_PITCH, DIMPLE_RADIUS, DIMPLE_DEPTH = 3.6e-3, 1.7e-3, 2.5e-4
-"""Distance of neighbouring dimples of a golf ball, radius of a dimple's rim, and its depth, in m."""
+"""Distance of neighbouring dimples of a golf ball, radius of a dimple's rim, and its depth, in m: typical values."""
 SSIM_WINDOW = 1.5
-"""Standard deviation of the windows of the structural similarity, in pixels (Wang et al. 2004)."""
+"""Standard deviation of the Gaussian window of the structural similarity, in pixels (Wang et al. 2004)."""
 SSIM_K1, SSIM_K2 = 0.01, 0.03
 """Constants K1 and K2 of the structural similarity, as shares of the range (Wang et al. 2004)."""
 LAST_BIN_MARGIN = 1e-3
@@ -53,14 +53,14 @@ class PressedShapes:
     dimpled_depth: float = 4e-4
     """Depth of the plate with dimples."""
     apart: float = -1.0
-    """Height beside a shape, where it does not touch: any negative one."""
+    """Height beside a shape, where it does not touch: any negative value."""
 
 
 PRESSED = PressedShapes()
 
 
 def published_table(path: Path = CALIBRATION) -> np.ndarray:
-    """The table (3, bins, bins, 6) in Taxim's format; bins beyond 1.2 rad are zero."""
+    """The published table (3, bins, bins, 6) in Taxim's format; its slope bins beyond 1.2 rad are zero."""
     with np.load(path) as stored:
         kept, bins = stored["coefficients"] * stored["scale"], int(stored["bins"])
     table = np.zeros((3, bins, *kept.shape[2:]))
@@ -100,7 +100,7 @@ def table_change(table: np.ndarray, surface: np.ndarray, pixel_size: float) -> n
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Structural similarity (Wang et al. 2004) of two pictures (H, W, 3), with the range of the second."""
+    """Structural similarity (Wang et al. 2004) of two images (H, W, 3), with the range of the second."""
     span = b.max() - b.min()
     c1, c2 = (SSIM_K1 * span) ** 2, (SSIM_K2 * span) ** 2
 
@@ -113,7 +113,7 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def dimples(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Depth of spherical dimples on a square lattice, m."""
+    """Depth of spherical dimples on a square lattice, m, at points x and y, m."""
     u, v = (p - np.round(p / DIMPLE_PITCH) * DIMPLE_PITCH for p in (x, y))
     ball = (DIMPLE_RADIUS**2 + DIMPLE_DEPTH**2) / (2 * DIMPLE_DEPTH)
     inside = u * u + v * v < DIMPLE_RADIUS**2

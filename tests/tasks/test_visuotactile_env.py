@@ -86,7 +86,7 @@ def test_state_modes(make_env):
 
 @pytest.mark.parametrize(
     ("mode", "word"),
-    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+rgb", "stands alone"), ("", "unknown")],
+    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+rgb", "cannot be joined"), ("", "unknown")],
 )
 def test_bad_obs_modes_name_what_is_known(mode, word):
     with pytest.raises(ValueError, match=word):
@@ -104,7 +104,7 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(tactile={"gel.thickness": 0.0}), "gel.thickness"),
         (dict(sensor_configs=dict(tactile_left=dict(units="tacsl"))), r"neither a sensor.*'wrist', 'tactile_right'"),
         (dict(sensor_configs=dict(tactile_right=dict(optics=dict(nose=1.0)))), "optics.nose"),
-        (dict(sensor_configs=dict(wrist=dict(widht=64))), "'widht'. are no fields of a camera; choose from"),
+        (dict(sensor_configs=dict(wrist=dict(widht=64))), "'widht'. are not fields of a camera; choose from"),
         (dict(occlusion=True), "nothing that could occlude"),
         (dict(fit="snug"), "tight"),
         (dict(randomization=dict(colour=1.0)), "socket_xy"),

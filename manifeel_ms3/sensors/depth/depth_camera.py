@@ -38,7 +38,7 @@ class CameraDepth:
 
     Raises:
         MachineError: The scene has no renderer.
-        InvalidArgumentError: The units need velocities, which a camera does not give.
+        InvalidArgumentError: The force field's units need velocities, which a camera does not measure.
     """
 
     def __init__(self, sensor: TactileSensorConfig, scene: ManiSkillScene, pad: Link):
@@ -56,7 +56,7 @@ class CameraDepth:
             pose=Pose.create(sensor.pad_pose * sapien.Pose([0, 0, -self._start], PAD_TO_CAMERA)),
             width=cols,
             height=rows,
-            fov=1.0,
+            fov=1.0,  # has no effect on an orthographic camera
             near=NEAR,
             far=self._start + REACH,
             mount=pad,
@@ -77,7 +77,12 @@ class CameraDepth:
         self._height = height[:, None]  # (N, 1, rows, cols)
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
-        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2); -REACH if there is none."""
+        """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2), m; -REACH if there is none.
+
+        Args:
+            grid: Points (C, 2) of the face, m.
+            window: Parts of the face that are needed; a camera sees all of it, and ignores this.
+        """
         row, column = (grid / self.half_size).unbind(-1)
         where = torch.stack([-column, row], dim=-1)[None, None]  # (right, down) in [-1, 1]
         where = where.expand(len(self._height), -1, -1, -1)

@@ -19,7 +19,7 @@ from manifeel_ms3.sensors.warp_device import launch_split, warp_device
 
 from .surfaces import scene_surfaces
 
-START = 4.2e-3  # m behind the face, where rays start: about the gel's back (4.25 mm), deeper than any object gets
+START = 4.2e-3  # m behind the face, where rays start: near the gel's back (4.25 mm), which no object reaches
 REACH = 5.0e-3  # m in front of the face, where rays end (chosen; beyond `contact.MAX_GAP`)
 
 wp.set_module_options({"enable_backward": False})
@@ -158,13 +158,13 @@ def _cast_moving(
 
 
 class MeshRays:
-    """Rays from N pads to B meshes each. Bodies and pads are at the origin until `move` is called.
+    """Rays from N pads, each against the meshes of B bodies. Bodies and pads are at the origin until `move` is called.
 
     Args:
         meshes: B lists of N meshes, None where an environment lacks the body. Equal meshes are stored once.
-        size: Size of the pads' face, m.
+        size: Size of the pads' face across and along the finger, m.
         device: Device on which rays are cast.
-        sag: Depth of a domed face's corners under its highest point, m: rays start so much deeper.
+        sag: Depth of a domed face's corners under its highest point, m: rays start deeper by this much.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ CAPSULE_SECTIONS = 128  # around and along a cap: within 3 micrometres of a 10 m
 CYLINDER_SECTIONS = 256  # around the axis: within 1 micrometre of a 10 mm radius
 PLANE_HALF_SIZE = 10.0  # m: extent of the slab that stands for an infinite plane (chosen)
 PLANE_THICKNESS = 0.1  # m (chosen)
-RELIEF = "touch_relief"
+RELIEF = "touch_relief"  # name of the attribute in which an actor keeps its relief
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Surface:
 
 
 def give_relief(actor: Actor, mesh: trimesh.Trimesh) -> None:
-    """Make pads feel this surface, m, in the actor's frame, instead of the visual shape; nothing else changes."""
+    """Make pads feel this surface, in the actor's frame, in m, instead of the visual shape; nothing else changes."""
     setattr(actor, RELIEF, mesh)
 
 

@@ -1,1 +1,1 @@
-"""Forces on a pad: the measured wrench, and the gel that carries it."""
+"""Forces on a pad: the measured wrench, and the mechanics of the gel that carries it."""

@@ -3,8 +3,8 @@
 # (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
 """Gel mechanics: from the shape of what presses and the measured wrench to penetration, normal force and shear of each cell.
 
-Each pad has one block of threads, which share the cells and add up their parts, so that a whole Newton iteration stays on
-the device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad
+Each pad has one block of threads, which share the cells and add up their parts, so that the whole Newton method runs on the
+device and stops when it has converged. Sums are in float64 and in a fixed order. Units are SI; the frame is the pad
 frame (z out of the gel).
 """
 

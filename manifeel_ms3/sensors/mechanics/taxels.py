@@ -4,18 +4,18 @@ import torch
 
 from .contact import ContactGrid
 
-# TacSL's penalty field as ManiFeel's public code runs it (damping off): unit-less gains on penetration and speed
+# TacSL's penalty field with the values of ManiFeel's public code, which switches damping off; the force field has no unit
 TACSL_NORMAL_GAIN = 1.0
 TACSL_SHEAR_GAIN = 0.1
 TACSL_FRICTION = 2.0
-# Divisors are at least this, which is far below what a touched pad has
+# Smallest divisors; what they stand for is far larger on a touched pad
 MIN_SUM = 1e-9  # N, or m/s
 MIN_SWIRL = 1e-12  # N m^2
 MIN_SHEAR = 1e-15  # N
 
 
 class Taxels:
-    """A grid of taxels centred on the pad; the border taxels own the rest of the gel.
+    """A grid of taxels centred on the pad; the taxels at its border also take the rest of the gel.
 
     A cell's force is shared linearly between the taxel centres around it. This keeps sums and first moments, except those of
     forces outside the outermost centres: a swirl of shear restores the cells' moment about the normal, as far as Coulomb's
@@ -41,7 +41,13 @@ class Taxels:
         return torch.einsum("rx,nxyk,cy->nrck", self._rows, values, self._cols)
 
     def forces(self, cell_force: torch.Tensor, shear: torch.Tensor, friction: torch.Tensor) -> torch.Tensor:
-        """Force field (N, rows, cols, 3), N, of the cells' normal forces (N, C) and shear (N, C, 2), N; `friction` (N,)."""
+        """Force field (N, rows, cols, 3), N, of the cells' forces.
+
+        Args:
+            cell_force: (N, C), N, normal forces of the cells.
+            shear: (N, C, 2), N, shear forces of the cells along x and y.
+            friction: (N,), Coulomb coefficients.
+        """
         field = self.add_up(torch.cat([cell_force[..., None], shear], dim=-1))
         normal, tangential = field[..., 0], field[..., 1:]
         cells = (self.grid.x * shear[..., 1] - self.grid.y * shear[..., 0]).sum(1)

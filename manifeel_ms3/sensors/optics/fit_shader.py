@@ -21,7 +21,7 @@ from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 from .taxim_table import fit_table, read_table
 
-SHIFTS = (8, 4, 2)  # pixels: steps of the search for a circle's middle, by up to two steps each (chosen)
+SHIFTS = (8, 4, 2)  # pixels: steps of the search for a circle's middle, which moves by up to two steps of each size (chosen)
 RIDGE = 1e-6  # share of the mean diagonal (chosen): coefficients of slopes and places that no press reached stay at zero
 
 
@@ -39,7 +39,7 @@ class Table:
 
 @dataclass(kw_only=True)
 class BallPresses:
-    """What is known of ball presses besides their images."""
+    """Options of a fit to ball presses, without their images."""
 
     ball_radius: float
     """Radius of the ball, m."""
@@ -48,10 +48,10 @@ class BallPresses:
     out: Path
     """Path of the shader file that is written."""
     uniform: bool = False
-    """Let colours change alike all over the image, for presses that cover only a part of it; what changes alike in all
-    directions is then taken for an effect of the depth, and left out."""
+    """Fit the same colour changes to the whole image, for presses that cover only a part of it. Changes that are the same for
+    all directions of the slope are then taken for an effect of depth, and left out."""
     refine: bool = False
-    """Shift each contact circle to where the other presses' colours fit best, for circles that were drawn by hand."""
+    """Shift each contact circle to where the colours of the other presses fit best, for circles that were drawn by hand."""
 
 
 @dataclass(kw_only=True)
@@ -88,7 +88,8 @@ def fit_presses(
         circles: (P, 3), row, column and radius of the contact, pixels.
         ball_radius: Radius of the ball, m.
         pixel_size: Size of a pixel on the gel's face, m.
-        uniform: Whether colours change alike all over the image, and not at all where that is independent of the direction.
+        uniform: Whether the same colour changes are fitted to the whole image, without those that are independent of the
+            slope's direction.
 
     Raises:
         InvalidArgumentError: A contact circle is larger than the ball, or the images have different shapes.
@@ -102,8 +103,7 @@ def fit_presses(
         raise InvalidArgumentError(
             f"a contact circle of {circles[:, 2].max()} pixels is larger than the ball; correct ball_radius or pixel_size"
         )
-    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
-    place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)  # (H, W, 6)
+    row, col, place = _pixels(rows, cols)
     # the first term over places, and over directions, is 1
     first, used = (1, 1) if uniform else (0, PLACE_TERMS)
     columns = (FOURIER_TERMS - first) * (len(KNOTS) - 1) * used
@@ -119,6 +119,12 @@ def fit_presses(
     fitted = np.zeros((3, FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS))
     fitted[:, first:, :, :used] = weights.T.reshape(3, FOURIER_TERMS - first, len(KNOTS) - 1, used)
     return Shader(fitted, flat.T)
+
+
+def _pixels(rows: int, cols: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row and column (H, W) of every pixel, and the place terms (H, W, 6) there."""
+    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
+    return row, col, place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)
 
 
 def _pressed(
@@ -143,13 +149,11 @@ def refined_circles(
     pixel_size: float,
     uniform: bool = False,
 ) -> np.ndarray:
-    """The contact circles, their middles shifted to where the shader of half of the presses fits the other half best.
+    """Contact circles (P, 3), shifted to where a shader that is fitted to one half of the presses fits the other half best.
 
-    Arguments are those of `fit_presses`.
+    The arguments are those of `fit_presses`.
     """
-    circles, rows, cols = circles.astype(float), *background.shape[:2]
-    row, col = np.meshgrid(np.arange(rows), np.arange(cols), indexing="ij")
-    place = place_terms(2 * row / (rows - 1) - 1, 2 * col / (cols - 1) - 1)
+    circles, (row, col, place) = circles.astype(float), _pixels(*background.shape[:2])
 
     def misfit(shader: Shader, press: int, middle: np.ndarray) -> float:
         inside, slope, phi = _pressed(row - middle[0], col - middle[1], circles[press, 2], ball_radius, pixel_size)

@@ -1,11 +1,11 @@
-"""Colours of a gel from a drawing of its lamps, for a sensor that has no published calibration.
+"""Colours of a gel from the places of its lamps, for a sensor that has no published calibration.
 
 A point of the skin with the unit normal n, seen from inside, at the distance r from a lamp in the direction l, shows the level
 
     I = e sum_k  a_k  max(0, n . l_k) / r_k^2
 
-of each channel: a matt skin under small lamps, without reflections between gel and housing. The exposure e of a channel is the
-one number that is not in the drawing: it gives the untouched gel the mean level that is asked for. The compact shader is fitted
+of each channel: a matt skin under small lamps, without reflections between gel and housing. The exposure e of a channel
+does not follow from the lamps: it is set so that the untouched gel has the configured mean level. The compact shader is fitted
 to these levels, so that everything after it is the same for all sensors.
 """
 
@@ -15,9 +15,9 @@ from manifeel_ms3.sensors.config import GelConfig, LightsConfig
 
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 
-PLACES = 9  # along each side of the image, at which the levels are computed; the fit has 6 terms over them
+PLACES = 9  # places along each side of the image at which the levels are computed (chosen; the fit has 6 terms over them)
 GRADIENT_STEP = 1e-6  # m: half of the step of the central differences of the face's depth
-DIRECTIONS = 16  # of the gradient; the fit has 5 terms over them
+DIRECTIONS = 16  # directions of the gradient (chosen; the fit has 5 terms over them)
 
 
 def lamp_shader(
@@ -42,7 +42,7 @@ def lamp_shader(
     steps = np.stack([np.cos(phi), np.sin(phi)], axis=-1)[:, None] * KNOTS[1:, None]  # (D, K, 2)
     change = exposure * (_levels(lights, gel, x, y, steps.reshape(-1, 2)) - untouched[:, None])  # (P, D K, 3)
     terms = np.einsum("df,kj->dkfj", fourier_terms(phi), slope_terms(KNOTS[1:])).reshape(len(steps) * len(KNOTS[1:]), -1)
-    # least squares over the outer product of places and slopes, one after the other
+    # least squares over places and slopes, one after the other, which is exact for their outer product
     over_places = np.linalg.lstsq(place, change.reshape(len(x), -1), rcond=None)[0].reshape(PLACE_TERMS, len(terms), 3)
     weights = np.linalg.lstsq(terms, over_places.transpose(1, 0, 2).reshape(len(terms), -1), rcond=None)[0]
     weights = weights.reshape(FOURIER_TERMS, len(KNOTS) - 1, PLACE_TERMS, 3).transpose(3, 0, 1, 2)

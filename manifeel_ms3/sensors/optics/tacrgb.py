@@ -23,8 +23,9 @@ from .shader import FOURIER_TERMS, KNOTS, Shader, place_terms, slope_terms
 from .taxim_table import TABLE_CHANNELS, fit_table, read_table
 
 COARSE = 4  # pixels along each side of a coarse cell; the wide blurs vary little over it
-WIDE_SIGMAS = (0.9e-3, 0.46e-3)  # m; with the next, the larger kernels of Taxim's pyramid at its 0.0295 mm per pixel
-NARROW_SIGMA = 0.24e-3  # m
+# Standard deviations, m: the larger kernels of Taxim's pyramid at its 0.0295 mm per pixel
+WIDE_SIGMAS = (0.9e-3, 0.46e-3)
+NARROW_SIGMA = 0.24e-3
 BLUR_REACH = 2.5  # standard deviations after which a blur's kernel ends: 4 % of its peak is left there
 BAND = 80  # samples of a blur that one matrix product computes (see `GaussianBlur`)
 SEGMENTS = len(KNOTS) - 1
@@ -33,6 +34,8 @@ SHADOW_STEPS = 12  # coarse cells: greatest length of a shadow, 4.2 mm on the R1
 LOW_LIGHT, HIGH_LIGHT = 0.2, 0.5
 MIN_GRADIENT = 5.0e-4  # below it no channel of the R1.5's shader changes by a quarter of a grey level
 LIGHT_GRADIENT = 0.3  # gradient at which the brightest direction is read from the shader: the middle of its range
+MIN_DIRECTION = 1e-9  # grey levels: avoids a division by zero in a channel without light
+CACHED_SHADERS = 4  # number of sensors whose shading maps are kept in memory (chosen)
 MARKER_SPREAD = 0.25  # of the gel's thickness: sigma over which shear drags the skin along (chosen by eye)
 MARKER_BULGE = 0.25  # of the gel's thickness times the slope: how far pressed-out gel carries the skin (chosen by eye)
 MARKER_DARKNESS = 0.75  # share of the light that a dot absorbs (chosen by eye)
@@ -318,7 +321,7 @@ def _shader(
     return Shader.load(calibration)
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=CACHED_SHADERS)
 def _shading_maps(
     calibration: Path,
     lights: LightsConfig | None,
@@ -341,7 +344,7 @@ def _shading_maps(
     background = (place @ shader.background.T).astype(np.float32)
     # a slope faces against its gradient: the light comes from where the brightest slope faces
     brightest = (shader.weights[..., 0] @ slope_terms(np.array(LIGHT_GRADIENT)))[:, 1:3]
-    to_light = -brightest / np.linalg.norm(brightest, axis=1, keepdims=True).clip(1e-9)
+    to_light = -brightest / np.linalg.norm(brightest, axis=1, keepdims=True).clip(MIN_DIRECTION)
     on = warp_device(device)
     maps = (wp.array(response, dtype=wp.vec3f, device=on), wp.array(background, dtype=wp.vec3f, device=on))
     return *maps, to_light.astype(np.float32)

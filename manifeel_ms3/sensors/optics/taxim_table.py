@@ -15,8 +15,8 @@ from .shader import KNOTS, Shader, fourier_terms, place_terms, slope_terms
 
 MAX_SLOPE = 1.0  # rad: the last of `KNOTS`, beyond which the shader is constant
 TABLE_CHANNELS = ("grad_r", "grad_g", "grad_b")
-# Colour (RGB) of an untouched R1.5 gel at the image's centre and at its corners (u, v) = (-,-) (+,-) (-,+) (+,+); the
-# background is the quadratic through them
+# Measured colour (RGB) of an untouched R1.5 gel at the image's centre and at its corners (u, v) = (-,-) (+,-) (-,+) (+,+);
+# the background is the quadratic through them
 BACKGROUND_CENTRE = (140.0, 149.0, 134.0)
 BACKGROUND_CORNERS = ((107.0, 112.0, 31.0), (93.0, 113.0, 68.0), (106.0, 87.0, 72.0), (102.0, 103.0, 83.0))
 
@@ -54,8 +54,11 @@ def portrait_place(r: np.ndarray, c: np.ndarray, image_shape: tuple[int, int]) -
 def fit_table(table: np.ndarray, image_shape: tuple[int, int]) -> Shader:
     """Shader fitted by least squares over all bins up to `MAX_SLOPE`.
 
-    The table's own value at zero slope is subtracted first, at every place. `image_shape` is that of our image: rows and
-    columns of the table's image, laid on its side.
+    The table's own value at zero slope is subtracted first, at every place.
+
+    Args:
+        table: Table (3, bins, bins, 6) of `read_table`.
+        image_shape: Rows and columns of our image, which is the table's image laid on its side.
     """
     bins = table.shape[1]
     slope = np.arange(bins) * (np.pi / 2 / (bins - 1))

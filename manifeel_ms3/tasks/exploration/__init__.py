@@ -1,1 +1,1 @@
-"""The exploration tasks: what the camera cannot tell, touch must find out."""
+"""The exploration tasks: touch must find out what the camera cannot show."""

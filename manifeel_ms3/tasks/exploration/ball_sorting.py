@@ -11,27 +11,32 @@ from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
 from manifeel_ms3.rendering.looks import Look
-from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, height_range, start_pose, uniform_in
+from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, WORKSPACE_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.viewpoints import FAR_FRONT_CAMERA_AT, FAR_SIDE_CAMERA_AT
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
-STAND_XY = (0.5, 0.0)  # m, nominal
-START_XYZ = (0.5, 0.0, 0.12)  # m (public code of the paper)
+STAND_XY = WORKSPACE_XY
+"""Nominal position of the stand, in m."""
+START_XYZ = (*WORKSPACE_XY, 0.12)
+"""Nominal position of the tool at the start, in m (public code of the paper)."""
 LIFTED = 0.10
-"""Height of the golf ball over its seat, in m, at success."""
+"""Smallest height of the golf ball over its seat, in m, at success (docs/fidelity.md)."""
 IN_PLACE = 0.010
-"""Distance of the table-tennis ball from its seat, in m, within which it has stayed in place."""
+"""Distance of a ball from its seat, in m, within which it has stayed in place. Our choice."""
 ON_TABLE = 0.005
-"""Height of a ball's lowest point over the table, in m, below which it has fallen off the stand."""
+"""Height of a ball's lowest point over the table, in m, below which it has fallen off the stand. Our choice."""
 PAD_END = 0.021
-"""Distance from the tool centre point to below the fingertips, in m, with some clearance."""
+"""Distance from the tool centre point to the fingertips, in m: 18 mm, and some clearance."""
 BOWLS = {
     "golf": ((0.40, 0.19), Look((0.85, 0.25, 0.03))),
     "tennis": ((0.40, -0.19), Look((0.03, 0.12, 0.60))),
-}  # xy, m; orange, blue
+}
+"""Position (x, y) of each ball's bowl, in m, and its look: orange and blue. Chosen by eye."""
 GOLF_BUILT_AT, TENNIS_BUILT_AT = (0.45, 0.0, 0.1), (0.55, 0.0, 0.1)
 """Positions at which the balls are built, in m, clear of each other; every reset moves them to their seats."""
 GOALS = ("lift", "bowls")
+"""Names of the goals: lift the golf ball, or put each ball into its bowl."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,7 @@ class BallSortingEnv(VisuotactileEnv):
 
     **Task Description:**
     A table-tennis ball and a golf ball of the same size and colour sit on a stand. The gripper lifts the golf ball and leaves
-    the other. Only touch can tell which is which: the golf ball's 336 dimples are there for the pads, and not for the cameras.
+    the other. Only touch can tell which is which: the pads feel the golf ball's 336 dimples, and the cameras do not show them.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - stand: xy +-50 mm around (0.5, 0) m; the balls swap seats with even chances; the golf ball is turned at random
@@ -95,8 +100,8 @@ class BallSortingEnv(VisuotactileEnv):
     policy_cameras = ("front",)
     grips_round_parts = True
     default_control_mode = "pd_ee_delta_pose"
-    front_camera_at = (0.80, 0.0, 0.15)
-    side_camera_at = (0.5, -0.4, 0.17)
+    front_camera_at = FAR_FRONT_CAMERA_AT
+    side_camera_at = FAR_SIDE_CAMERA_AT
 
     def __init__(self, *args, goal: str = "lift", **kwargs):
         self.goal = one_of("goal", goal, GOALS)
@@ -134,7 +139,7 @@ class BallSortingEnv(VisuotactileEnv):
         self.agent.reset_tool(start)
 
     def _seats(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions (N, 3), in m, of the centres of the golf ball and of the other ball in their seats."""
+        """Positions (N, 3), in m, that the centres of the golf ball and of the other ball have in their seats."""
         middle = self.stand.pose.p + torch.tensor([0.0, 0.0, SEAT_HEIGHT], device=self.device)
         side = torch.where(self.swapped, 1.0, -1.0)[:, None] * torch.tensor([0.0, SEAT_SPACING / 2, 0.0], device=self.device)
         return middle + side, middle - side

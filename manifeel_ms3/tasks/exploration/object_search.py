@@ -7,13 +7,16 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry.containers import BATTERY_SIZE, CONTAINER_FLOOR, CONTAINER_OUTER, CONTAINER_WALL, battery, container
-from manifeel_ms3.tasks.placement import height_range, start_pose, uniform_in
+from manifeel_ms3.tasks.placement import WORKSPACE_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.viewpoints import FAR_FRONT_CAMERA_AT, FAR_SIDE_CAMERA_AT
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
-CONTAINER_XY = (0.5, 0.0)  # m
-PLACES_X = (-0.075, 0.075)  # m from the container's middle
-START_XYZ = (0.5, 0.0, 0.07)
+CONTAINER_XY = WORKSPACE_XY
+"""Position of the container's middle, in m."""
+PLACES_X = (-0.075, 0.075)
+"""Places of the battery along x, in m from the container's middle."""
+START_XYZ = (*WORKSPACE_XY, 0.07)
 """Position of the tool at the start, in m (public code of the paper): in the container, between the two places."""
 HAND = 0.08
 """Half of the hand's width, in m."""
@@ -22,15 +25,16 @@ LOWEST = 0.055
 BUILT_HEIGHT = 0.05
 """Height over the table at which the battery is built, in m; every reset moves it to its place."""
 LIFTED = 0.10
-"""Height of the battery over the container's floor, in m, at success."""
+"""Smallest height of the battery over the container's floor, in m, at success (docs/fidelity.md)."""
 OUTSIDE = 0.17
-"""Distance of the battery from the container's middle on either axis, in m, beyond which it is outside (half size: 0.161 m)."""
-PAPER_GOAL = (0.5, 0.0, 0.01)
+"""Distance of the battery from the container's middle on either axis, in m, beyond which it is outside: the container's half
+size, 0.161 m, and a margin."""
+PAPER_GOAL = (*WORKSPACE_XY, 0.01)
 """Position from which the public code takes the battery's distance, in m: the container's own."""
 PAPER_DISTANCES = (0.12, 0.2)
-"""Distances, in m, between which the public code counts a success."""
+"""Smallest and largest distance, in m, from `PAPER_GOAL` at which the public code counts a success."""
 NOT_LIFTED = 0.02
-"""Height of the battery over the container's floor, in m, below which it has not been lifted."""
+"""Height of the battery over the container's floor, in m, below which it has not been lifted. Our choice."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +43,7 @@ class ObjectSearchRandomization:
 
     place_xy: float = 0.005
     """Position of the battery on each axis around the place drawn, in m. The paper has exactly two places; without these few
-    millimetres, fifty evaluation episodes would be two."""
+    millimetres, fifty evaluation episodes would be copies of only two."""
     start_xy: float = 0.0
     """Position of the tool at the start on each horizontal axis, in m."""
     start_z: float = 0.0
@@ -91,8 +95,8 @@ class ObjectSearchEnv(VisuotactileEnv):
     default_control_mode = "pd_ee_delta_pose_fixed_rotation"
     has_occluder = True
     max_reward = 3.0
-    front_camera_at = (0.80, 0.0, 0.15)
-    side_camera_at = (0.5, -0.4, 0.17)
+    front_camera_at = FAR_FRONT_CAMERA_AT
+    side_camera_at = FAR_SIDE_CAMERA_AT
 
     def _largest_ranges(self):
         to_wall = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - PLACES_X[1] - BATTERY_SIZE / 2

@@ -12,14 +12,17 @@ from manifeel_ms3.geometry.containers import open_box
 from manifeel_ms3.tasks.insertion.base import CLEAR, SOCKET_XY, START_XYZ, InsertionEnv, InsertionRandomization
 from manifeel_ms3.tasks.placement import height_range
 from manifeel_ms3.tasks.registry import register_task
+from manifeel_ms3.tasks.viewpoints import FAR_FRONT_CAMERA_AT, FAR_SIDE_CAMERA_AT
 
-BOX_OUTER, BOX_HEIGHT = (0.24, 0.26), 0.09  # m
+BOX_OUTER, BOX_HEIGHT = (0.24, 0.26), 0.09
+"""Outer size of the box along x and y, and its height, in m: it hides the rim from the front camera."""
 MAX_HAND_TILT = np.deg2rad(5.0)
-"""Angle, in rad, from the vertical below which the hand counts as upright."""
+"""Angle, in rad, from the vertical below which the hand counts as upright. Our choice."""
 MAX_IN_HAND = np.deg2rad(3.0)
-"""Angle, in rad, between the peg and the hand below which the peg counts as turned."""
+"""Angle, in rad, between the peg and the hand below which the peg counts as turned. Our choice."""
 MAX_YAW = 1.0
-"""Largest half range of the tool's rotation about the vertical, in rad, that keeps its last joint off its limits."""
+"""Largest half range of the tool's rotation about the vertical, in rad, that keeps the last joint of the arm off
+its limits."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +72,8 @@ class PegReorientationEnv(InsertionEnv):
     Randomization = PegReorientationRandomization
     policy_cameras = ("front",)
     has_occluder = True
-    front_camera_at = (0.80, 0.0, 0.15)
-    side_camera_at = (0.5, -0.4, 0.17)
+    front_camera_at = FAR_FRONT_CAMERA_AT
+    side_camera_at = FAR_SIDE_CAMERA_AT
     fits = ("paper",)
     paper_threshold = 0.03
     lift = 0.07

@@ -1,4 +1,4 @@
-"""The base class of the insertion tasks: a held plug, a socket on the table, and the plug's foremost face over its floor."""
+"""The base class of the insertion tasks, in which a held plug is put into a socket on the table."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -16,6 +16,7 @@ from manifeel_ms3.tasks.placement import (
     OUT_OF_REACH,
     POINTING_DOWN,
     REACH_XY,
+    WORKSPACE_XY,
     height_range,
     start_pose,
     turned_about,
@@ -23,27 +24,29 @@ from manifeel_ms3.tasks.placement import (
 )
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 
-SOCKET_XY = (0.5, 0.0)  # m, nominal
-START_XYZ = (0.5, 0.0, 0.15)
+SOCKET_XY = WORKSPACE_XY
+"""Nominal position of the socket, in m."""
+START_XYZ = (*WORKSPACE_XY, 0.15)
 """Nominal position of the tool, in m, at the start (public code of the paper)."""
 GRIP_FORCE = 20.0
-"""Force of each pad on the plug, in N."""
+"""Force of each pad on the plug, in N. Set once; not tuned."""
 GRIP_INDENTATION = 6e-4
 """Indentation of each gel under the grip of 20 N, in m: four contact points of 8 kN/m."""
 MAX_TILT = np.deg2rad(3.0)
-"""Angle, in rad, from the socket's axis below which the plug counts as upright."""
+"""Angle, in rad, from the socket's axis below which the plug counts as upright. Our choice."""
 LOST = 0.03
-"""Displacement of the plug in the grip, in m, beyond which it is lost."""
+"""Displacement of the plug in the grip, in m, beyond which it is lost. Our choice."""
 BESIDE = 0.003
-"""Distance, in m, of the plug's end from the socket's axis beyond which it is beside the hole and not in it."""
+"""Distance, in m, of the plug's end from the socket's axis beyond which it is beside the hole and not in it.
+Our choice."""
 CLEAR = 0.010
-"""Smallest height of the plug over the socket at the start, in m."""
+"""Smallest height of the plug over the socket at the start, in m. Set once; not tuned."""
 MAX_ROTATION = 0.4
 """Largest half range of the tool's rotation, in rad, that keeps the hand off the table and its joints off their limits."""
 KEY_POINTS = (-0.25, -0.25 / 3, 0.25 / 3, 0.25)
 """Places of the key points along the plug's axis, in m from its foremost face: four on a line of 0.5 m (public code)."""
 MAX_PITCH = 0.8
-"""Largest half range of the plug's pitch in the hand, in rad."""
+"""Largest half range of the plug's pitch in the hand, in rad: beyond it, the plug would lie across the fingers."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ class InsertionEnv(VisuotactileEnv):
     fits: ClassVar[tuple[str, ...]] = FITS
     """Names of the sizes that the parts come in."""
     lift: float = 0.0
-    """Height by which the tool starts above 150 mm, in m, where the parts are so long that they would start in each other."""
+    """Height that is added to the tool's start, in m, where long parts would otherwise start in each other."""
     paper_threshold: float
     """Mean distance of the key points, in m, below which the paper's public code counts a success."""
 
@@ -106,7 +109,7 @@ class InsertionEnv(VisuotactileEnv):
 
     @staticmethod
     def make_fit(fit: str) -> Fit:
-        """The shapes of plug and socket in the sizes of that name."""
+        """Shapes of plug and socket in the sizes that have this name, one of `fits`."""
         raise NotImplementedError
 
     def _largest_ranges(self):
@@ -139,7 +142,7 @@ class InsertionEnv(VisuotactileEnv):
 
     @property
     def _start_rotation(self) -> float | torch.Tensor:
-        """Half range of the tool's rotation at the start, in rad: of every axis of the robot's base, or of each (3,)."""
+        """Half range of the tool's rotation at the start, in rad, about every axis of the base frame, or about each (3,)."""
         return self.randomization.start_rotation
 
     @property

@@ -16,8 +16,9 @@ from manifeel_ms3.tasks.visuotactile_env import CONTACTS
 from .base import SOCKET_XY, InsertionEnv, InsertionRandomization
 
 NEIGHBOURS = ("small", "large")
+"""Names of the gears that turn freely beside the held one."""
 ON_SHAFT = 1.0e-3
-"""Largest displacement of a neighbouring gear from its place, in m, at success."""
+"""Largest displacement of a neighbouring gear from its place, in m, at success. Our choice."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,14 @@ class GearAssemblyEnv(InsertionEnv):
 
     **Success Conditions:** held for 0.5 s
     - the gear is on its shaft, within 1 mm of the base, tilted by less than 3 degrees
-    - both neighbours are on theirs: there, its teeth are in their gaps
+    - both neighbouring gears are on their shafts, so that the teeth mesh
 
     **Fail Conditions:** the gear has left the grip (30 mm).
     """
 
     _sample_video_link = "docs/films/GearAssembly.mp4"
     Randomization = GearRandomization
-    contacts = CONTACTS | dict(enable_pcm=False)  # persistent manifolds find teeth millimetres deep that only touch
+    contacts = CONTACTS | dict(enable_pcm=False)  # with persistent manifolds, teeth that only touch count as millimetres deep
     make_fit = staticmethod(gear_fit)
     paper_threshold = 0.008
     lift = 0.05
@@ -78,7 +79,7 @@ class GearAssemblyEnv(InsertionEnv):
         }
 
     def _largest_ranges(self):
-        return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is all the way round"))
+        return super()._largest_ranges() | dict(base_yaw=(torch.pi, "that is a full turn"))
 
     def _initialize_task(self, env_idx: torch.Tensor):
         super()._initialize_task(env_idx)
@@ -96,7 +97,7 @@ class GearAssemblyEnv(InsertionEnv):
 
     def measure(self) -> dict[str, torch.Tensor]:
         off = [torch.linalg.norm(actor.pose.p - self._place_of(name), dim=1) for name, actor in self.neighbours.items()]
-        return super().measure() | dict(neighbours_off=torch.stack(off).amax(0))  # m, the worse of both
+        return super().measure() | dict(neighbours_off=torch.stack(off).amax(0))  # m, the larger of the two
 
     def goal_reached(self, measures):
         return super().goal_reached(measures) & (measures["neighbours_off"] < ON_SHAFT)

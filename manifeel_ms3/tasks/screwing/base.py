@@ -9,23 +9,26 @@ from mani_skill.utils.geometry.rotation_conversions import axis_angle_to_quatern
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import Screw
-from manifeel_ms3.tasks.placement import BUILT_AT, height_range, start_pose, uniform_in
+from manifeel_ms3.tasks.placement import BUILT_AT, POINTING_DOWN, WORKSPACE_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.visuotactile_env import CONTACTS, VisuotactileEnv
 
-FIXED_XY = (0.5, 0.0)  # m, nominal
-START_Z = 0.12  # m (public code of the paper)
+FIXED_XY = WORKSPACE_XY
+"""Nominal position of the fixed part, in m."""
+START_Z = 0.12
+"""Nominal height of the tool at the start, in m (public code of the paper)."""
 WOUND_UP = np.deg2rad(200)
-"""Rotation of the hand about the vertical at the start, in rad: near the end of its last joint, so that the first turn is long.
-The public code starts at 0."""
+"""Rotation of the hand about the vertical at the start, in rad: near the limit of its last joint, so that the first turn is
+long. The public code starts at 0."""
 MAX_XY = 0.07
 """Largest half range of horizontal positions, in m, within which the wrist can be turned all the way."""
 CLEAR = 0.02
-"""Smallest height at the start over the first contact of the threads, in m."""
-WRIST_END = "further out the wrist comes to its end"
+"""Smallest height at the start over the first contact of the threads, in m. Set once; not tuned."""
+WRIST_END = "further out the wrist reaches its limit"
+"""What happens beyond `MAX_XY`, for messages."""
 LOST = 0.05
-"""Distance of the held part from the tool, in m, beyond which it is out of the hand."""
+"""Distance of the held part from the tool, in m, beyond which it is out of the hand. Our choice."""
 OFF_AXIS = 0.004
-"""Distance of the held part from the fixed part's axis, in m, beyond which it is off it."""
+"""Distance of the held part from the fixed part's axis, in m, beyond which it is off the axis. Our choice."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class ScrewingRewardConfig:
 
 
 class ScrewingEnv(VisuotactileEnv):
-    """A held part is screwed onto or into a fixed one: the hand turns it, lets go, turns back, and grasps it again.
+    """A held part is screwed onto or into a fixed part: the hand turns it, lets go, turns back, and grasps it again.
 
     Subclasses define `screw` and `grip_indentation`.
     """
@@ -91,10 +94,17 @@ class ScrewingEnv(VisuotactileEnv):
         """Put the tool at its start, with the held part in it."""
         opening = self.screw.grip_width / 2 - self.grip_indentation
         start = self._start_tool(env_idx, START_Z, opening, self.screw.grip_force)
-        self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([[0.0, 1.0, 0.0, 0.0]])))
+        self.held.set_pose(start * Pose.create_from_pq(q=torch.tensor([POINTING_DOWN])))
 
     def _start_tool(self, env_idx: torch.Tensor, height: float, opening: float, grip_force: float) -> Pose:
-        """Put the wound-up tool at a random pose around a height, in m, and return the poses."""
+        """Put the tool, its wrist turned back by `WOUND_UP`, at random poses around a height, and return the poses (n,).
+
+        Args:
+            env_idx: Indices (n,) of the environments.
+            height: Nominal height, in m.
+            opening: Distance of each finger from the middle, in m.
+            grip_force: Force, in N, of each finger on the object that it holds.
+        """
         n, ranges = len(env_idx), self.randomization
         start = start_pose(n, (*FIXED_XY, height), (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
         wound = axis_angle_to_quaternion(torch.tensor([[0.0, 0.0, WOUND_UP]])).expand(n, 4)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.agents.panda_gelsight import FINGER_RANGE
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry import bulb_and_holder
 from manifeel_ms3.geometry.screws import BULB_TRAVEL, bulb_yaw
@@ -15,19 +16,20 @@ from manifeel_ms3.tasks.visuotactile_env import CONTACTS
 from .base import ScrewingEnv, ScrewingRandomization
 
 MAX_GAP = 0.5e-3
-"""Distance of the cap's foot from the holder's contact, in m, at success."""
+"""Largest distance of the cap's foot from the holder's contact, in m, at success. Our choice."""
 ON_AXIS = 2e-3
-"""Distance of the bulb from the holder's axis, in m, at success."""
+"""Largest distance of the bulb from the holder's axis, in m, at success. Our choice."""
 TIGHT = 0.1
-"""Torque of the hand on the bulb, in N m, at success."""
+"""Smallest torque of the hand on the bulb, in N m, at success. Our choice."""
 STARTS = ("hand", "holder")
+"""Where the bulb can be at the start: between the fingers, or in the holder."""
 SCREWED_IN = 0.0015
-"""Mean depth of a bulb that starts in the holder below the first contact of the threads, in m."""
+"""Mean depth of a bulb that starts in the holder below the first contact of the threads, in m. Our choice."""
 SUNK = 2.2e-4
-"""Distance, in m, by which a bulb that rests on the thread sits lower than the middle of the groove."""
+"""Distance, in m, by which a bulb that rests on the thread sits lower than the middle of the groove. Set once; not tuned."""
 OVER_BULB = 0.17
-"""Height of the tool over the table, in m, at the start over a bulb in the holder."""
-OPEN = 0.04
+"""Height of the tool over the table, in m, at the start over a bulb in the holder. Set once; not tuned."""
+OPEN = FINGER_RANGE[1]
 """Distance of each open finger from the middle, in m: the Panda's limit."""
 
 
@@ -61,7 +63,7 @@ class BulbInstallationEnv(ScrewingEnv):
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - holder: xy +-50 mm around (0.5, 0) m
 
-    The gripper starts 120 mm above the table, wound up; the bulb's place in it is fixed.
+    The gripper starts 120 mm above the table, its wrist turned back by 200 degrees; the bulb's place in it is fixed.
 
     **Success Conditions:** held for 0.5 s
     - the cap is within 0.5 mm of the holder's contact
@@ -79,8 +81,8 @@ class BulbInstallationEnv(ScrewingEnv):
     grips_round_parts = True
     grip_indentation = 1.5e-3  # m; tuned: with 1.27e-3 two of four demonstrations fail
     contacts = CONTACTS | dict(
-        enable_pcm=False,  # persistent manifolds make a tight thread rattle, and so lose its friction
-        contact_offset=4e-5,  # m; without them, what moves further than twice that in a physics step slips through a thread
+        enable_pcm=False,  # with persistent manifolds, a tight thread rattles and so loses its friction
+        contact_offset=4e-5,  # m; what moves further than twice this in a physics step slips through a thread
     )
 
     def __init__(self, *args, start: str = "hand", control_mode: str | None = None, **kwargs):

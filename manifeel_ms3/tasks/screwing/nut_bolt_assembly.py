@@ -8,9 +8,9 @@ from manifeel_ms3.tasks.registry import register_task
 from .base import ScrewingEnv
 
 ON_AXIS = 1.0e-3
-"""Distance of the nut from the bolt's axis, in m, at success."""
+"""Largest distance of the nut from the bolt's axis, in m, at success. Our choice."""
 MAX_TILT = np.deg2rad(2.0)
-"""Angle, in rad, between the axes of nut and bolt at success."""
+"""Largest angle, in rad, between the axes of nut and bolt at success. Our choice."""
 
 
 @register_task(
@@ -29,13 +29,13 @@ class NutBoltAssemblyEnv(ScrewingEnv):
     """Screw an M16 nut onto a bolt.
 
     **Task Description:**
-    The gripper holds an M16 nut and screws it onto a bolt that stands up. Both have real threads, 2 mm of pitch. The hand turns
-    310 degrees at most; then it lets go, turns back, and takes the nut again.
+    The gripper holds an M16 nut and screws it onto a bolt that stands up. Both have real threads with a pitch of 2 mm. The
+    hand turns 310 degrees at most; then it lets go, turns back, and takes the nut again.
 
     **Randomizations:** (half ranges; the argument `randomization` overrides them)
     - bolt: xy +-50 mm around (0.5, 0) m
 
-    The gripper starts 120 mm above the table, wound up; the nut's place in it is fixed.
+    The gripper starts 120 mm above the table, its wrist turned back by 200 degrees; the nut's place in it is fixed.
 
     **Success Conditions:** held for 0.5 s
     - the nut is 1.5 pitches down from where the threads first meet
