@@ -38,7 +38,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class PolicyRequest:
-    """What one episode asks of a policy that answers several episodes at once."""
+    """The request of one episode for actions, to a policy that answers several episodes at once."""
 
     seed: int
     """Seed of the episode."""
@@ -49,23 +49,25 @@ class PolicyRequest:
 
 
 Ask = Callable[[PolicyRequest], np.ndarray]
-"""Function that returns the answer to a question; what an answer is, the policy and its part beside the episode agree on."""
+"""Function that sends a request to the policy and returns its answer, an array whose form the policy and its part beside the
+episode agree on."""
 
 
 class BatchPolicy(Protocol):
-    """A policy of which one object answers all episodes, in batches: one network on one device.
+    """A policy of which one object answers the requests of all episodes in batches: one network on one device.
 
-    It keeps nothing of an episode. What an episode must remember is kept by its part beside the episode, which
-    `make_episode_part` makes in the process that simulates. A registered policy (`manifeel.policies`) may be one.
+    The object keeps no state of an episode. This state is kept by the policy's part beside the episode, which
+    `make_episode_part` makes in the process that simulates. A registered policy (`manifeel.policies`) may be a `BatchPolicy`.
     """
 
     make_episode_part: Callable[[Ask], Policy]
-    """Makes the part of the policy that runs beside an episode, a `Policy`, from the function that it asks. It is pickled."""
+    """Function that makes the part of the policy that runs beside an episode, a `Policy`. It takes the function to which this
+    part gives its requests, and is pickled."""
     batch_size: int
-    """Number of questions that are answered together."""
+    """Largest number of requests that are answered together."""
 
-    def answer(self, questions: list[PolicyRequest]) -> list[np.ndarray]:
-        """One answer for each question; it depends on the question alone, not on those beside it."""
+    def answer(self, requests: list[PolicyRequest]) -> list[np.ndarray]:
+        """One answer for each request; it depends on this request only, not on the others in the batch."""
         ...
 
 
@@ -74,7 +76,7 @@ class PolicyError(InvalidArgumentError):
 
 
 class PolicyUnavailableError(ServerError):
-    """The policy cannot be asked, for a reason that is not its own: its server is not running, or does not keep episodes apart.
+    """The policy cannot be reached through no fault of its own: its server is not running, or does not keep episodes apart.
 
     It ends the evaluation. Any other error of a policy is its own fault and fails the episode.
     """
