@@ -1,5 +1,6 @@
 """Reading and writing of files: a file that is written appears whole or not at all, whenever the program is killed."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -18,6 +19,8 @@ PARTIAL = ".partial"
 """End of the name of a file or folder that is being written, or deleted."""
 SHOWN_LENGTH = 200
 """Number of characters of a schema's complaint that an error message shows; the complaint quotes the whole content."""
+HASH_BLOCK = 2**20
+"""Number of bytes that are read at a time for a hash; set once, not tuned."""
 
 
 class FileWriteError(ManifeelError, OSError):
@@ -55,9 +58,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             _delete_abandoned(path)
             yield partial
-            _flush(partial)
+            flush(partial)
             partial.replace(path)
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         _delete(partial)
 
@@ -82,7 +85,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
             _delete_abandoned(path)
             yield partial
             for entry in (*partial.rglob("*"), partial):
-                _flush(entry)
+                flush(entry)
             if replace and path.exists():
                 path.rename(old)
             try:
@@ -91,7 +94,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
                 if old.exists():
                     old.rename(path)
                 raise
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         _delete(partial)
         _delete(old)
@@ -165,6 +168,23 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     return found
 
 
+def file_hash(*paths: Path) -> str:
+    """SHA-256 of the contents of files, one after the other, in hexadecimal digits.
+
+    Args:
+        paths: Paths of the files.
+
+    Raises:
+        OSError: A file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(HASH_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
 def move(source: Path, target: Path) -> None:
     """Rename a file or a folder, and let the new name reach the disk.
 
@@ -173,7 +193,7 @@ def move(source: Path, target: Path) -> None:
     """
     try:
         source.replace(target)
-        _flush(target.parent)
+        flush(target.parent)
     except OSError as error:
         raise FileWriteError(
             f"{source} cannot be moved to {target} ({error}); get the permission, or give another path"
@@ -239,8 +259,12 @@ def _not(path: Path, kind: str, reason: str) -> str:
     return f"{path} is not {kind} ({reason}); copy it or make it again"
 
 
-def _flush(path: Path) -> None:
-    """Let a file, or the entries of a folder, reach the disk."""
+def flush(path: Path) -> None:
+    """Write a file, or the entries of a folder, from the system's cache to the disk (fsync).
+
+    Raises:
+        OSError: The path cannot be opened or written.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

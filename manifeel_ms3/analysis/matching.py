@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition
 from .paper import SCRATCH
-from .presets import PAPER, TrainingSettings, has_presets_encoder, training_settings_of
+from .presets import TrainingSettings, has_presets_encoder, training_settings_of
 from .protocol import ConditionResults
 
 Found = Mapping[Condition, ConditionResults]
@@ -44,7 +44,7 @@ def answering_all(wanted: Sequence[Condition], found: Found) -> dict[TrainingSet
     """The conditions that answer for several of the paper, in each set-up that has all of them; the paper's preset is first."""
     answers = [answering(condition, found) for condition in wanted]
     common = set.intersection(*(set(one) for one in answers))
-    in_order = sorted(common, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+    in_order = sorted(common, key=lambda setup: setup.sort_key)
     return {setup: [one[setup] for one in answers] for setup in in_order}
 
 

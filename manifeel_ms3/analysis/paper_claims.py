@@ -7,6 +7,7 @@ from itertools import chain
 from .condition import Condition
 from .paper import (
     DIM,
+    DP,
     EQUIDP,
     FM,
     MODES,
@@ -63,7 +64,7 @@ def _picture_claims() -> Iterator[Comparison]:
         if task != "PegInsertion":  # there, the paper found a gain of seven points
             claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg"
             yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION), gain=False)
-    for policy in ("diffusion_policy", EQUIDP, FM):
+    for policy in (DP, EQUIDP, FM):
         with_picture, without = (paper_condition("GearAssembly", mode, policy) for mode in (TACRGB, VISION))
         yield Comparison("3. TacRGB takes success away on gear, with every policy", without, with_picture)
 
@@ -72,7 +73,7 @@ def _policy_claims() -> Iterator[Comparison]:
     for task in tasks_in_table("II"):
         exploration = task in tasks_in_table("II", "exploration")
         for mode in MODES:
-            dp, equidp, fm = (paper_condition(task, mode, policy) for policy in ("diffusion_policy", EQUIDP, FM))
+            dp, equidp, fm = (paper_condition(task, mode, policy) for policy in (DP, EQUIDP, FM))
             yield Comparison("4. Flow Matching is below Diffusion Policy", dp, fm)
             if exploration:
                 yield Comparison("5. Equivariant Diffusion Policy is below on search and sorting", dp, equidp)

@@ -80,7 +80,7 @@ def _setups(found: Found) -> list[TrainingSettings]:
     wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
     wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
     setups = {setup for condition in wanted for setup in answering(condition, found)}
-    return sorted(setups, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+    return sorted(setups, key=lambda setup: setup.sort_key)
 
 
 Rows = Mapping[tuple[str, str], tuple[Rate, ...]]

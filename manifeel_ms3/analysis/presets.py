@@ -36,6 +36,11 @@ class TrainingSettings:
     changes: Settings
     """Settings that differ from the preset's, or all of them where there is no preset."""
 
+    @property
+    def sort_key(self) -> tuple[bool, int, str]:
+        """Key that puts the paper's preset first, and settings with fewer changes before those with more."""
+        return self.preset != PAPER, len(self.changes), str(self)
+
     def __str__(self) -> str:
         changes = [f"{name} {value.strip(chr(34))}" for name, value in self.changes]
         return ", ".join(filter(None, (self.preset, *changes))) or NOT_RECORDED

@@ -20,7 +20,7 @@ from .estimates import TAILS, Estimate, resampled_success
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import reported
-from .presets import PAPER, TrainingSettings
+from .presets import TrainingSettings
 from .protocol import ConditionResults
 
 FEWEST = 3
@@ -127,7 +127,7 @@ def _ranked_by_table(found: Found) -> Iterator[tuple[str, TrainingSettings, list
         for setup, condition in answering(wanted, found).items():
             by_table.setdefault(table, {}).setdefault(setup, []).append(Ranked(condition, rate.mean, found[condition]))
     for table, setups in by_table.items():
-        for setup in sorted(setups, key=lambda one: (one.preset != PAPER, len(one.changes), str(one))):
+        for setup in sorted(setups, key=lambda one: one.sort_key):
             yield table, setup, setups[setup]
 
 

@@ -17,10 +17,11 @@ from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
+from .formats.h5_checks import POSE_SIZE
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
-POSE = slice(0, 7)
+POSE = slice(0, POSE_SIZE)
 """Part of an actor's state that is its pose: position (m) and quaternion wxyz."""
 
 

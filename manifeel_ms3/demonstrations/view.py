@@ -22,6 +22,7 @@ import tyro
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, PandaGelSight
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import MachineError
+from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
@@ -29,8 +30,6 @@ from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_he
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches; Rerun's own default is every address of the machine, without a password."""
 FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
 """Names of the components of the force on a whole pad, in the order of the force field's channels."""
 JOINTS = tuple(PandaGelSight.arm_joint_names)
@@ -92,6 +91,8 @@ def main(args: Args) -> None:
 
 def viewer_command(file: Path, web_port: int | None) -> list[str]:
     """Command that shows a .rrd file in Rerun's viewer and listens on the loopback address only.
+
+    By default, Rerun would listen on every address of the machine, without a password.
 
     Args:
         file: Path of the .rrd file.

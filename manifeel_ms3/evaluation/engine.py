@@ -15,7 +15,7 @@ from manifeel_ms3.tasks.obs_modes import announce_images_of_workers
 from manifeel_ms3.tasks.registry import make_env
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
-from .policy import Policy, PolicySource
+from .policy import STEP_TIMEOUT, Policy, PolicySource
 from .policy_process import PolicyProcess, SharedPolicy
 from .redaction import secrets_in, without_secrets
 from .rollout import EpisodeOutcome, evaluate_episode, failed_outcome
@@ -35,7 +35,7 @@ class Evaluation:
     """Configuration of the policy; the result holds it without paths, passwords and tokens."""
     stop_at_success: bool = False
     """Whether episodes end at success or failure instead of at the time limit."""
-    step_timeout: float = 60.0
+    step_timeout: float = STEP_TIMEOUT
     """Longest time that the policy may take for one action, in s."""
 
 

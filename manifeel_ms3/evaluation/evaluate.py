@@ -34,7 +34,7 @@ from .checkpoint_config import CheckpointError, checkpoint_config
 from .engine import Evaluation, run_episodes
 from .entries import Entry, find_entry
 from .journal import Journal
-from .policy import BATCH_SIZES, PolicySource, checked_device
+from .policy import BATCH_SIZES, STEP_TIMEOUT, PolicySource, checked_device
 from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
@@ -96,7 +96,7 @@ class Args:
     stop_at_success: bool = False
     """End an episode at success or failure, which is cheaper; the result then lacks success_at_end and fail_at_end. Without
     this flag every episode runs to the time limit of the task, as in ManiSkill's evaluation."""
-    step_timeout: float = 60.0
+    step_timeout: float = STEP_TIMEOUT
     """Longest time that the policy may take for one action, in s."""
     env_kwargs: str = "{}"
     """Arguments of the task as json, such as '{"fit": "tight"}'."""

@@ -13,10 +13,14 @@ import torch
 
 from manifeel_ms3 import plugins
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
+from manifeel_ms3.files import file_hash
 from manifeel_ms3.typed_modules import look_in_working_folder
 
-from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash, file_hash
+from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash
 from .redaction import redacted
+
+STEP_TIMEOUT = 60.0
+"""Longest time in s that a policy may take for one action if no other time is given; set once, not tuned."""
 
 
 class Policy(Protocol):
@@ -98,7 +102,7 @@ class PolicySource:
     """Device that computes a checkpoint's policy, such as "cpu" or "cuda"."""
     batch_size: int | None = None
     """Number of episodes that a checkpoint's policy answers together."""
-    answer_timeout: float = 60.0
+    answer_timeout: float = STEP_TIMEOUT
     """Longest time in s that a server may take for an answer."""
 
     @property

@@ -37,7 +37,7 @@ from mani_skill.utils import common
 
 from manifeel_ms3.errors import InvalidArgumentError, ServerError
 
-from .policy import PolicyUnavailableError
+from .policy import STEP_TIMEOUT, PolicyUnavailableError
 
 EPISODE = "X-Episode"
 """Header that names the episode."""
@@ -72,7 +72,7 @@ class RemotePolicy:
         InvalidArgumentError: The address is not one.
     """
 
-    def __init__(self, address: str, timeout: float = 60.0):
+    def __init__(self, address: str, timeout: float = STEP_TIMEOUT):
         parts = _parts_of(address)
         login, _, host = parts.netloc.rpartition("@")
         self.address, self.timeout = parts._replace(netloc=host).geturl().rstrip("/"), timeout

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
+from manifeel_ms3.analysis.protocol import FEWEST_EPISODES
 from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
@@ -16,8 +17,8 @@ from .rerun import INVENTED
 from .submission import Submission, SubmissionError
 from .untrusted import quoted
 
-EPISODES = 50
-"""Number of evaluation episodes of a result, as in the paper."""
+EPISODES = FEWEST_EPISODES
+"""Number of evaluation episodes of a result: that of the paper's protocol."""
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 MOST_FORCE = 500.0

@@ -12,6 +12,7 @@ from typing import Any
 import jsonschema
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.evaluation.entries import ABOUT as ABOUT_NAME
 from manifeel_ms3.evaluation.result import check_result
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.paths import data_dir
@@ -19,8 +20,8 @@ from manifeel_ms3.paths import data_dir
 from .text import is_safe_link
 from .untrusted import FolderReader, UntrustedFileError, parse_json, quoted
 
-ABOUT, RERUN = Path("submission.json"), Path("rerun.json")
-"""What the submission is, by its authors; and which episodes the leaderboard ran again."""
+ABOUT, RERUN = Path(ABOUT_NAME), Path("rerun.json")
+"""Files of a submission: its description by the authors, and the episodes that the leaderboard ran again."""
 SHOWN_FAULTS = 20
 """Number of faults that a message lists."""
 

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 from manifeel_ms3.errors import FileExistsAlreadyError
-from manifeel_ms3.files import FileWriteError, atomic_write
+from manifeel_ms3.files import FileWriteError, atomic_write, flush
 from manifeel_ms3.ownership import owned
 
 from .submission import RERUN, Rerun, Submission, SubmissionError
@@ -49,9 +49,10 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
             for path, content in contents.items():
                 with atomic_write(incoming / path) as partial:
                     partial.write_bytes(content)
-            _flush(incoming, *{incoming / parent for path in contents for parent in path.parents})
+            for folder in {incoming / parent for path in contents for parent in path.parents}:
+                flush(folder)
             incoming.rename(target)
-            _flush(board)
+            flush(board)
         except FileWriteError:
             raise
         except OSError as error:
@@ -59,13 +60,3 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
         finally:
             shutil.rmtree(incoming, ignore_errors=True)
     return target
-
-
-def _flush(*folders: Path) -> None:
-    """Let the entries of folders reach the disk."""
-    for folder in folders:
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -28,12 +28,11 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from manifeel_ms3.errors import MachineError
+from manifeel_ms3.network import LOOPBACK_NAMES
 
 log = logging.getLogger(__name__)
 TOKEN_BYTES = 16
 """Length of the token in bytes: 128 bits, which nobody guesses."""
-LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-"""Names under which only this machine reaches itself."""
 ANY_ADDRESS = frozenset({"0.0.0.0", "::", ""})
 """Values of `host` that stand for all addresses of this machine."""
 
