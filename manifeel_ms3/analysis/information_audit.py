@@ -60,6 +60,8 @@ COLOURS = ("#8a8f98", "#c7793a", "#3a74c7")
 """Colours of the bars, in the order of MODALITIES."""
 HEADROOM = 1.05
 """Upper end of an axis of shares, so that the line of an interval at 100 % is visible."""
+CAP_SIZE = 3
+"""Size of the caps at the ends of an interval, in points (matplotlib's `capsize`)."""
 DPI = 130
 """Resolution of the figure, in pixels per inch."""
 
@@ -284,7 +286,7 @@ def draw_figure(results: list[ProbeResult], path: Path) -> None:
         score = np.array([result.score for result in group]) * factor
         ends = np.array([result.interval for result in group]).T * factor
         ax.bar(places, score, color=COLOURS)
-        ax.errorbar(places, score, np.abs(ends - score), fmt="none", ecolor="black", capsize=3, lw=1)
+        ax.errorbar(places, score, np.abs(ends - score), fmt="none", ecolor="black", capsize=CAP_SIZE, lw=1)
         ax.axhline(group[0].chance * factor, color="black", ls=":", lw=1)
         ax.set_xticks(places, list(MODALITIES.values()), fontsize=FONT_SIZE)
         ax.set_ylabel(f"RMSE, {group[0].unit}" if group[0].unit else "right answers, %", fontsize=FONT_SIZE)

@@ -9,11 +9,9 @@ from mani_skill.utils import common
 
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks import VisuotactileEnv
+from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
 from .formats.maniskill_h5_writing import Episode
-
-FORCE_DECIMALS = 3
-"""Decimals of a peak force in the json, in N: millinewtons, far below what matters in contact."""
 
 
 def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:

@@ -20,6 +20,8 @@ WIDTH = 28
 """Number of characters of a sparkline and of the longest bar of a histogram."""
 NUM_SHOWN = 12
 """Number of episodes, and of arrays, that are listed one by one."""
+LEAST_TOP = 1e-9
+"""Smallest value that the highest bar of a sparkline may stand for, so that nothing is divided by 0."""
 FORCE_EDGES = (0, 0.5, 1, 2, 5, 10, 20, 40, 60, np.inf)
 """Edges of the histogram's bins in N, in steps of about 2; demonstrations stay under 60 N."""
 
@@ -39,7 +41,7 @@ def sparkline(values: np.ndarray, top: float) -> str:
     if len(values) == 0:
         return ""
     stretches = np.array_split(values, min(WIDTH, len(values)))
-    levels = [round(min(max(stretch.max() / max(top, 1e-9), 0), 1) * (len(BARS) - 1)) for stretch in stretches]
+    levels = [round(min(max(stretch.max() / max(top, LEAST_TOP), 0), 1) * (len(BARS) - 1)) for stretch in stretches]
     return "".join(BARS[level] for level in levels)
 
 

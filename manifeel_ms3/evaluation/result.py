@@ -16,7 +16,7 @@ from manifeel_ms3.tasks.registry import task_spec
 
 from .gentle import is_gentle
 from .redaction import redacted
-from .rollout import ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
+from .rollout import MEAN_DECIMALS, ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
 from .statistics import wilson_interval
 
 RESULT_SCHEMA = "manifeel-evaluation-3"
@@ -32,8 +32,10 @@ PRIVATE = ("policy_name", "policy_kwargs")
 """Entries of a policy's configuration that come from the command line, and may hold passwords and tokens."""
 MEANS = ("return", "reward", "episode_len")
 """Numbers of an episode whose means a result holds."""
+RATE_DECIMALS = 4
+"""Decimals of the ends of a success rate's interval in a file; the interval is wider by far."""
 LONGEST_MESSAGE = 300
-"""Characters of a message of jsonschema that are shown; the rest repeats the faulty data."""
+"""Number of characters of a message of jsonschema that are shown; the rest repeats the faulty data. Set once, not tuned."""
 
 
 class ResultError(InvalidFileError):
@@ -98,12 +100,12 @@ def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dic
     if force_limit is not None:
         gentle = [is_gentle(episode, force_limit) for episode in episodes]
         summary |= dict(force_limit=force_limit, gentle_success=_rate(gentle))
-    return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), 6) for name in MEANS}
+    return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), MEAN_DECIMALS) for name in MEANS}
 
 
 def _rate(happened: list[bool]) -> dict[str, float]:
     low, high = wilson_interval(sum(happened), len(happened))
-    return dict(rate=sum(happened) / len(happened), low=round(low, 4), high=round(high, 4))
+    return dict(rate=sum(happened) / len(happened), low=round(low, RATE_DECIMALS), high=round(high, RATE_DECIMALS))
 
 
 def write_result(result: dict[str, Any], path: Path) -> None:

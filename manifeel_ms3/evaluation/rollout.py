@@ -14,11 +14,15 @@ import numpy as np
 
 from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
 from .policy import Policy, PolicyUnavailableError
 
 HANGS_FOR_GOOD = 10.0
-"""Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
+"""Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts; set
+once, not tuned."""
+MEAN_DECIMALS, TIME_DECIMALS = 6, 3
+"""Decimals of rewards and means in a result, and of times in ms; finer than any comparison needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,7 +175,7 @@ class _Metrics:
         self.success, self.fail = bool(info["success"]), bool(info["fail"])
         self.fail_once |= self.fail
         if self.success and self.first_success is None:
-            self.first_success, self.force_until_success = self.steps, round(self.peak, 3)
+            self.first_success, self.force_until_success = self.steps, round(self.peak, FORCE_DECIMALS)
 
     def outcome(self, to_the_end: bool, error: str | None, shortcoming: str) -> EpisodeOutcome:
         """The outcome; with an error the episode has failed, whatever was reached before.
@@ -190,12 +194,12 @@ class _Metrics:
             fail_once=self.fail_once,
             fail_at_end=self.fail if to_the_end else None,
             first_success=self.first_success if won else None,
-            return_=round(self.returned, 6),
-            reward=round(self.returned / max(self.steps, 1), 6),
+            return_=round(self.returned, MEAN_DECIMALS),
+            reward=round(self.returned / max(self.steps, 1), MEAN_DECIMALS),
             episode_len=self.steps,
-            peak_contact_force=round(self.peak, 3),
+            peak_contact_force=round(self.peak, FORCE_DECIMALS),
             force_until_success=self.force_until_success if won else None,
-            inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), 3),
+            inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), TIME_DECIMALS),
             ending=ending,
             error=error,
         )

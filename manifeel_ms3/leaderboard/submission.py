@@ -23,7 +23,9 @@ from .untrusted import FolderReader, UntrustedFileError, parse_json, quoted
 ABOUT, RERUN = Path(ABOUT_NAME), Path("rerun.json")
 """Files of a submission: its description by the authors, and the episodes that the leaderboard ran again."""
 SHOWN_FAULTS = 20
-"""Number of faults that a message lists."""
+"""Largest number of faults that a message lists."""
+SHOWN_FOREIGN = 3
+"""Largest number of unknown files that a message lists."""
 
 
 class SubmissionError(InvalidFileError):
@@ -124,7 +126,8 @@ def read_submission(folder: Path) -> Submission:
     if about is None or faults:
         raise SubmissionError(folder, faults)
     if foreign := sorted(set(about.checkpoints) - {path.as_posix() for path in results}):
-        raise SubmissionError(folder, [f"{ABOUT} names checkpoints of {foreign[:3]}, which are no result files here"])
+        faults = [f"{ABOUT} names checkpoints of {foreign[:SHOWN_FOREIGN]}, which are no result files here"]
+        raise SubmissionError(folder, faults)
     shown = {path: content for path, content in read.contents.items() if path in results or _is_video(path)}
     return Submission(folder, about, results, {ABOUT: read.contents[ABOUT]} | shown, rerun)
 

@@ -5,6 +5,8 @@ from urllib.parse import urlsplit
 
 LONGEST_SHOWN = 200
 """Largest number of characters of a text that is shown."""
+CUT = "..."
+"""End of a text that was cut off."""
 LINK = re.compile(r"https?://[A-Za-z0-9\-._~:/?#!$&'*+,;=%]+")
 """A web address without a user name, and without the characters that end a link in Markdown; the rest is percent-encoded."""
 ENTITIES = {character: f"&#{ord(character)};" for character in "&<>\"'|~$@^"}
@@ -14,7 +16,7 @@ ESCAPES = {character: f"\\{character}" for character in "\\`*_{}[]#!"}
 def one_line(text: str) -> str:
     """The text in one line, without control characters and those that turn the direction of writing, at most so long."""
     kept = " ".join("".join(letter if letter.isprintable() else " " for letter in text[: 2 * LONGEST_SHOWN]).split())
-    return kept if len(kept) <= LONGEST_SHOWN else kept[: LONGEST_SHOWN - 3] + "..."
+    return kept if len(kept) <= LONGEST_SHOWN else kept[: LONGEST_SHOWN - len(CUT)] + CUT
 
 
 def markdown_text(text: str) -> str:
