@@ -1,4 +1,4 @@
-"""Reading and writing of files: a file that is written appears whole or not at all, whenever the program is killed."""
+"""Reading and writing of files: a file appears as a whole or not at all, even if the program is killed while it writes."""
 
 import hashlib
 import json
@@ -16,9 +16,9 @@ import jsonschema
 from .errors import InvalidFileError, ManifeelError
 
 PARTIAL = ".partial"
-"""End of the name of a file or folder that is being written, or deleted."""
+"""End of the name of a file or folder while it is written or deleted."""
 SHOWN_LENGTH = 200
-"""Number of characters of a schema's complaint that an error message shows; the complaint quotes the whole content."""
+"""Number of characters that a message shows of an error of jsonschema, which quotes the whole content; set once, not tuned."""
 HASH_BLOCK = 2**20
 """Number of bytes that are read at a time for a hash; set once, not tuned."""
 
@@ -29,7 +29,7 @@ class FileWriteError(ManifeelError, OSError):
 
 @contextmanager
 def _failures_named(path: Path) -> Iterator[None]:
-    """Turn a failure of the file system into an error that names the path which is written."""
+    """Turn a failure of the file system into an error that names the path that was to be written."""
     try:
         yield
     except OSError as error:
@@ -130,7 +130,7 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
     Args:
         path: Path of the file.
         schema: Json schema that the content must fulfil.
-        kind: What the file should be, with its article, for the error message: "a manifest".
+        kind: What the file should be, with its article, for the error message, such as "a manifest".
 
     Raises:
         InvalidFileError: The file cannot be read, is not json, or has another form.
@@ -146,9 +146,9 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects in a file that has one in each line, such as a log.
+    """The objects in a file that holds one json object per line, such as a log.
 
-    Lines that are no objects are left out, such as an incomplete one, left by a killed process.
+    Lines that hold no json object are skipped, such as an incomplete line that a killed process left.
 
     Args:
         path: Path of the file, which need not exist.
@@ -186,10 +186,10 @@ def file_hash(*paths: Path) -> str:
 
 
 def move(source: Path, target: Path) -> None:
-    """Rename a file or a folder, and let the new name reach the disk.
+    """Rename a file or a folder, and write the new name to the disk.
 
     Raises:
-        FileWriteError: It cannot be renamed.
+        FileWriteError: The file or folder cannot be renamed.
     """
     try:
         source.replace(target)
@@ -241,7 +241,7 @@ def _delete_abandoned(path: Path) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether this machine has a process of a number.
+    """Whether a process with a given number (PID) runs on this machine.
 
     Args:
         process: Number of the process.
@@ -250,7 +250,7 @@ def is_running(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # another user's
+    except OSError:  # the process belongs to another user
         pass
     return True
 

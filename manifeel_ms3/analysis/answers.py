@@ -1,4 +1,4 @@
-"""What touch adds, task by task: a paragraph of numbers for each task that was run with touch and without."""
+"""What touch adds, task by task: a paragraph of numbers for each task that was run both with and without touch."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -13,7 +13,7 @@ from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
 from .presets import TrainingSettings
 
 SIGNIFICANCE = 0.05
-"""Value of p below which a gain is not called a matter of chance; the field's convention, as the intervals of 95 %."""
+"""p-value below which a gain does not count as chance: the field's convention, like intervals of 95 %."""
 
 TEXT = """
 ## What touch adds, and how episodes fail
@@ -23,10 +23,11 @@ of the task. What camera and touch could tell at all is in the [audit](audit.md)
 
 """
 NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
+"""Names of the observation modes in the text."""
 
 
 def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
-    """Markdown, part by part; nothing where no task was run with touch and without.
+    """Markdown, part by part; nothing if no task was run both with and without touch.
 
     Args:
         found: The results that enter comparisons.

@@ -18,7 +18,7 @@ from .success_curves import PANEL
 COLUMNS = 3
 """Largest number of panels side by side."""
 FORCES = 200
-"""Number of points of a curve."""
+"""Number of points of a curve; set once, not tuned."""
 CURVE_WIDTH = 1.8
 """Width of a curve, in points."""
 MARGIN = 1.1

@@ -59,7 +59,7 @@ def _touch_claims() -> Iterator[Comparison]:
 
 
 def _picture_claims() -> Iterator[Comparison]:
-    """What TacRGB does where its pictures do not matter."""
+    """The claims about TacRGB in tasks that its pictures do not help."""
     for task in tasks_in_table("I", "insertion", "screwing"):
         if task != "PegInsertion":  # there, the paper found a gain of seven points
             claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg"
@@ -84,7 +84,7 @@ def _policy_claims() -> Iterator[Comparison]:
 def _encoder_claims() -> Iterator[Comparison]:
     for task in tasks_in_table("III"):
         scratch, unit, t3 = (paper_condition(task, TACRGB, encoder=name) for name in (SCRATCH, "unit", "t3"))
-        for encoder in (unit, t3):  # says the text; in the paper's own Table III they are so in three cases of six
+        for encoder in (unit, t3):  # the text says so; in the paper's own Table III it holds in three cases of six
             yield Comparison("6. UniT and T3 are above ResNet-18 from scratch", encoder, scratch)
     scratch, anytouch = (paper_condition("GearAssembly", TACRGB, encoder=name) for name in (SCRATCH, "anytouch"))
     yield Comparison("6. AnyTouch is below ResNet-18 from scratch on gear", scratch, anytouch)

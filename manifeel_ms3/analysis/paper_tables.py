@@ -98,7 +98,7 @@ Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
 def _rows_by_sensing(
     found: Found, files: Mapping[Condition, str], setup: TrainingSettings, rows: Rows
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
-    """Task and policy, and a cell for each observation mode; only rows in which something was run."""
+    """Task and policy, and a cell for each observation mode; only rows of which some condition was run."""
     for (task, policy), rates in rows.items():
         answers = [answering(paper_condition(task, mode, policy), found).get(setup) for mode in MODES]
         if any(answers):
@@ -110,7 +110,7 @@ def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: Traini
     for task in tasks_in_table("III"):
         wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
         answers = {name: answering(condition, found).get(setup) for name, condition in wanted.items()}
-        if sum(answer is not None for answer in answers.values()) > 1:  # one alone compares nothing
+        if sum(answer is not None for answer in answers.values()) > 1:  # a single encoder compares nothing
             yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
 
 

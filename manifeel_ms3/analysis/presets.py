@@ -18,6 +18,7 @@ PAPER_PRECISION = {"precision": json.dumps("fp32")}
 NOT_RECORDED = "not recorded"
 """Value of a setting that an older version of the policy did not have."""
 NONE, A_FILE = json.dumps(None), json.dumps("a file of weights")
+"""Values of the setting `tacrgb_weights` as json: no file, and any file."""
 TACTILE_IMAGE_SIZE = {"t3": 224, "anytouch": 224}
 """Size of TacRGB images, in pixels, that the paper gives these encoders; the others have the preset's."""
 PRETRAINED = ("unit", "t3", "anytouch")

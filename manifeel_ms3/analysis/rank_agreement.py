@@ -24,7 +24,7 @@ from .presets import TrainingSettings
 from .protocol import ConditionResults
 
 FEWEST = 3
-"""Number of conditions from which on an order says something."""
+"""Smallest number of conditions whose order is compared."""
 RESAMPLES = 1000
 """Number of resamples of an interval; fewer than for a rate, since each takes an order of all conditions."""
 TEXT = """
@@ -49,7 +49,7 @@ class Ranked:
 
 
 class Agreement(Estimate):
-    """A measure of agreement with its interval of 95 %; it is no share, and not written in percent."""
+    """A measure of agreement with its interval of 95 %; it is not a share, and not written in percent."""
 
     def __str__(self) -> str:
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"

@@ -30,7 +30,7 @@ HEADROOM = 0.02
 """Part of the axis of success that lies below 0 and above 1, so that curves at its ends are visible."""
 COLUMNS = ("task", "variant", "sensing", "policy", "settings", "id", "gradient_steps", "environment_steps")
 MEASURES = ("success", "low", "high", "training_seeds", "episodes")
-"""Columns of the table: those that say what was trained, and those that say how it succeeds."""
+"""Columns of the table: those that say what was trained, and those that say how often it succeeds."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,11 @@ class Point:
     """Success of a condition after some training."""
 
     gradient_steps: int
+    """Number of gradient steps of the checkpoint."""
     environment_steps: int | None
     """Gradient steps times batch size; None if the configuration does not name the batch size."""
     success: Estimate
+    """Success rate of the checkpoint."""
     training_seeds: int
     """Number of training seeds that were evaluated after so many steps."""
     episodes: int

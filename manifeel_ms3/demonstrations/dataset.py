@@ -34,7 +34,8 @@ DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
 MANIFEST_FILE = "manifest.json"
 """Name of the manifest in its folder."""
 SMALLEST_SHARE = 0.2
-"""Share of a demonstration's size that is counted on at least, because touch and states do not shrink with the images."""
+"""Smallest share of a demonstration's full size that is expected where images are smaller, because touch and states do not
+shrink with them; set once, not tuned."""
 MANIFEST = {
     "type": "object",
     "required": ["schema", "files"],
@@ -109,10 +110,10 @@ def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
 
 
 def _check_room(args: Args, counts: dict[str, int]) -> None:
-    """Check that the disk has room for so many demonstrations of each task.
+    """Check that the disk has room for the number of demonstrations of each task.
 
     Raises:
-        MachineError: It has not.
+        MachineError: The disk has too little room.
     """
     free = shutil.disk_usage(args.out).free
     pixels = ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2

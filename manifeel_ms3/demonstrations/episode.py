@@ -1,4 +1,4 @@
-"""One episode in a simulator, with all that a trajectory file holds of it."""
+"""Running of one episode in a simulator, and collection of everything that a trajectory file holds of it."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, cast
@@ -30,8 +30,8 @@ def run_episode(
     Args:
         env: Environment with `num_envs=1`.
         seed: Seed of the reset.
-        actions: Returns the actions (A,); called after the reset.
-        on_step: Called with every observation and `info`, those of the reset included.
+        actions: Function that returns the actions (A,); it is called after the reset.
+        on_step: Function that is called with every observation and `info`, including those of the reset.
     """
     base: Any = env.unwrapped
     obs, info = env.reset(seed=seed)

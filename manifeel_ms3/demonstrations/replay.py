@@ -1,4 +1,4 @@
-"""Replay episodes from their actions, to prove that they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
+"""Replay episodes from their actions, to see if they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
 
 import logging
 import sys
@@ -89,7 +89,7 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
         return make_env(env_id, **kwargs | dict(obs_mode="none", render_backend="none"))
     except ManifeelError:
         raise
-    except Exception as error:  # arguments from a file: ManiSkill raises many kinds
+    except Exception as error:  # for arguments from a file, ManiSkill raises errors of many types
         raise DemonstrationError(
             f"{path}: {env_id} cannot be made with {kwargs} ({type(error).__name__}: {error}); record it again"
         ) from error

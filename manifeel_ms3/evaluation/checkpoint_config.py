@@ -9,11 +9,11 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import file_hash
 
 TRAINING_STATE = "training.safetensors"
-"""File that only training reads; it is deleted from older checkpoints, and is not part of their hash."""
+"""File that only training reads; it is deleted from older checkpoints, and the hash leaves it out."""
 TRAINING_LOSS = "losses/total_loss"
 """Name of the training loss in log.jsonl, the log beside the checkpoints."""
 HASHED = ("model.safetensors", "config.json")
-"""Files of a checkpoint whose contents, one after the other, its published hash is of."""
+"""Files of a checkpoint from whose contents, one after the other, its published hash is computed."""
 
 
 class CheckpointError(InvalidFileError):

@@ -76,7 +76,7 @@ class BatchPolicy(Protocol):
 
 
 class PolicyError(InvalidArgumentError):
-    """A policy of the user's own cannot be made."""
+    """A class or server that the user named as the policy cannot be made."""
 
 
 class PolicyUnavailableError(ServerError):
@@ -107,7 +107,7 @@ class PolicySource:
 
     @property
     def is_shared(self) -> bool:
-        """Whether one object may answer all episodes, as a registered policy may; each process makes one of the user's own."""
+        """Whether one object may answer all episodes, as for a checkpoint; other policies are made in each process."""
         return self.checkpoint is not None
 
     def make(self) -> Policy:
@@ -129,7 +129,7 @@ class PolicySource:
             return import_name(name)(**kwargs)
         except ManifeelError:
             raise
-        except Exception as error:  # the constructor is anybody's code
+        except Exception as error:  # the constructor may raise anything
             raise PolicyError(
                 f"{redacted(name)} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, "
                 "and its arguments as --policy-kwargs"
@@ -150,7 +150,7 @@ class PolicySource:
         try:
             spec = importlib.util.find_spec(str(self.policy).partition(":")[0])
             return file_hash(Path(spec.origin)) if spec and spec.origin else None
-        except Exception:  # packages are imported on the way; `make` names what is wrong
+        except Exception:  # the search imports packages, which may fail; `make` names the fault
             return None
 
 
@@ -160,11 +160,11 @@ take longer in the same proportion; a GPU computes 16 in the time of one."""
 
 
 def checked_device(name: str | None) -> str:
-    """A device of torch that this machine has: the given one, or a GPU if there is one and none is given.
+    """Name of a torch device that this machine has: the given one; if none is given, a GPU if there is one, else the CPU.
 
     Raises:
-        InvalidArgumentError: It is not the name of a device.
-        MachineError: This machine does not have it.
+        InvalidArgumentError: The name is not that of a device.
+        MachineError: This machine does not have the device.
     """
     if name is None:
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -176,7 +176,9 @@ def checked_device(name: str | None) -> str:
         torch.zeros(1, device=device)
     except Exception as error:  # torch's backends raise errors of many types
         reason = str(error).splitlines()[0]
-        raise MachineError(f"--device {name} is not there ({reason}); give --device cpu, or install a torch for it") from error
+        raise MachineError(
+            f"--device {name} is not there ({reason}); give --device cpu, or install a build of torch that supports it"
+        ) from error
     return name
 
 
@@ -208,7 +210,7 @@ def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:
 
 
 def import_name(name: str) -> Any:
-    """The object that "module:Name" stands for.
+    """The object that a name such as "module:Name" stands for.
 
     Only names that the user gives on the command line are imported, never a name that a file holds.
     """

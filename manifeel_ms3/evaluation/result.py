@@ -1,4 +1,4 @@
-"""Result files: an evaluation writes one, the leaderboard and the pages of results read them."""
+"""Result files: an evaluation writes one, and the leaderboard and the pages of results read them."""
 
 import json
 import math
@@ -25,7 +25,7 @@ EARLIER = {
     "manifeel-evaluation-1": "does not say the revision of the task",
     "manifeel-evaluation-2": "is of episodes that ended at success, with other time limits",
 }
-"""Earlier versions, and why results of them cannot be compared with those of today."""
+"""Earlier versions, and why their results cannot be compared with those of the present version."""
 PATHS = ("demos", "run_dir", "tacrgb_weights")
 """Entries of a policy's configuration that are paths on the machine where it was trained."""
 PRIVATE = ("policy_name", "policy_kwargs")
@@ -112,8 +112,8 @@ def write_result(result: dict[str, Any], path: Path) -> None:
     """Check that a result has the published form, and write it.
 
     Raises:
-        ResultError: It does not have the published form.
-        FileWriteError: The file cannot be written; the old one is as it was.
+        ResultError: The result does not have the published form.
+        FileWriteError: The file cannot be written; an old one stays as it was.
     """
     write_json(path, as_published(result, path))
 
@@ -126,7 +126,7 @@ def as_published(result: dict[str, Any], path: Path) -> dict[str, Any]:
         path: Path of the file, for messages.
 
     Raises:
-        ResultError: It does not have the published form.
+        ResultError: The result does not have the published form.
     """
     result = json.loads(json.dumps(result, default=str))
     check_result(result, path)
@@ -178,7 +178,7 @@ def check_result(result: Any, source: Path) -> None:
         source: Path of the file, for messages.
 
     Raises:
-        ResultError: It does not have the form; the message names the place.
+        ResultError: The result does not have the form; the message names the place.
     """
     given = result.get("schema") if isinstance(result, dict) else None
     if isinstance(given, str) and given in EARLIER:

@@ -22,9 +22,9 @@ EPISODES = FEWEST_EPISODES
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 MOST_FORCE = 500.0
-"""Contact force in N, more than the arm can press with; demonstrations stay below 60 N."""
+"""Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 60 N."""
 RATE_TOLERANCE = 1e-3
-"""Difference between numbers that count as the same, where a result rounds them to four digits."""
+"""Largest difference between rates or means that count as equal; a result rounds the ends of intervals to four decimals."""
 SHOWN = 5
 """Number of wrong seeds that a message lists."""
 SAME_OUTCOME = np.array([2 * FORCE_TOLERANCE if name in FORCES else 0 for name in COMPARED])
@@ -33,14 +33,15 @@ other."""
 
 
 def check(submission: Submission, to_take: bool = True) -> None:
-    """Check that results are of the tasks as they are now, on the evaluation seeds, of possible numbers, and no copies.
+    """Check that results are of the current tasks and the evaluation seeds, have possible numbers, and are no copies.
 
     Args:
         submission: The submission.
-        to_take: Whether it is to be taken into the leaderboard; its simulator must then be the one that is installed here.
+        to_take: Whether the submission is to be taken into the leaderboard; its simulator must then be the one that is
+            installed.
 
     Raises:
-        SubmissionError: Some results are not.
+        SubmissionError: Some results are not as required; the message says which and why.
     """
     faults = [
         f"{quoted(path)}: {fault}"

@@ -33,9 +33,9 @@ from .untrusted import quoted
 
 log = logging.getLogger(__name__)
 INVENTED = 0.1
-"""Share of invented episodes in a row of the page from which on the row must be found out."""
+"""Smallest share of invented episodes in a row of the page that must be detected."""
 CHANCE = 0.01
-"""Largest chance of such a row not to be found out."""
+"""Largest probability that such a row is not detected."""
 COINCIDENCE = 0.1
 """Assumed probability that an invented episode has the same outcome as its repetition, that is, the same success and forces
 within 0.01 N. In 14 of the 15 results under leaderboard/cpu, at most 3 of the 50 episodes have forces so near to any one value;
@@ -96,7 +96,7 @@ def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
 
 
 def name_checkpoints(submission: Submission, folders: Iterable[Path]) -> dict[str, str]:
-    """The hash of the checkpoint of each result, found by the configuration that both hold.
+    """The hash of the checkpoint of each result, found by the configuration that the result and the checkpoint hold.
 
     Raises:
         SubmissionError: A result fits none of the checkpoints, or several.
@@ -173,7 +173,9 @@ def _differing_settings(result: dict[str, Any], config: dict[str, Any]) -> list[
 
 
 def draw(submission: Submission, most: int | None, seed: int) -> dict[Path, list[int]]:
-    """Numbers of the episodes to run again, by result file: from each row of the page as many as it needs, of all its files.
+    """Draw the episodes to run again, and return their numbers, counted from 0, by result file.
+
+    From each row of the page, as many episodes are drawn as it needs, from all of its files.
 
     Args:
         submission: The submission.

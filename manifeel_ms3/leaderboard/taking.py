@@ -12,10 +12,10 @@ from manifeel_ms3.ownership import owned
 from .submission import RERUN, Rerun, Submission, SubmissionError
 
 INCOMING = ".incoming"
-"""Folder of the leaderboard that a submission is copied to before it takes its name; what is left of a copy that was killed is
-removed by the next one."""
+"""Folder of the leaderboard that a submission is copied to before it takes its name; the rest of an interrupted
+copy is removed by the next one."""
 NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
-"""Names of folders that the leaderboard takes."""
+"""Names of folders that the leaderboard takes: at most 100 letters, digits, underscores, dots and hyphens."""
 
 
 def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Path:
@@ -32,7 +32,7 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
         FileWriteError: The leaderboard's folder cannot be written.
         InUseError: Another process copies a submission.
-        SubmissionError: The name of the folder cannot be taken.
+        SubmissionError: The name of the folder has characters that are not allowed, or is too long.
     """
     name = submission.folder.resolve().name
     if not NAME.fullmatch(name):
