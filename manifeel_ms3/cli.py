@@ -4,10 +4,10 @@
     manifeel train diffusion_policy cpu --demo-path peg.h5
     manifeel --tyro-print-completion bash > ~/.local/share/bash-completion/completions/manifeel
 
-Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). If it has
-a function `next_step(args, answer)`, its text is shown at the end. Other packages add commands through the entry point group
-`manifeel.commands`. Only the module of the command that is run is imported,
-except for a shell's completion, which needs the flags of all commands.
+Each command is a module with a class `Args` and a function `main(args)`, and can also be run by itself (`python -m`). If the
+module has a function `next_step(args, answer)`, the text that it returns is shown at the end. Other packages add commands
+through the entry point group `manifeel.commands`. Only the module of the command that is run is imported, except for a shell's
+completion, which needs the flags of all commands.
 """
 
 import logging
@@ -53,11 +53,12 @@ COMMANDS = {
         "manifeel_ms3.analysis.information_audit", "Measure how well each sense answers questions about each task."
     ),
 }
+"""The package's own commands by their names."""
 
 
 @dataclass
 class _NotImported:
-    """The arguments of a command whose module is not imported, since only its name is listed."""
+    """Stands for the arguments of a command whose module is not imported, because only its name is listed."""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -26,6 +26,7 @@ TRACEBACK = "MANIFEEL_TRACEBACK"
 INTERRUPTED = 130
 """Exit code of a command that was interrupted with Ctrl-C: 128 + SIGINT, the convention of shells."""
 PACKAGE = "manifeel-ms3"
+"""Name of this package's distribution."""
 DISTRIBUTIONS = {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
 """Names of distributions by the names of their modules, where the two differ."""
 
@@ -38,9 +39,10 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
 
     Args:
         main: Function of the command.
-        args: Its only argument, as it was typed: a module before the id of a task, "my_task:MyLab-Press-v1", is imported.
-        next_step: Function from `args` and the answer of `main` to what it made and what one can do with it; this is logged
-            at the end.
+        args: Arguments of the command, as they were typed. The module that stands before the id of a task, as in
+            "my_task:MyLab-Press-v1", is imported.
+        next_step: Function that takes `args` and the return value of `main`, and returns a text that is logged at the end: what
+            the command made, and what one can do with it.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     try:
@@ -50,7 +52,7 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             log.info("%s", next_step(args, answer))
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")
-        gc.freeze()  # or else the end of the interpreter searches all objects of torch for garbage, which takes 1.4 s
+        gc.freeze()  # otherwise the interpreter searches all objects of torch for garbage as it ends, which takes 1.4 s
         return INTERRUPTED
     except ManifeelError as error:
         if os.environ.get(TRACEBACK):
@@ -92,8 +94,8 @@ def json_object(flag: str, given: str) -> dict[str, Any]:
     """Parse the value of a flag that must be a json object.
 
     Args:
-        flag: Name of the flag, for the error.
-        given: Its value.
+        flag: Name of the flag, for the error message.
+        given: Value of the flag.
 
     Raises:
         InvalidArgumentError: The value is not a json object.

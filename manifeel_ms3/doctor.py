@@ -25,9 +25,9 @@ from .paths import CACHE_DIR, writable_cache
 PYTHONS = ((3, 10), (3, 12))
 """First and last version of Python that the tests run on."""
 DISK_SPACE = 10.0
-"""Size of the paper's demonstrations with observations, in GB."""
+"""Size of the paper's demonstrations with observations, in GB: the sum over the tasks of `TaskSpec.demo_megabytes`."""
 TIMEOUT = 300
-"""Time after which a check has failed, in s."""
+"""Time in s after which a check counts as failed; set once, not tuned."""
 MAKE_WITHOUT_RENDERER = (
     "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiFeel-PegInsertion-v1', obs_mode='tacff', render_backend='none')"
 )
@@ -35,6 +35,7 @@ MAKE_WITH_IMAGES = "import gymnasium as gym, manifeel_ms3; env = gym.make('ManiF
 STEP = "; env.reset(seed=0); env.step(env.action_space.sample()); env.close()"
 RENDERER = "; from manifeel_ms3.rendering.backend import available_render_backend as found; print(found())"
 CUDA = "import torch; print(torch.cuda.get_device_name() if torch.cuda.is_available() else 'none')"
+"""Programs, and parts of programs, that the checks run in processes of their own."""
 RENDERER_REMEDY = (
     "Without a GPU: install Mesa 24.3 or newer, libvulkan1, libegl1 and libgl1, as scripts/setup.sh does. With a GPU: install "
     "its driver and libvulkan1. Until then, use obs_mode='state' or 'tacff' with render_backend='none'."
@@ -59,7 +60,7 @@ def examine(on_check: Callable[[str], None] | None = None) -> list[Finding]:
     """The findings of all checks.
 
     Args:
-        on_check: Called before each check with what is checked; some take ten seconds.
+        on_check: Function that is called before each check with the name of what is checked; some checks take ten seconds.
     """
     findings = []
     for what, check in _checks().items():
@@ -163,8 +164,8 @@ class _Ran:
 
 
 def _run(code: str) -> _Ran:
-    """Run a program in a process of its own, which imports nothing from the current folder: a file there may be of anybody."""
-    # the empty entry is the current folder; `python -P`, which leaves it out, needs Python 3.11
+    """Run a program in a process of its own, without importing from the current folder, whose files may be anybody's."""
+    # the empty entry stands for the current folder; `python -P`, which leaves it out, needs Python 3.11
     alone = "import sys; sys.path[:] = [folder for folder in sys.path if folder]"
     program = f"{alone}\ntry: {code}\nexcept Exception as error: raise SystemExit(f'{{type(error).__name__}}: {{error}}')"
     try:

@@ -39,7 +39,7 @@ class PluginError(ManifeelError, ImportError):
 
 
 class MachineError(ManifeelError, RuntimeError):
-    """This machine lacks what is asked for: a renderer, a GPU, room on the disk."""
+    """This machine lacks what is asked for, such as a renderer, a GPU or room on the disk."""
 
 
 class ServerError(ManifeelError, ConnectionError):

@@ -1,5 +1,6 @@
-"""Reading and writing of files: a file that is written appears whole or not at all, whenever the program is killed."""
+"""Reading and writing of files: a file appears as a whole or not at all, even if the program is killed while it writes."""
 
+import hashlib
 import json
 import os
 import shutil
@@ -15,9 +16,11 @@ import jsonschema
 from .errors import InvalidFileError, ManifeelError
 
 PARTIAL = ".partial"
-"""End of the name of a file or folder that is being written, or deleted."""
+"""End of the name of a file or folder while it is written or deleted."""
 SHOWN_LENGTH = 200
-"""Number of characters of a schema's complaint that an error message shows; the complaint quotes the whole content."""
+"""Number of characters that a message shows of an error of jsonschema, which quotes the whole content; set once, not tuned."""
+HASH_BLOCK = 2**20
+"""Number of bytes that are read at a time for a hash; set once, not tuned."""
 
 
 class FileWriteError(ManifeelError, OSError):
@@ -26,7 +29,7 @@ class FileWriteError(ManifeelError, OSError):
 
 @contextmanager
 def _failures_named(path: Path) -> Iterator[None]:
-    """Turn a failure of the file system into an error that names the path which is written."""
+    """Turn a failure of the file system into an error that names the path that was to be written."""
     try:
         yield
     except OSError as error:
@@ -55,9 +58,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
             path.parent.mkdir(parents=True, exist_ok=True)
             _delete_abandoned(path)
             yield partial
-            _flush(partial)
+            flush(partial)
             partial.replace(path)
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         _delete(partial)
 
@@ -82,7 +85,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
             _delete_abandoned(path)
             yield partial
             for entry in (*partial.rglob("*"), partial):
-                _flush(entry)
+                flush(entry)
             if replace and path.exists():
                 path.rename(old)
             try:
@@ -91,7 +94,7 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
                 if old.exists():
                     old.rename(path)
                 raise
-            _flush(path.parent)
+            flush(path.parent)
     finally:
         _delete(partial)
         _delete(old)
@@ -127,7 +130,7 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
     Args:
         path: Path of the file.
         schema: Json schema that the content must fulfil.
-        kind: What the file should be, with its article, for the error message: "a manifest".
+        kind: What the file should be, with its article, for the error message, such as "a manifest".
 
     Raises:
         InvalidFileError: The file cannot be read, is not json, or has another form.
@@ -143,9 +146,9 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects in a file that has one in each line, such as a log.
+    """The objects in a file that holds one json object per line, such as a log.
 
-    Lines that are no objects are left out, such as an incomplete one, left by a killed process.
+    Lines that hold no json object are skipped, such as an incomplete line that a killed process left.
 
     Args:
         path: Path of the file, which need not exist.
@@ -165,15 +168,32 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
     return found
 
 
-def move(source: Path, target: Path) -> None:
-    """Rename a file or a folder, and let the new name reach the disk.
+def file_hash(*paths: Path) -> str:
+    """SHA-256 of the contents of files, one after the other, in hexadecimal digits.
+
+    Args:
+        paths: Paths of the files.
 
     Raises:
-        FileWriteError: It cannot be renamed.
+        OSError: A file cannot be read.
+    """
+    digest = hashlib.sha256()
+    for path in paths:
+        with path.open("rb") as file:
+            while block := file.read(HASH_BLOCK):
+                digest.update(block)
+    return digest.hexdigest()
+
+
+def move(source: Path, target: Path) -> None:
+    """Rename a file or a folder, and write the new name to the disk.
+
+    Raises:
+        FileWriteError: The file or folder cannot be renamed.
     """
     try:
         source.replace(target)
-        _flush(target.parent)
+        flush(target.parent)
     except OSError as error:
         raise FileWriteError(
             f"{source} cannot be moved to {target} ({error}); get the permission, or give another path"
@@ -221,7 +241,7 @@ def _delete_abandoned(path: Path) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether this machine has a process of a number.
+    """Whether a process with a given number (PID) runs on this machine.
 
     Args:
         process: Number of the process.
@@ -230,7 +250,7 @@ def is_running(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:  # another user's
+    except OSError:  # the process belongs to another user
         pass
     return True
 
@@ -239,8 +259,12 @@ def _not(path: Path, kind: str, reason: str) -> str:
     return f"{path} is not {kind} ({reason}); copy it or make it again"
 
 
-def _flush(path: Path) -> None:
-    """Let a file, or the entries of a folder, reach the disk."""
+def flush(path: Path) -> None:
+    """Write a file, or the entries of a folder, from the system's cache to the disk (fsync).
+
+    Raises:
+        OSError: The path cannot be opened or written.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

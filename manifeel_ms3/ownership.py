@@ -1,4 +1,4 @@
-"""One process at a time works on a file or folder.
+"""Locks, so that only one process at a time works on a file or folder.
 
 The lock is advisory and belongs to the operating system (`filelock`): it ends with the process that holds it, however that
 process ends. A small json beside it names the holder, for the message that the second process gets.
@@ -41,7 +41,7 @@ def owned(path: Path) -> Iterator[None]:
     except OSError as error:
         raise MachineError(f"{path.parent} cannot be written ({error.strerror}); give another path") from error
     try:
-        with suppress(OSError):  # the name is a courtesy: the disk may be full, or the file may be of another user
+        with suppress(OSError):  # the lock works without the name: the disk may be full, or the file another user's
             _write_holder(holder)
         yield
     finally:
@@ -61,6 +61,6 @@ def _described(path: Path) -> str:
         holder = json.loads(path.read_text(encoding="utf-8"))
         if holder["host"] != socket.gethostname() or is_running(holder["pid"]):
             return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
-    except (OSError, ValueError, KeyError, TypeError, OverflowError):  # it has just begun, or has just ended
+    except (OSError, ValueError, KeyError, TypeError, OverflowError):  # the other process has just begun, or has just ended
         pass
     return "another process"

@@ -1,4 +1,4 @@
-"""Folders of the data that ships with the package, and of derived assets."""
+"""Folders of the data that ships with the package, and of assets that are derived from it once, such as simplified meshes."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ def data_dir() -> Path:
 
 
 def leaderboard_dir() -> Path:
-    """Folder of the leaderboard: that of the working folder, or else that of the clone that this package is imported from."""
+    """Folder `leaderboard` in the working folder, or else in the clone that this package is imported from."""
     here = Path("leaderboard")
     return here if here.is_dir() else _PACKAGE.parent / "leaderboard"
 
@@ -50,7 +50,7 @@ def cache_dir() -> Path:
 
 @contextmanager
 def writable_cache() -> Iterator[Path]:
-    """Context manager that makes the folder of derived assets, gives its path, and names the remedy where writing fails.
+    """Context manager that makes and yields the folder of derived assets; if writing fails, the error names the remedy.
 
     Raises:
         MachineError: The folder cannot be made, or the code in the context cannot write into it.

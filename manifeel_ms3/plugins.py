@@ -20,7 +20,7 @@ TASKS = "manifeel.tasks"
 POLICIES = "manifeel.policies"
 """Objects with a method `load(checkpoint, **kwargs)` that returns a `manifeel_ms3.evaluation.Policy`."""
 SENSORS = "manifeel.sensors"
-"""Functions from the name of a pad and of its link to a `manifeel_ms3.sensors.TactileSensorConfig`."""
+"""Functions that take the names of a pad and of its link, and return a `manifeel_ms3.sensors.TactileSensorConfig`."""
 COMMANDS = "manifeel.commands"
 """`Command` objects."""
 
@@ -66,7 +66,7 @@ def load(group: str, name: str) -> Any:
         raise UnknownNameError(f"{name!r} is not registered in {group}; registered are {list(points)}")
     try:
         return points[name].load()
-    except Exception as error:  # a plug-in is anybody's code
+    except Exception as error:  # a plug-in may raise anything
         raise PluginError(
             f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); repair "
             f"or uninstall it. Registered in {group} are {list(points)}"

@@ -7,14 +7,14 @@ from functools import partial
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 REFRESH_HZ = 2
-"""Rate in Hz at which a bar is drawn; episodes take seconds."""
+"""Rate in Hz at which a bar is drawn, which is enough because episodes take seconds."""
 
 
 def progress_bar(disable: bool = False) -> Progress:
     """A progress bar for a terminal.
 
     Args:
-        disable: Show nothing.
+        disable: Whether nothing is shown.
     """
     return Progress(
         TextColumn("{task.description}"),
@@ -32,13 +32,15 @@ def progress_bar(disable: bool = False) -> Progress:
 def episode_counter(
     description: str, total: int, done: int, on_episode: Callable[[], None] | None = None
 ) -> Iterator[Callable[[int], None]]:
-    """A context with the function to call with a number of further episodes: it calls `on_episode`, or advances a progress bar.
+    """Context manager that yields a function, which is to be called with the number of episodes that have just finished.
+
+    The function advances a progress bar, or calls `on_episode` if that is given.
 
     Args:
         description: Text beside the bar.
         total: Number of episodes.
         done: Number of episodes that are finished already.
-        on_episode: Called once for each episode instead of showing a bar.
+        on_episode: Function that is called once for each episode; a progress bar is shown if it is not given.
     """
     if on_episode is not None:
         yield partial(_repeat, on_episode)

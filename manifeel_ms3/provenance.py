@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 PACKAGES = ("manifeel-ms3", "mani-skill", "sapien", "torch")
-"""Packages whose versions a result carries."""
+"""Packages whose versions a result records."""
 
 
 def package_versions() -> dict[str, str]:
@@ -21,14 +21,14 @@ def package_versions() -> dict[str, str]:
 def git_commit() -> str | None:
     """Commit of this package's own repository.
 
-    None where the package was installed from a wheel, even if that is inside of another repository, where git is not
-    installed, or where git refuses to read a repository of another user.
+    It is None if the package was installed from a wheel, even inside another repository, if git is not installed, or if git
+    refuses to read a repository of another user.
     """
     source = Path(__file__).resolve().parents[1]
     project = source / "pyproject.toml"
     if not project.is_file() or f'name = "{PACKAGES[0]}"' not in project.read_text(encoding="utf-8").splitlines():
         return None
-    foreign = {name for name in os.environ if name.startswith("GIT_")}  # a hook of git sets GIT_DIR to its own repository
+    foreign = {name for name in os.environ if name.startswith("GIT_")}  # git sets GIT_DIR for its hooks
     environment = {name: value for name, value in os.environ.items() if name not in foreign}
     command = ["git", "rev-parse", "--show-toplevel", "HEAD"]
     try:

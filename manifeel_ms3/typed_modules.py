@@ -1,6 +1,6 @@
 """Modules that a user names on a command line, such as that of a task in the working folder: `my_task:MyLab-Press-v1`.
 
-Nothing that a file says comes here: only what is typed is imported.
+Only what a user types is imported, never a name that comes from a file.
 """
 
 import sys
@@ -13,7 +13,7 @@ from .errors import UnknownNameError
 FIELDS = ("env_id", "task", "tasks")
 """Arguments of commands that hold ids of tasks."""
 _imported: list[str] = []
-"""Names of the modules; worker processes, which are spawned, import them, too."""
+"""Names of the modules that were imported. Worker processes, which are spawned, import them again."""
 
 
 def import_typed_tasks(args: Any) -> None:
@@ -39,7 +39,7 @@ def _import_typed(module: str, env_id: str) -> None:
         import_module(module)
     except ModuleNotFoundError as error:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and imports another that is not
+            raise  # the module exists, and imports another one that does not
         raise UnknownNameError(
             f"the module {module!r} of the task {env_id!r} is neither installed nor in the working folder {Path.cwd()}"
         ) from error

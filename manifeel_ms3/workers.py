@@ -33,12 +33,12 @@ Task = TypeVar("Task")
 
 
 SAFE_PATH = "PYTHONSAFEPATH"
-"""Environment variable of Python 3.11 and later: a new interpreter does not look for modules in the current folder."""
+"""Environment variable of Python 3.11 and later, with which a new interpreter finds no modules in the current folder."""
 
 
 @contextmanager
 def _safe_path() -> Iterator[None]:
-    """Interpreters that start now do not look for modules in the current folder, where anybody's pickle.py may lie."""
+    """Context in which new interpreters find no modules in the current folder, where anybody's pickle.py may lie."""
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"
     try:
@@ -51,7 +51,7 @@ def _safe_path() -> Iterator[None]:
 
 
 class SafeProcess(SpawnProcess):
-    """A spawned process, which finds modules where this process finds them, and nowhere else, also while it starts."""
+    """A spawned process that finds modules only where this process finds them, even while it starts."""
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (the name is that of multiprocessing)
@@ -60,7 +60,7 @@ class SafeProcess(SpawnProcess):
 
 
 class SafeSpawnContext(SpawnContext):
-    """The context "spawn" of multiprocessing with processes that are `SafeProcess`es."""
+    """The context "spawn" of multiprocessing, with `SafeProcess` as its class of processes."""
 
     Process = SafeProcess
 
@@ -68,7 +68,7 @@ class SafeSpawnContext(SpawnContext):
         super().__init__()
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
         with _safe_path():
-            resource_tracker.ensure_running()  # which locks would start, and which lets Ctrl-C through again as it starts
+            resource_tracker.ensure_running()  # locks would start it later; its start unblocks Ctrl-C, hence the mask
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
@@ -76,8 +76,8 @@ class WorkerDiedError(WorkFailedError):
     """A worker process ended while it worked on a task: it was killed or crashed.
 
     Args:
-        task: The task that it worked on.
-        exit_code: Exit code of the process; minus the number of the signal that ended it.
+        task: The task that the process worked on.
+        exit_code: Exit code of the process, which is negative if a signal of that number ended it.
     """
 
     def __init__(self, task: Any, exit_code: int | None):
@@ -90,7 +90,7 @@ class WorkerDiedError(WorkFailedError):
 
 @dataclass(frozen=True)
 class Finished(Generic[Task]):
-    """A task that is over, well or badly."""
+    """A task that has ended, with a result or with an exception."""
 
     task: Task
     """The task, as it was submitted."""
@@ -116,17 +116,17 @@ class Finished(Generic[Task]):
 
 
 class WorkerPool(Generic[State, Task]):
-    """Processes that share tasks; a process that dies fails its task and is replaced.
+    """Processes that share tasks; if a process dies, its task fails and a new process takes its place.
 
     Processes are spawned, because a forked renderer does not work, and use one thread each for torch, because they share the
     cores and because sums then do not depend on the number of threads. They end when the process that made them is killed.
-    Where the context is left by an exception, such as the KeyboardInterrupt of Ctrl-C, tasks that wait are cancelled and the
-    processes are killed at once. Ctrl-C reaches the main process alone.
+    If an exception leaves the context, such as the KeyboardInterrupt of Ctrl-C, waiting tasks are cancelled and the processes
+    are killed at once. Ctrl-C reaches only the main process.
 
     Args:
         workers: Number of worker processes.
-        make_state: Makes the state of one process. It is called with the process's first task, so that what it raises is
-            raised by `Finished.result`. It must be picklable.
+        make_state: Function that makes the state of one process. It is called before the process's first task, so that its
+            exceptions are raised by `Finished.result`. It must be picklable.
 
     Raises:
         InvalidArgumentError: `workers` is less than 1.
@@ -148,7 +148,7 @@ class WorkerPool(Generic[State, Task]):
         else:
             self._pool.stop()
             for process in active_children():
-                if process.name == WORKERS_NAME:  # asked to end, it would first finish what its native code is computing
+                if process.name == WORKERS_NAME:  # a request to end would wait until native code returns
                     process.kill()
         self._pool.join()
 
@@ -168,7 +168,8 @@ class WorkerPool(Generic[State, Task]):
     def as_finished(self) -> Iterator[Finished[Task]]:
         """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile.
 
-        Of tasks that finish at the same time, those that went well come first: an error of another may end the caller.
+        Of tasks that finish at the same time, those with a result come first, because the exception of another may end the
+        caller.
         """
         while self._running:
             finished = wait(self._running, return_when=FIRST_COMPLETED).done
@@ -191,7 +192,8 @@ class _Worker:
 
 
 _this_worker: _Worker | None = None
-"""The worker of this process; None in a process that is not one. A process has no other place to keep a state."""
+"""The worker of this process; None in a process that is no worker. It is global, since a process keeps its state nowhere
+else."""
 
 
 def _start(worker: _Worker, modules: tuple[str, ...]) -> None:
@@ -204,7 +206,7 @@ def _start(worker: _Worker, modules: tuple[str, ...]) -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when the one that made it has ended, even if that was killed and could not tell."""
+    """End this process when its parent process has ended, even if that was killed and could not send a message."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()

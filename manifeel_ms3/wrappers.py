@@ -42,7 +42,7 @@ class _ObservationWrapper(gym.ObservationWrapper):
 class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
     """ManiSkill's `FlattenRGBDObservationWrapper` with touch: an observation is a dict with one entry for each modality.
 
-    - `state` (N, D): all that is not of a sensor, such as joint positions and the tool's pose.
+    - `state` (N, D): everything that no sensor observes, such as joint positions and the tool's pose.
     - `rgb` uint8 (N, H, W, 3 C) and `depth` (N, H, W, C): images of the C cameras.
     - `tacrgb` uint8 (N, H, W, 3 P): images of the P pads.
     - `tacff` float32 (N, 10, 14, 3 P): force fields of the pads, N per taxel.
@@ -56,9 +56,9 @@ class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
         state: Whether the state is included.
         tacrgb: Whether images of pads are included.
         tacff: Whether force fields are included.
-        image_size: Height and width to which `rgb` and `tacrgb` are resized, in pixels; they keep their own if not given.
-        sep_tacrgb: Whether `tacrgb` is an entry of its own. If not, its channels follow those of `rgb`, for scripts that know
-            cameras alone; the images must then have one size.
+        image_size: Height and width to which `rgb` and `tacrgb` are resized, in pixels; they keep their own size if not given.
+        sep_tacrgb: Whether `tacrgb` is an entry of its own. If not, its channels follow those of `rgb`, for scripts that only
+            know cameras; all images must then have one size.
         flat_tacff: Whether `tacff` is a vector (N, 420 P), so that ManiSkill's `FlattenObservationWrapper` can join it with the
             state.
 
@@ -105,7 +105,7 @@ class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
 
 
 class PadsAsCamerasWrapper(_ObservationWrapper):
-    """Observations as ManiSkill's own wrappers expect them, to be wrapped by these: every sensor is a camera.
+    """Observations in which every sensor is a camera, to be wrapped by ManiSkill's own wrappers.
 
     The image of a pad has the size of the cameras' images, so that their channels can be joined. Its force field is a vector
     (N, 420) in `extra`, which those wrappers make a part of the state, or in `state` if the observation has that.
@@ -116,7 +116,7 @@ class PadsAsCamerasWrapper(_ObservationWrapper):
         env: Environment whose observation mode has sensors.
 
     Raises:
-        InvalidArgumentError: The observation mode has no sensors, or asks for images of pads beside textures that pads lack.
+        InvalidArgumentError: The observation mode has no sensors, or asks for images of pads and for textures that pads lack.
     """
 
     def observation(self, observation: Any) -> Observation:
@@ -142,7 +142,7 @@ class PadsAsCamerasWrapper(_ObservationWrapper):
 
 
 def resized(images: torch.Tensor, size: tuple[int, int] | None) -> torch.Tensor:
-    """Images (N, H, W, C) at another height and width, without aliasing; as they are if no size is given."""
+    """Images (N, H, W, C) at another height and width, without aliasing; unchanged if no size is given."""
     if size is None or images.shape[1:3] == tuple(size):
         return images
     channels_first = images.permute(0, 3, 1, 2).float()

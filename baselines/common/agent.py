@@ -69,7 +69,7 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
 class PolicyAgent:
     """A trained policy: it answers several episodes at once, each from its last observations, or is the policy of one.
 
-    An answer depends on its question alone. The noise is drawn from the seed of the episode and the step. The network always
+    An answer depends on its request only. The noise is drawn from the seed of the episode and the step. The network always
     computes a full batch, in which an episode has the place that its seed says, since matrix products round differently in
     batches of another size and at other places; what stands at the other places changes nothing.
 
@@ -110,7 +110,7 @@ class PolicyAgent:
             raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a positive whole number")
         self.inference_steps = steps
         self.make_episode_part = partial(ActionChunks, self.policy.spec, self.policy.config.obs_horizon)
-        self._part = self.make_episode_part(lambda question: self.answer([question])[0])
+        self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False
 
     # ------------------------------------------------------------ as the policy of one episode
@@ -134,24 +134,24 @@ class PolicyAgent:
 
     # ------------------------------------------------------------ as the policy of many
 
-    def answer(self, questions: list[PolicyRequest]) -> list[np.ndarray]:
-        """The actions (action_horizon, A) to execute next, for each question."""
+    def answer(self, requests: list[PolicyRequest]) -> list[np.ndarray]:
+        """The actions (action_horizon, A) to execute next, for each request."""
         answers: dict[int, np.ndarray] = {}
-        left = list(range(len(questions)))
+        left = list(range(len(requests)))
         while left:
             places: dict[int, int] = {}
             for index in left:
-                places.setdefault(questions[index].seed % self.batch_size, index)
-            actions = self._predict({place: questions[index] for place, index in places.items()})
+                places.setdefault(requests[index].seed % self.batch_size, index)
+            actions = self._predict({place: requests[index] for place, index in places.items()})
             answers |= {index: actions[place] for place, index in places.items()}
             left = [index for index in left if index not in answers]
-        return [answers[index] for index in range(len(questions))]
+        return [answers[index] for index in range(len(requests))]
 
     @torch.inference_mode()
-    def _predict(self, questions: dict[int, PolicyRequest]) -> np.ndarray:
-        """Actions (batch_size, action_horizon, A), of which those at the places of questions count."""
-        filling = next(iter(questions.values()))
-        rows = [questions.get(place, filling) for place in range(self.batch_size)]
+    def _predict(self, requests: dict[int, PolicyRequest]) -> np.ndarray:
+        """Actions (batch_size, action_horizon, A), of which only those at the places of requests count."""
+        filling = next(iter(requests.values()))
+        rows = [requests.get(place, filling) for place in range(self.batch_size)]
         batch = {
             key: torch.as_tensor(np.stack([row.observation[key] for row in rows])).to(self.device)
             for key in filling.observation

@@ -27,6 +27,7 @@ from rich.table import Table
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import MachineError, WorkFailedError
+from manifeel_ms3.network import LOOPBACK
 
 from . import cost
 from .command_lines import shell_command
@@ -48,8 +49,6 @@ RAY_SETTINGS = {
 """Environment variables of a Ray that is started here, unless they are set."""
 FILE_WIDTH = 160
 """Number of characters of a line if the output is not a terminal; wide enough for the tables."""
-LOOPBACK = "127.0.0.1"
-"""Address on which a Ray that is started here listens, so that no other machine reaches it."""
 CODE = Path(__file__).parents[2]
 """Folder that these packages are imported from."""
 
@@ -142,7 +141,7 @@ def _start_ray(address: str | None) -> None:
     settings: dict[str, Any] = {}
     address = address or "local"
     if address == "local":
-        settings = dict(_node_ip_address=LOOPBACK)
+        settings = dict(_node_ip_address=LOOPBACK)  # Ray then listens on this address, which no other machine reaches
         os.environ[ray_constants.ENABLE_RAY_CLUSTERS_ENV_VAR] = "0"  # for the processes that Ray starts
         ray_constants.ENABLE_RAY_CLUSTER = False  # else it replaces 127.0.0.1 by this machine's outer address, except on macOS
         os.environ.pop("RAY_AUTH_MODE", None)  # if it is not set, a Ray that is started here asks for a token

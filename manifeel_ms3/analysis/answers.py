@@ -1,4 +1,4 @@
-"""What touch adds, task by task: a paragraph of numbers for each task that was run with touch and without."""
+"""What touch adds, task by task: a paragraph of numbers for each task that was run both with and without touch."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -23,10 +23,11 @@ determined by a rule of its task. The [audit](audit.md) shows how much the camer
 
 """
 NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
+"""Names of the observation modes in the text."""
 
 
 def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
-    """Markdown, part by part; nothing where no task was run with touch and without.
+    """Markdown, part by part; nothing if no task was run both with and without touch.
 
     Args:
         found: The results that enter comparisons.

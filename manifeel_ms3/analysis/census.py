@@ -27,13 +27,13 @@ class Endings:
     succeeded: int
     """Number of episodes that succeeded."""
     missed: list[tuple[str, int]]
-    """What the failed episodes ended with, and how many did so, the most frequent first."""
+    """Endings of the failed episodes, and the number of episodes with each, the most frequent first."""
     pressed_too_hard: int | None
     """Number of failed episodes with a force above the limit of gentle success; None for a task without one."""
 
 
 def census_table(results: Results, conditions: list[Condition]) -> str:
-    """The section of a page that counts how episodes end; "" where no result says it.
+    """The section of a page that counts how episodes end; "" if no result says it.
 
     Args:
         results: Contents of result files.

@@ -38,7 +38,7 @@ class ClaimResult:
     difference: Estimate
     """How much more often the first condition succeeds."""
     p_value: float
-    """Probability of such a difference if there is none."""
+    """Probability of so large a difference if both conditions succeed equally often."""
     verdict: Verdict
     setup: TrainingSettings
     """Settings that both conditions were run with."""

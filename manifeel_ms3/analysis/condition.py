@@ -17,19 +17,19 @@ from manifeel_ms3.evaluation.evaluate import SENSING
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
 BACKENDS = ("sim_backend", "render_backend")
-"""Arguments of an environment that say what computes it, and make no other condition."""
+"""Arguments of an environment that say what computes it; they do not make another condition."""
 NO_SETTINGS = frozenset(
     {
-        *("policy_name", "env_id", *SENSING, "num_demos", "env_kwargs"),  # have fields of their own
-        *("seed", "step"),  # what a condition has several of
-        *("action_dim", "taxel_shape", "num_samples"),  # follow from the task and its demonstrations
+        *("policy_name", "env_id", *SENSING, "num_demos", "env_kwargs"),  # these have fields of their own
+        *("seed", "step"),  # a condition has several of these
+        *("action_dim", "taxel_shape", "num_samples"),  # these follow from the task and its demonstrations
         *("demos", "run_dir", "resume", "overwrite", "device", "compile", "trained_on", "training_seconds"),  # where and how
         *("total_steps", "save_freq", "keep", "log_freq"),
         *("num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "eval_freq", "capture_video"),
         *("exp_name", "track", "wandb_project_name", "wandb_entity"),
     }
 )
-"""Entries of a policy's configuration that make no other policy. Every other entry does."""
+"""Entries of a policy's configuration that do not make it another policy. Every other entry does."""
 OF_MODALITIES = {
     "image_size": ("rgb",),
     "camera_view": ("rgb",),
@@ -43,13 +43,13 @@ OF_MODALITIES = {
     "policy.encoder.force_field": ("tacff",),
     "policy.encoder.tactile_features": ("tacrgb", "tacff"),
 }
-"""Settings that have an effect only on a policy that observes one of some modalities."""
+"""Settings that only have an effect on a policy that observes one of the given modalities."""
 ENCODER, NETWORK = "policy.encoder.tacrgb", "policy.encoder.image"
 """Settings that name the networks of TacRGB and of the cameras."""
 LEARNT_ON = "trained on"
 """Setting of a policy whose demonstrations were recorded with other arguments of the task than its evaluation has."""
 KEY_LENGTH = 8
-"""Digits of a condition's hash that are shown."""
+"""Number of hexadecimal digits of a condition's hash that are shown."""
 Settings = tuple[tuple[str, str], ...]
 """Names and values, in the order of the names. Names of nested entries are joined by dots, values are json."""
 
@@ -170,7 +170,7 @@ def _default_arguments(env_id: str) -> dict[str, Any]:
 
 
 def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
-    """The settings of a policy that make another one.
+    """The settings of a policy that tell it apart from other policies.
 
     Args:
         config: Configuration of the policy, with nested entries.

@@ -25,7 +25,7 @@ class EncoderRanking:
     gaps: dict[tuple[str, str], Estimate]
     """How much more often the first of two encoders succeeds than the second; for every two, the better one first."""
     p_value: float
-    """Probability of the gap between the best and the second if there is none."""
+    """Probability of so large a gap between the best and the second encoder if both succeed equally often."""
 
     @property
     def best_over_second(self) -> Estimate:
@@ -33,7 +33,7 @@ class EncoderRanking:
         return self.gaps[self.encoders[0], self.encoders[1]]
 
     def is_beaten(self, encoder: str) -> bool:
-        """Whether some other encoder is above this one by its whole interval."""
+        """Whether another encoder succeeds more often, with the whole interval of the difference above zero."""
         return any(gap.low > 0 for (_, worse), gap in self.gaps.items() if worse == encoder)
 
 

@@ -1,8 +1,8 @@
 """Success rates and their differences, with intervals over training seeds and initial states.
 
 Another training seed gives another policy, another initial state another episode; a mean varies with both. The bootstrap
-therefore draws both anew, each independently of the other (the pigeonhole bootstrap, Owen 2007, which errs on the wide side).
-Checkpoints of one run are no independent samples: they are averaged before anything is drawn.
+therefore draws both anew, each independently of the other (the pigeonhole bootstrap, Owen 2007, whose intervals are rather too
+wide). Checkpoints of one run are no independent samples: they are averaged before anything is drawn.
 """
 
 from collections.abc import Sequence
@@ -117,9 +117,9 @@ def _resampled_means(rates: np.ndarray, starts: np.ndarray, rng: np.random.Gener
 
 
 def _estimate(value: float, drawn: np.ndarray, of: Sequence[ConditionResults], lowest: float) -> Estimate:
-    if np.ptp(drawn) < NO_SPREAD:  # nothing varies, so that a bootstrap has nothing to draw from:
+    if np.ptp(drawn) < NO_SPREAD:  # without any variation, a bootstrap has nothing to draw from
         fewest = min(len(results.episode_seeds) for results in of)
-        unseen = wilson_interval(0, fewest)[1]  # the rate that an outcome may have which none of so many episodes has shown
+        unseen = wilson_interval(0, fewest)[1]  # largest plausible rate of an outcome that no episode has shown
         return Estimate(value, max(value - unseen, lowest), min(value + unseen, 1.0))
     low, high = np.quantile(drawn, TAILS)
     return Estimate(value, float(low), float(high))

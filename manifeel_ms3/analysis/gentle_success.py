@@ -11,16 +11,18 @@ from manifeel_ms3.evaluation.gentle import success_under_force
 from .condition import Condition
 from .matching import Found
 from .paper import MODALITIES, MODES
-from .paper_tables import COLOURS, DPI, HEADINGS, table_one
+from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, table_one
 from .protocol import ConditionResults
 from .success_curves import PANEL
 
 COLUMNS = 3
 """Largest number of panels side by side."""
 FORCES = 200
-"""Number of points of a curve."""
+"""Number of points of a curve; set once, not tuned."""
+CURVE_WIDTH = 1.8
+"""Width of a curve, in points."""
 MARGIN = 1.1
-"""The axis of forces ends at the largest force that is drawn, times this."""
+"""Ratio of the end of the force axis to the largest force that is drawn."""
 
 
 def gentle_cell(results: ConditionResults) -> str | None:
@@ -70,11 +72,11 @@ def _draw_task(ax: Any, found: Found, by_mode: dict[str, Condition]) -> None:
     forces = np.linspace(0, MARGIN * max([1.0, *limits, *map(_largest_force, results.values())]), FORCES)
     for mode, here in results.items():
         curve = success_under_force(here.episodes, forces)
-        ax.plot(forces, curve, drawstyle="steps-post", color=COLOURS[mode], label=HEADINGS[mode], lw=1.8)
+        ax.plot(forces, curve, drawstyle="steps-post", color=COLOURS[mode], label=HEADINGS[mode], lw=CURVE_WIDTH)
     for limit in limits:
         ax.axvline(limit, color="black", ls="--", lw=1, label=f"limit of the task, {limit:g} N")
     ax.set(xlabel="contact force allowed, N", ylabel="success", xlim=(0, forces[-1]), ylim=(0, 1))
-    ax.legend(fontsize=8, loc="upper left")
+    ax.legend(fontsize=LEGEND_SIZE, loc="upper left")
 
 
 def _largest_force(results: ConditionResults) -> float:

@@ -1,8 +1,8 @@
-"""Measure what vision and touch carry: `python -m manifeel_ms3.analysis.information_audit --demo-path data/demos`.
+"""Measure what vision and touch tell: `python -m manifeel_ms3.analysis.information_audit --demo-path data/demos`.
 
 Small predictors, fitted to recorded observations of one camera or one pad at one moment, answer the questions of
-`manifeel_ms3.analysis.probes`, which a policy would need to answer. Where they cannot answer from a modality, a policy that
-has that modality alone will hardly know. Predictions are cross-validated over episodes.
+`manifeel_ms3.analysis.probes`, which a policy would need to answer. Where they cannot answer from a modality, a policy
+that observes only that modality can hardly know the answer. Predictions are cross-validated over episodes.
 
 The table and the figure go into the documentation, so the figure is a static image that matplotlib draws.
 """
@@ -38,7 +38,7 @@ MODALITIES = {"camera": "camera", "tacrgb": "TacRGB", "tacff": "TacFF"}
 FOLDS = 5
 """Number of parts that the episodes are split into; each part is predicted from a fit to the others."""
 FEWEST_EPISODES = 2 * FOLDS
-"""Number of episodes that a question needs: two in each part."""
+"""Smallest number of episodes that a question needs: two in each part."""
 COMPONENTS = 64
 """Number of principal components of the features that a predictor is fitted to; fewer than there are samples."""
 GRID = 16
@@ -59,7 +59,9 @@ FONT_SIZE, TITLE_WIDTH = 7, 28
 COLOURS = ("#8a8f98", "#c7793a", "#3a74c7")
 """Colours of the bars, in the order of MODALITIES."""
 HEADROOM = 1.05
-"""Upper end of an axis of shares, so that the line of an interval at 100 % is visible."""
+"""Upper end of an axis of shares, above 1, so that the line of an interval at 100 % is visible."""
+CAP_SIZE = 3
+"""Size of the caps at the ends of an interval, in points (matplotlib's `capsize`)."""
 DPI = 130
 """Resolution of the figure, in pixels per inch."""
 
@@ -69,7 +71,9 @@ class ProbeResult:
     """How well one modality answers a question."""
 
     question: str
+    """The question, in a few words."""
     env_id: str
+    """Id of the task."""
     modality: str
     """"camera", "tacrgb" or "tacff"."""
     unit: str
@@ -119,7 +123,7 @@ def _features(episode: Episode, sensor: str, modality: str, t: int) -> np.ndarra
 
 @dataclass
 class _Data:
-    """What a question is answered from: n moments of recorded episodes."""
+    """The data from which a question is answered: n moments of recorded episodes."""
 
     truth: np.ndarray
     """True answers (n,)."""
@@ -206,7 +210,7 @@ def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarra
         from sklearn.svm import SVC
 
     features = features[:, features.std(0) > 0]
-    if not features.size:  # the sensor shows the same at all times
+    if not features.size:  # the sensor observes the same at all times
         features = np.zeros((len(truth), 1))
     components = PCA(min(COMPONENTS, features.shape[1], len(truth) // 2), random_state=0)
     if numeric:
@@ -214,7 +218,7 @@ def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarra
         pipeline = make_pipeline(components, GaussianProcessRegressor(kernel, normalize_y=True))
     else:
         pipeline = make_pipeline(StandardScaler(), components, SVC(C=SVM_PENALTY, class_weight="balanced"))
-    # neither is a fault: an image without change has no variance to share out, and a fit may end at its kernel's bounds
+    # neither warning is a fault: images without change have no variance, and a fit may end at the bounds of its kernel
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return np.asarray(cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS)))
@@ -284,7 +288,7 @@ def draw_figure(results: list[ProbeResult], path: Path) -> None:
         score = np.array([result.score for result in group]) * factor
         ends = np.array([result.interval for result in group]).T * factor
         ax.bar(places, score, color=COLOURS)
-        ax.errorbar(places, score, np.abs(ends - score), fmt="none", ecolor="black", capsize=3, lw=1)
+        ax.errorbar(places, score, np.abs(ends - score), fmt="none", ecolor="black", capsize=CAP_SIZE, lw=1)
         ax.axhline(group[0].chance * factor, color="black", ls=":", lw=1)
         ax.set_xticks(places, list(MODALITIES.values()), fontsize=FONT_SIZE)
         ax.set_ylabel(f"RMSE, {group[0].unit}" if group[0].unit else "right answers, %", fontsize=FONT_SIZE)
@@ -313,7 +317,7 @@ def main(args: Args) -> list[ProbeResult]:
         MissingExtraError: The extra `audit` is not installed.
     """
     with missing_extras_named():
-        import sklearn  # noqa: F401  (asked for before the recordings are read)
+        import sklearn  # noqa: F401  (names a missing extra before the recordings are read)
     recorded = dict(_recorded_tasks(args.demos))
     if not recorded:
         raise DemonstrationError(

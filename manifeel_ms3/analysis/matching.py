@@ -1,7 +1,7 @@
-"""Find the results that answer for a condition of the paper, and compare like with like.
+"""Find the results that correspond to a condition of the paper, and compare like with like.
 
-The paper's condition leaves settings open: all conditions of a comparison must then have the same ones. So each set-up, such as
-the paper's preset or the small networks, gives an answer of its own.
+A condition of the paper leaves the settings open, but all conditions of a comparison must have the same settings. Therefore
+each set-up, such as the paper's preset or the small networks, has a result of its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,21 +11,21 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition
 from .paper import SCRATCH
-from .presets import PAPER, TrainingSettings, has_presets_encoder, training_settings_of
+from .presets import TrainingSettings, has_presets_encoder, training_settings_of
 from .protocol import ConditionResults
 
 Found = Mapping[Condition, ConditionResults]
 
 
 def answering(wanted: Condition, found: Found) -> dict[TrainingSettings, Condition]:
-    """The conditions that answer for one of the paper, one for each set-up.
+    """The conditions that correspond to one of the paper, one for each set-up.
 
     Args:
         wanted: A condition of the paper, without settings.
         found: The results that enter comparisons.
 
     Raises:
-        ResultError: Two conditions answer in one set-up, such as encoders that start from different weights.
+        ResultError: Two conditions correspond to it in one set-up, such as encoders that start from different weights.
     """
     answers: dict[TrainingSettings, Condition] = {}
     for condition in found:
@@ -41,10 +41,10 @@ def answering(wanted: Condition, found: Found) -> dict[TrainingSettings, Conditi
 
 
 def answering_all(wanted: Sequence[Condition], found: Found) -> dict[TrainingSettings, list[Condition]]:
-    """The conditions that answer for several of the paper, in each set-up that has all of them; the paper's preset is first."""
+    """The conditions that correspond to several of the paper, for each set-up that has them all, the paper's preset first."""
     answers = [answering(condition, found) for condition in wanted]
     common = set.intersection(*(set(one) for one in answers))
-    in_order = sorted(common, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+    in_order = sorted(common, key=lambda setup: setup.sort_key)
     return {setup: [one[setup] for one in answers] for setup in in_order}
 
 

@@ -20,6 +20,7 @@ VISION, TACRGB, TACFF = "rgb", "rgb+tacrgb", "rgb+tacff"
 MODES = (VISION, TACRGB, TACFF)
 """Observation modes in the order of the paper's columns."""
 DP, EQUIDP, FM = "diffusion_policy", "equivariant_diffusion_policy", "flow_matching"
+"""Registered names of the paper's policies."""
 SCRATCH = "resnet18"
 """Encoder of TacRGB that is trained from scratch, the same network as that of the cameras."""
 DIM, YAW, TACSL = dict(lighting="dim"), dict(control_mode="pd_ee_delta_yaw"), dict(tactile=dict(units="tacsl"))
@@ -106,9 +107,9 @@ SIMILARITY = {
     "tacrgb": {"ball": (5.67, 0.0579), "bulb": (5.80, 0.0646), "gear": (6.57, 0.0744)},
     "tacff": {"ball": (2.96, 0.0277), "bulb": (3.54, 0.0323), "gear": (2.91, 0.0254)},
 }
-"""Distances of simulated to real tactile images, FID and KID, by modality and object; features of a ResNet not named."""
+"""Distances of simulated to real tactile images, FID and KID, by modality and object; the paper does not name its ResNet."""
 RUNTIME = dict(resnet18=8.1, unit=25.8, t3=17.7, anytouch=66.3)
-"""Minutes of training for one epoch, by encoder of TacRGB: NVIDIA A30, batch size 8, real sorting in normal light."""
+"""Time of training for one epoch in minutes, by encoder of TacRGB: NVIDIA A30, batch size 8, real sorting in normal light."""
 RUNTIME_DEMOS = 103
 """Number of demonstrations of the runtime comparison."""
 

@@ -14,6 +14,7 @@ from .paper import DP, RUNTIME, RUNTIME_DEMOS, SIMILARITY, TACRGB
 
 SECONDS_PER_MINUTE = 60
 RUNTIME_TASKS = ("BallSorting", "BallSortingDim")
+"""Short names of the tasks whose training times are compared."""
 RUNTIME_TEXT = """
 ## Training time
 
@@ -61,7 +62,7 @@ def similarity_table(files: Sequence[Path]) -> str:
     """Markdown: FID and KID by modality and object, the paper's and those of files that `manifeel similarity` wrote.
 
     Raises:
-        ResultError: A file is not one of those.
+        ResultError: A file was not written by `manifeel similarity`.
     """
     measured = [_similarity(path) for path in files]
     rows = []

@@ -7,6 +7,7 @@ from itertools import chain
 from .condition import Condition
 from .paper import (
     DIM,
+    DP,
     EQUIDP,
     FM,
     MODES,
@@ -58,12 +59,12 @@ def _touch_claims() -> Iterator[Comparison]:
 
 
 def _picture_claims() -> Iterator[Comparison]:
-    """What TacRGB does where its pictures do not matter."""
+    """The claims about TacRGB in tasks that its pictures do not help."""
     for task in tasks_in_table("I", "insertion", "screwing"):
         if task != "PegInsertion":  # there, the paper found a gain of seven points
             claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg"
             yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION), gain=False)
-    for policy in ("diffusion_policy", EQUIDP, FM):
+    for policy in (DP, EQUIDP, FM):
         with_picture, without = (paper_condition("GearAssembly", mode, policy) for mode in (TACRGB, VISION))
         yield Comparison("3. TacRGB takes success away on gear, with every policy", without, with_picture)
 
@@ -72,7 +73,7 @@ def _policy_claims() -> Iterator[Comparison]:
     for task in tasks_in_table("II"):
         exploration = task in tasks_in_table("II", "exploration")
         for mode in MODES:
-            dp, equidp, fm = (paper_condition(task, mode, policy) for policy in ("diffusion_policy", EQUIDP, FM))
+            dp, equidp, fm = (paper_condition(task, mode, policy) for policy in (DP, EQUIDP, FM))
             yield Comparison("4. Flow Matching is below Diffusion Policy", dp, fm)
             if exploration:
                 yield Comparison("5. Equivariant Diffusion Policy is below on search and sorting", dp, equidp)
@@ -83,7 +84,7 @@ def _policy_claims() -> Iterator[Comparison]:
 def _encoder_claims() -> Iterator[Comparison]:
     for task in tasks_in_table("III"):
         scratch, unit, t3 = (paper_condition(task, TACRGB, encoder=name) for name in (SCRATCH, "unit", "t3"))
-        for encoder in (unit, t3):  # says the text; in the paper's own Table III they are so in three cases of six
+        for encoder in (unit, t3):  # the text says so; in the paper's own Table III it holds in three cases of six
             yield Comparison("6. UniT and T3 are above ResNet-18 from scratch", encoder, scratch)
     scratch, anytouch = (paper_condition("GearAssembly", TACRGB, encoder=name) for name in (SCRATCH, "anytouch"))
     yield Comparison("6. AnyTouch is below ResNet-18 from scratch on gear", scratch, anytouch)

@@ -29,10 +29,19 @@ NEEDS_GPU = """
 Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` estimates the hours on your machine.
 """
 HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
+"""Headings of the tables' columns, by observation mode."""
 PANEL = (11.0, 4.2)
 """Width and height of the bar chart, in inches."""
 DPI = 110
+"""Resolution of the figures, in pixels per inch."""
+LEGEND_SIZE = 8
+"""Size of the letters in the legends, in points."""
+LABEL_ANGLE = 20
+"""Angle of the names of the tasks below the bar chart, in degrees, so that they do not overlap."""
+PAPER_LINE = 1.5
+"""Width of the lines for the paper's rates, in points."""
 COLOURS: dict[str, str] = dict(zip(MODES, ("#9aa0a6", "#d9822b", "#2b6cb0"), strict=True))
+"""Colour of each observation mode in the figures."""
 BAR = 0.27
 """Width of a bar; tasks are 1 apart."""
 
@@ -80,7 +89,7 @@ def _setups(found: Found) -> list[TrainingSettings]:
     wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
     wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
     setups = {setup for condition in wanted for setup in answering(condition, found)}
-    return sorted(setups, key=lambda setup: (setup.preset != PAPER, len(setup.changes), str(setup)))
+    return sorted(setups, key=lambda setup: setup.sort_key)
 
 
 Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
@@ -89,7 +98,7 @@ Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
 def _rows_by_sensing(
     found: Found, files: Mapping[Condition, str], setup: TrainingSettings, rows: Rows
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
-    """Task and policy, and a cell for each observation mode; only rows in which something was run."""
+    """Task and policy, and a cell for each observation mode; only rows of which some condition was run."""
     for (task, policy), rates in rows.items():
         answers = [answering(paper_condition(task, mode, policy), found).get(setup) for mode in MODES]
         if any(answers):
@@ -101,7 +110,7 @@ def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: Traini
     for task in tasks_in_table("III"):
         wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
         answers = {name: answering(condition, found).get(setup) for name, condition in wanted.items()}
-        if sum(answer is not None for answer in answers.values()) > 1:  # one alone compares nothing
+        if sum(answer is not None for answer in answers.values()) > 1:  # a single encoder compares nothing
             yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
 
 
@@ -167,10 +176,10 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         for k, rate in enumerate(MODALITIES[task]):
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
-            ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=1.5, label=label)
+            ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=PAPER_LINE, label=label)
     ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {setup.preset}")
-    ax.set_xticks(range(len(tasks)), tasks, rotation=20, ha="right")
-    ax.legend(ncols=4, fontsize=8, loc="upper left")
+    ax.set_xticks(range(len(tasks)), tasks, rotation=LABEL_ANGLE, ha="right")
+    ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
     out.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(out, dpi=DPI)
     return True

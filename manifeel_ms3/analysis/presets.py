@@ -18,6 +18,7 @@ PAPER_PRECISION = {"precision": json.dumps("fp32")}
 NOT_RECORDED = "not recorded"
 """Value of a setting that an older version of the policy did not have."""
 NONE, A_FILE = json.dumps(None), json.dumps("a file of weights")
+"""Values of the setting `tacrgb_weights` as json: no file, and any file."""
 TACTILE_IMAGE_SIZE = {"t3": 224, "anytouch": 224}
 """Size of TacRGB images, in pixels, that the paper gives these encoders; the others have the preset's."""
 PRETRAINED = ("unit", "t3", "anytouch")
@@ -35,6 +36,11 @@ class TrainingSettings:
     """Name of the policy's preset that the settings come nearest to; "" where the policy has no presets here."""
     changes: Settings
     """Settings that differ from the preset's, or all of them where there is no preset."""
+
+    @property
+    def sort_key(self) -> tuple[bool, int, str]:
+        """Key that puts the paper's preset first, and settings with fewer changes before those with more."""
+        return self.preset != PAPER, len(self.changes), str(self)
 
     def __str__(self) -> str:
         changes = [f"{name} {value.strip(chr(34))}" for name, value in self.changes]

@@ -39,7 +39,7 @@ class ConditionResults:
 
     @property
     def size(self) -> str:
-        """Numbers of training seeds, checkpoints and episodes, such as "3 x 10 x 50"."""
+        """Text with the numbers of training seeds, checkpoints and episodes, such as "3 x 10 x 50"."""
         return " x ".join(map(str, self.success.shape))
 
     @property

@@ -20,11 +20,11 @@ from .estimates import TAILS, Estimate, resampled_success
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import reported
-from .presets import PAPER, TrainingSettings
+from .presets import TrainingSettings
 from .protocol import ConditionResults
 
 FEWEST = 3
-"""Number of conditions from which on an order says something."""
+"""Smallest number of conditions whose order is compared."""
 RESAMPLES = 1000
 """Number of resamples of an interval; fewer than for a rate, since each takes an order of all conditions."""
 TEXT = """
@@ -49,7 +49,7 @@ class Ranked:
 
 
 class Agreement(Estimate):
-    """A measure of agreement with its interval of 95 %; it is no share, and not written in percent."""
+    """A measure of agreement with its interval of 95 %; it is not a share, and not written in percent."""
 
     def __str__(self) -> str:
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
@@ -127,7 +127,7 @@ def _ranked_by_table(found: Found) -> Iterator[tuple[str, TrainingSettings, list
         for setup, condition in answering(wanted, found).items():
             by_table.setdefault(table, {}).setdefault(setup, []).append(Ranked(condition, rate.mean, found[condition]))
     for table, setups in by_table.items():
-        for setup in sorted(setups, key=lambda one: (one.preset != PAPER, len(one.changes), str(one))):
+        for setup in sorted(setups, key=lambda one: one.sort_key):
             yield table, setup, setups[setup]
 
 

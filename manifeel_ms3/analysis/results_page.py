@@ -38,6 +38,8 @@ from .success_curves import DPI, PANEL, write_curves
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
 SECONDS_PER_HOUR = 3600
+LEGEND_SIZE = 7
+"""Size of the letters in the legend of the losses, in points."""
 HEAD = """# Results
 
 *Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is written by hand.*
@@ -167,7 +169,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
         for name, entries in curves:
             ax.plot([entry["step"] for entry in entries], [entry[TRAINING_LOSS] for entry in entries], label=name, lw=1)
         ax.set(title=task, xlabel="gradient step", ylabel="loss", yscale="log")
-        ax.legend(fontsize=7)
+        ax.legend(fontsize=LEGEND_SIZE)
     out.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(out, dpi=DPI)
     return True

@@ -4,7 +4,7 @@
 
 Two sets of tactile images are compared by the features of a network that was trained on photographs. FID is the Fréchet
 distance between the normal distributions that fit the two sets of features (Heusel et al. 2017), KID the squared maximum mean
-discrepancy under a cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so these are always asked for,
+discrepancy under a cubic kernel (Binkowski et al. 2018, unbiased). Both depend on the features, so they must always be given,
 and the result names them.
 """
 
@@ -37,13 +37,13 @@ Distance = Callable[[np.ndarray, np.ndarray], float]
 IMAGES, FIELDS, RECORDINGS = (".png", ".jpg", ".jpeg"), (".npy", ".npz"), (".h5",)
 """Suffixes of files with an image, a force field, or recorded episodes."""
 BATCH = 32
-"""Number of images that a network takes at once."""
+"""Number of images that a network takes at once; set once, not tuned."""
 FEWEST = 10
-"""Least number of images in each set."""
+"""Smallest number of images in each set; set once, not tuned."""
 PAIRS, PAIR_SIDE = 8, 160
 """Number of pairs in nearest.png, and the width and height of an image there, in pixels."""
 IN_CONTACT = 0.05
-"""Sum of the absolute forces of a recorded field in N above which the pad is in contact."""
+"""Sum of the absolute forces of a recorded field, in N, above which the pad counts as in contact; set once, not tuned."""
 INCEPTION_FEATURES = "2048"
 """Name that torch-fidelity gives to the features which FID is defined on: the 2048 after Inception's last pooling."""
 
@@ -69,13 +69,14 @@ class Args:
     pad: str = "tactile_right"
     """Finger pad that is read from trajectory files: "tactile_left" or "tactile_right"."""
     limit: int = 2000
-    """Largest number of images in each set; if there are more, so many are drawn at random."""
+    """Largest number of images in each set; if there are more, this number is drawn at random."""
     resamples: int = 100
     """Number of resamples of the bootstrap."""
     out: Path = Path("runs/similarity")
     """Folder for similarity.json and nearest.png."""
     object: str = ""
-    """Object that both sides touch, such as the paper's "ball", "bulb" or "gear", beside which the page of results shows it."""
+    """Object that both sensors touch; for "ball", "bulb" or "gear", the page of results shows the distances beside the
+    paper's."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,15 @@ class Similarity:
     """Distances between simulated and real touch, with intervals of 95 % from a bootstrap over images."""
 
     fid: Estimate
+    """Fréchet distance of the features."""
     kid: Estimate
+    """Squared maximum mean discrepancy of the features."""
     modality: str
     """Modality, "tacrgb" or "tacff"."""
     object: str
-    """Object that both sides touch; "" if it was not named."""
+    """Object that both sensors touch; "" if it was not named."""
     features: str
-    """Name of the features, as it was asked for."""
+    """Name of the features, as it was given."""
     dimensions: int
     """Number of features of an image."""
     sim_count: int
@@ -270,7 +273,7 @@ def nearest_pairs(sim_images: list[np.ndarray], real_images: list[np.ndarray], s
 
 
 def features_by_name(name: str) -> Features:
-    """The function that makes features (N, D) of images (N, H, W, 3) uint8; always the one that was asked for.
+    """The function that makes features (N, D) of images (N, H, W, 3) uint8; always the one that was named.
 
     Args:
         name: "inception", name or folder of a ResNet, or "module:function", as the command line gives it.

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.evaluation.result import RATE_DECIMALS
 from manifeel_ms3.files import write_text
 
 from .condition import Condition, condition_of
@@ -21,9 +22,15 @@ from .protocol import collect
 
 PANEL, DPI = (5.0, 3.4), 130
 """Width and height of a panel in inches, and resolution in pixels per inch."""
+LEGEND_SIZE, LINE_WIDTH = 6, 1.5
+"""Size of a legend's letters, and width of a curve, in points."""
+BAND_OPACITY = 0.15
+"""Opacity of the band of an interval, from 0 to 1, so that curves behind it are visible."""
+HEADROOM = 0.02
+"""Part of the axis of success that lies below 0 and above 1, so that curves at its ends are visible."""
 COLUMNS = ("task", "variant", "sensing", "policy", "settings", "id", "gradient_steps", "environment_steps")
 MEASURES = ("success", "low", "high", "training_seeds", "episodes")
-"""Columns of the table: those that say what was trained, and those that say how it succeeds."""
+"""Columns of the table: those that say what was trained, and those that say how often it succeeds."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +38,11 @@ class Point:
     """Success of a condition after some training."""
 
     gradient_steps: int
+    """Number of gradient steps of the checkpoint."""
     environment_steps: int | None
     """Gradient steps times batch size; None if the configuration does not name the batch size."""
     success: Estimate
+    """Success rate of the checkpoint."""
     training_seeds: int
     """Number of training seeds that were evaluated after so many steps."""
     episodes: int
@@ -82,7 +91,7 @@ def curve_table(curves: dict[Condition, list[Point]]) -> str:
             condition.key,
         )
         for point in points:
-            success = [round(number, 4) for number in (point.success.value, point.success.low, point.success.high)]
+            success = [round(number, RATE_DECIMALS) for number in (point.success.value, point.success.low, point.success.high)]
             amount = (point.gradient_steps, point.environment_steps)
             writer.writerow((*what, *amount, *success, point.training_seeds, point.episodes))
     return out.getvalue()
@@ -117,9 +126,9 @@ def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -
     for ax, (task, conditions) in zip(fig.subplots(1, len(tasks), squeeze=False)[0], tasks.items(), strict=True):
         for condition in conditions:
             _draw(ax, condition, [point for point in curves[condition] if point.environment_steps is not None])
-        ax.set(title=task, xlabel="environment steps trained on", ylabel="success", ylim=(-0.02, 1.02))
+        ax.set(title=task, xlabel="environment steps trained on", ylabel="success", ylim=(-HEADROOM, 1 + HEADROOM))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 400k
-        ax.legend(fontsize=6)
+        ax.legend(fontsize=LEGEND_SIZE)
     figure.parent.mkdir(parents=True, exist_ok=True)
     fig.savefig(figure, dpi=DPI)
     write_text(table, curve_table({condition: curves[condition] for here in tasks.values() for condition in here}))
@@ -131,6 +140,6 @@ def _draw(ax: Any, condition: Condition, points: list[Point]) -> None:
     label = ", ".join(
         filter(None, (condition.variant, condition.sensing, condition.policy, str(training_settings_of(condition))))
     )
-    (line,) = ax.plot(seen, [point.success.value for point in points], label=label, lw=1.5, marker=".")
+    (line,) = ax.plot(seen, [point.success.value for point in points], label=label, lw=LINE_WIDTH, marker=".")
     lows, highs = zip(*((point.success.low, point.success.high) for point in points), strict=True) if points else ((), ())
-    ax.fill_between(seen, lows, highs, color=line.get_color(), alpha=0.15, lw=0)
+    ax.fill_between(seen, lows, highs, color=line.get_color(), alpha=BAND_OPACITY, lw=0)

@@ -23,11 +23,12 @@ from manifeel_ms3.agents.controllers import LimitedLeadEEPoseController, rotatio
 ARM, GRIPPER = "arm", "gripper"
 """Names of the controllers of the robot's arm and gripper."""
 LAST_STEPS = 10
-"""Number of steps for which the last command is held where the goal is met later than in the recording."""
+"""Number of steps for which the last command is held, in case the goal is met later than in the recording; set once, not
+tuned."""
 
 
 def converted(actions: Iterable[np.ndarray], seed: int, source: gym.Env, target: gym.Env) -> Iterator[np.ndarray]:
-    """Actions (A,) for the controller of `target`, each to be run there before the next one is asked for.
+    """Actions (A,) for the controller of `target`; each must be run there before the next one is requested.
 
     Args:
         actions: Actions for the controller of `source`.
@@ -46,7 +47,7 @@ def converted(actions: Iterable[np.ndarray], seed: int, source: gym.Env, target:
 
 
 def same_command(source: PandaGelSight, target: PandaGelSight) -> np.ndarray:
-    """The action (A,) with which the controller of `target` commands, as nearly as it can, what that of `source` did last."""
+    """Action (A,) with which the controller of `target` commands, as closely as it can, the last joint targets of `source`."""
     commanded = source.robot.get_drive_targets()  # (1, 9)
     parts = [_arm_action(target, commanded[:, :7])]
     if target.controller.controllers[GRIPPER].single_action_space.shape[0]:
@@ -77,7 +78,7 @@ def _pose_action(arm: LimitedLeadEEPoseController, pose: Pose) -> torch.Tensor:
 
 
 def _gripper_action(source: PandaGelSight, target: PandaGelSight, commanded: torch.Tensor) -> torch.Tensor:
-    """The action (1, 1) of a gripper that presses with the same force: stiffness times the way to the commanded position."""
+    """The action (1, 1) of a gripper that presses with the same force: stiffness times distance to the commanded position."""
     config = target.controller.controllers[GRIPPER].config
     position = source.robot.get_qpos()[:, 7:8]
     ratio = source.controller.controllers[GRIPPER].config.stiffness / config.stiffness

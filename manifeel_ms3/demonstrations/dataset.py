@@ -6,7 +6,6 @@ the tasks' folders has hashes, versions, seeds and outcomes, which `validate` ch
 stopped when the same command is given again.
 """
 
-import hashlib
 import shutil
 import sys
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ import tyro
 from manifeel_ms3.agents.panda_gelsight import IMAGE_SIZE
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidFileError, MachineError
-from manifeel_ms3.files import read_json, write_json
+from manifeel_ms3.files import file_hash, read_json, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
@@ -35,9 +34,8 @@ DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
 MANIFEST_FILE = "manifest.json"
 """Name of the manifest in its folder."""
 SMALLEST_SHARE = 0.2
-"""Share of a demonstration's size that is counted on at least, because touch and states do not shrink with the images."""
-HASH_BLOCK = 1 << 20
-"""Number of bytes that are read at a time for a hash."""
+"""Smallest share of a demonstration's full size that is expected where images are smaller, because touch and states do not
+shrink with them; set once, not tuned."""
 MANIFEST = {
     "type": "object",
     "required": ["schema", "files"],
@@ -112,10 +110,10 @@ def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
 
 
 def _check_room(args: Args, counts: dict[str, int]) -> None:
-    """Check that the disk has room for so many demonstrations of each task.
+    """Check that the disk has room for the number of demonstrations of each task.
 
     Raises:
-        MachineError: It has not.
+        MachineError: The disk has too little room.
     """
     free = shutil.disk_usage(args.out).free
     pixels = ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2
@@ -142,8 +140,8 @@ def describe(path: Path) -> dict[str, Any]:
         env_kwargs=header["env_info"]["env_kwargs"],
         versions=header["versions"],
         revision=header.get("revision"),
-        sha256=_sha256(path),
-        json_sha256=_sha256(path.with_suffix(".json")),
+        sha256=file_hash(path),
+        json_sha256=file_hash(path.with_suffix(".json")),
         bytes=path.stat().st_size,
         seeds=[episode["episode_seed"] for episode in episodes],
         failed_seeds=header.get("failed_seeds", []),
@@ -151,14 +149,6 @@ def describe(path: Path) -> dict[str, Any]:
         mean_steps=round(sum(episode["elapsed_steps"] for episode in episodes) / max(len(episodes), 1), 1),
         peak_contact_force=max((episode["peak_contact_force"] for episode in episodes), default=0.0),
     )
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(HASH_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:

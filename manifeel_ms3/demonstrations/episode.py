@@ -1,4 +1,4 @@
-"""One episode in a simulator, with all that a trajectory file holds of it."""
+"""Running of one episode in a simulator, and collection of everything that a trajectory file holds of it."""
 
 from collections.abc import Callable, Iterable
 from typing import Any, cast
@@ -9,11 +9,9 @@ from mani_skill.utils import common
 
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks import VisuotactileEnv
+from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
 from .formats.maniskill_h5_writing import Episode
-
-FORCE_DECIMALS = 3
-"""Decimals of a peak force in the json, in N: millinewtons, far below what matters in contact."""
 
 
 def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
@@ -32,8 +30,8 @@ def run_episode(
     Args:
         env: Environment with `num_envs=1`.
         seed: Seed of the reset.
-        actions: Returns the actions (A,); called after the reset.
-        on_step: Called with every observation and `info`, those of the reset included.
+        actions: Function that returns the actions (A,); it is called after the reset.
+        on_step: Function that is called with every observation and `info`, including those of the reset.
     """
     base: Any = env.unwrapped
     obs, info = env.reset(seed=seed)

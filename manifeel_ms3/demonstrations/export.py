@@ -31,11 +31,12 @@ class Args:
     file: tyro.conf.Positional[Path]
     """Path of a trajectory file with observations."""
     to: Format
-    """Format: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each episode."""
+    """Format to write: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each
+    episode."""
     out: Path
     """Folder to write; it must not exist yet."""
     videos: bool = False
-    """Store the cameras' images of a LeRobot dataset as videos, which are smaller and lose a little; touch stays as it is."""
+    """Store the cameras' images of a LeRobot dataset as videos, which are smaller but not lossless; touch stays lossless."""
 
 
 def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
@@ -50,7 +51,7 @@ def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Path, Progress], None]] = {
-    "npz": write_npz,  # not among the formats, because it is not read
+    "npz": write_npz,  # not one of the formats, because this package does not read it
     **{known.name: known.write for known in FORMATS if known.write is not None},
 }
 
@@ -60,7 +61,7 @@ def main(args: Args) -> Path:
 
     Raises:
         DemonstrationError: The file cannot be exported, or the folder exists already.
-        InvalidArgumentError: Videos are asked for in a format that has none.
+        InvalidArgumentError: Videos are requested in a format that has none.
         MissingExtraError: The library that writes the format is not installed.
     """
     if args.videos and args.to != "lerobot":

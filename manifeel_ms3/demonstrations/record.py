@@ -36,7 +36,7 @@ class Args:
     env_id: tyro.conf.Positional[str]
     """Id of the task, such as ManiFeel-PegInsertion-v1, or its short name, such as PegInsertion."""
     num: Annotated[int, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = 50
-    """Number of successful episodes that the file shall hold."""
+    """Number of successful episodes to record into the file."""
     workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
     """Number of worker processes."""
     seed: int = 0
@@ -96,11 +96,11 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 
     Args:
         args: Arguments of the command.
-        on_episode: Called after each successful episode; a progress bar is shown if it is not given.
+        on_episode: Function that is called after each successful episode; a progress bar is shown if it is not given.
 
     Raises:
         UnknownNameError: The task is not registered, or has no demonstrator.
-        InvalidArgumentError: Seeds are asked for that are for evaluation, or an argument is not allowed.
+        InvalidArgumentError: Seeds that are reserved for evaluation are requested, or an argument is not allowed.
         DemonstrationError: The file was recorded with other arguments.
         InUseError: Another process records into the file.
         WorkFailedError: Too many seeds failed, or a worker process died.
@@ -132,11 +132,11 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 def _submit(
     pool: WorkerPool[Recorder, int], seeds: Iterator[int], args: Args, recording: Recording, count: Callable[[int], None]
 ) -> None:
-    """Submit seeds: each one only once the seeds before it cannot be enough, so that the episodes never depend on timing."""
+    """Submit seeds, each one only when the seeds before it cannot suffice, so that the episodes do not depend on timing."""
     while recording.num_finished + pool.num_running < args.num:
         seed = next(seeds, None)
         if seed is None and pool.num_running > 0:
-            return  # episodes that run may still succeed
+            return  # running episodes may still succeed
         if seed is None:
             raise WorkFailedError(
                 f"{len(args.seeds)} seeds were tried and {len(recording.infos)} of {args.num} episodes succeeded; see whether "

@@ -1,4 +1,4 @@
-"""Shared by everything that records: a trajectory file to which episodes are added, its json, and the state of a worker."""
+"""Common parts of all commands that record: a trajectory file to which episodes are added, its json, the state of a worker."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -33,14 +33,14 @@ from .formats.maniskill_h5_writing import (
 STATES_FILE = "trajectory.h5"
 """Name of a file of states and actions, without observations, as ManiSkill's users expect."""
 SESSION = "session-"
-"""Start of the name of the folder into which the workers of one recording session write."""
+"""First part of the name of the folder into which the workers of one recording session write."""
 
 
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     """The json of a trajectory file, without its episodes.
 
     The environment's id has gymnasium's form "module:id", so that ManiSkill's tools import the module that registers it. The
-    render backend is left out, because it is a choice of the machine at hand.
+    render backend is left out, because it is a choice of each machine.
 
     Args:
         env_id: Id of the task.
@@ -64,9 +64,9 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
 
 
 def trajectory_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
-    """Name of a trajectory file as ManiSkill names its own, which tells what the file holds.
+    """Name of a trajectory file by ManiSkill's convention, which tells what the file holds.
 
-    That is "trajectory.{obs_mode}.{control_mode}.{sim_backend}.h5"; a file without observations is "trajectory.h5".
+    The name is "trajectory.{obs_mode}.{control_mode}.{sim_backend}.h5"; a file without observations is "trajectory.h5".
 
     Args:
         env_id: Id of the task.
@@ -185,7 +185,7 @@ class Recording:
             separate(self.path)
             self.is_complete = False
         write_index(self.path, self._fields(), self.infos)
-        for stale in self._folder.glob(f"{SESSION}*"):  # of sessions that were killed
+        for stale in self._folder.glob(f"{SESSION}*"):  # left by sessions that were killed
             remove_folder(stale)
         self.drafts.mkdir(parents=True)
 
@@ -197,10 +197,10 @@ class Recording:
             info: The episode's entry in the json.
 
         Returns:
-            Number of episodes that the file holds more than before.
+            Number of episodes by which the file has grown.
 
         Raises:
-            FileWriteError: The episode cannot be written; it is as if it had not been given.
+            FileWriteError: The episode cannot be written; the recording is as it was before.
         """
         file = episode_file(self._folder, seed)
         entry = file.with_suffix(".json")
@@ -214,16 +214,16 @@ class Recording:
             raise
 
     def accept_kept(self, seed: int) -> int:
-        """Take over an episode of `kept`, and return the number of episodes that the file holds more than before."""
+        """Take over an episode of `kept`, and return the number of episodes by which the file has grown."""
         return self._enter({seed: self.kept.pop(seed)})
 
     def reject(self, seed: int) -> int:
-        """Remember that an episode failed, and return the number of episodes that the file holds more than before."""
+        """Remember that an episode failed, and return the number of episodes by which the file has grown."""
         self.failed.add(seed)
         return self._enter({})
 
     def _enter(self, finished: dict[int, dict[str, Any]]) -> int:
-        """Append to the file what has finished and whose turn it is."""
+        """Append the finished episodes whose turn it is, and return the number of episodes by which the file has grown."""
         infos, waiting = dict(self.infos), self._waiting | finished
         for seed in list(waiting) if self._order is None else self._order:
             if seed in waiting:
@@ -236,7 +236,7 @@ class Recording:
         return more
 
     def finish(self) -> None:
-        """Turn the index and the episodes into one file; a recording without episodes leaves none."""
+        """Turn the index and the episodes into one file; a recording without episodes leaves no file."""
         if self.infos:
             consolidate(self.path)
         else:
@@ -274,7 +274,7 @@ def make_recorder(
 
 
 def next_step(_args: Any, path: Path) -> str:
-    """What a trajectory file holds, and the commands that take it: the end of the commands that write one.
+    """Text for the end of a command that writes a trajectory file: what the file holds, and which commands take it.
 
     Args:
         _args: Arguments of the command.

@@ -68,11 +68,11 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 
     Args:
         args: Arguments of the command.
-        on_episode: Called after each episode; a progress bar is shown if it is not given.
+        on_episode: Function that is called after each episode; a progress bar is shown if it is not given.
 
     Raises:
         InvalidArgumentError: The file to write is the file to read, or an argument is not allowed.
-        DemonstrationError: A file cannot be used.
+        DemonstrationError: A trajectory file is missing or broken, or was recorded with other arguments.
         InUseError: Another process writes the file.
         WorkFailedError: A worker process died.
     """
@@ -123,7 +123,7 @@ def _warn(recording: Recording) -> None:
 
 
 def _env_kwargs(args: Args, source: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of the environment that renders: those of the recording, with the changes that are asked for."""
+    """Arguments of the environment that renders: those of the recording, with the changes that the arguments ask for."""
     sensing = dict(obs_mode=args.obs_mode, cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     asked: dict[str, Any] = {} if args.control_mode is None else dict(control_mode=args.control_mode)
     if args.image_size is not None:

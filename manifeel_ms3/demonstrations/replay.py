@@ -1,4 +1,4 @@
-"""Replay episodes from their actions, to prove that they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
+"""Replay episodes from their actions, to see if they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
 
 import logging
 import sys
@@ -17,10 +17,11 @@ from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
+from .formats.h5_checks import POSE_SIZE
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
-POSE = slice(0, 7)
+POSE = slice(0, POSE_SIZE)
 """Part of an actor's state that is its pose: position (m) and quaternion wxyz."""
 
 
@@ -88,7 +89,7 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
         return make_env(env_id, **kwargs | dict(obs_mode="none", render_backend="none"))
     except ManifeelError:
         raise
-    except Exception as error:  # arguments from a file: ManiSkill raises many kinds
+    except Exception as error:  # for arguments from a file, ManiSkill raises errors of many types
         raise DemonstrationError(
             f"{path}: {env_id} cannot be made with {kwargs} ({type(error).__name__}: {error}); record it again"
         ) from error

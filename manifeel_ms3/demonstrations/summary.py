@@ -1,4 +1,4 @@
-"""Summarise a trajectory file in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
+"""Summarize a trajectory file in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
 
 import sys
 from dataclasses import dataclass
@@ -17,9 +17,11 @@ from .formats.maniskill_h5 import open_trajectories, read_header
 BARS = " ▁▂▃▄▅▆▇█"
 """Characters of a sparkline, from the lowest level to the highest: Unicode's eighths of a block."""
 WIDTH = 28
-"""Number of characters of a sparkline and of the longest bar of a histogram."""
+"""Number of characters of a sparkline and of the longest bar of a histogram; set once, not tuned."""
 NUM_SHOWN = 12
-"""Number of episodes, and of arrays, that are listed one by one."""
+"""Number of episodes, and of arrays, that are listed one by one; set once, not tuned."""
+LEAST_TOP = 1e-9
+"""Smallest value that the highest bar of a sparkline may stand for, so that nothing is divided by 0."""
 FORCE_EDGES = (0, 0.5, 1, 2, 5, 10, 20, 40, 60, np.inf)
 """Edges of the histogram's bins in N, in steps of about 2; demonstrations stay under 60 N."""
 
@@ -29,7 +31,7 @@ class Args:
     """Arguments of the command."""
 
     file: tyro.conf.Positional[Path]
-    """Path of the trajectory file; another program's, in ManiSkill's format, is summarized, too."""
+    """Path of the trajectory file; it may be the file of another program in ManiSkill's format."""
     episodes: int = NUM_SHOWN
     """Number of episodes to list one by one."""
 
@@ -39,7 +41,7 @@ def sparkline(values: np.ndarray, top: float) -> str:
     if len(values) == 0:
         return ""
     stretches = np.array_split(values, min(WIDTH, len(values)))
-    levels = [round(min(max(stretch.max() / max(top, 1e-9), 0), 1) * (len(BARS) - 1)) for stretch in stretches]
+    levels = [round(min(max(stretch.max() / max(top, LEAST_TOP), 0), 1) * (len(BARS) - 1)) for stretch in stretches]
     return "".join(BARS[level] for level in levels)
 
 
@@ -66,7 +68,7 @@ def summary(path: Path, num_shown: int = NUM_SHOWN) -> Group:
     episodes = header["episodes"]
     with open_trajectories(path) as file:
         places = [f"traj_{episode['episode_id']}/contact_force" for episode in episodes]
-        forces = [file[place][()] for place in places if place in file]  # other programs' files have none
+        forces = [file[place][()] for place in places if place in file]  # files of other programs hold no forces
         sizes: dict[str, int] = {}
 
         def count(name: str, item: h5py.HLObject) -> None:
@@ -94,7 +96,7 @@ def _file_table(path: Path, header: dict) -> Table:
     )
     table.add_row("steps", f"{lengths.mean():.0f} on average, {lengths.min()} to {lengths.max()}, {lengths.sum()} in all")
     table.add_row(
-        "size", f"{path.stat().st_size / 1e6:.2f} MB, {path.stat().st_size / 1e6 / max(len(episodes), 1):.2f} an episode"
+        "size", f"{path.stat().st_size / 1e6:.2f} MB, {path.stat().st_size / 1e6 / max(len(episodes), 1):.2f} per episode"
     )
     return table
 
@@ -125,7 +127,7 @@ def _episode_table(episodes: list[dict], forces: list[np.ndarray] | None) -> Tab
 
 
 def _size_table(sizes: dict[str, int], episodes: int) -> Table:
-    table = Table("array", "MB", "kB an episode", title="sizes of the arrays")
+    table = Table("array", "MB", "kB per episode", title="sizes of the arrays")
     for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:NUM_SHOWN]:
         table.add_row(name, f"{size / 1e6:.2f}", f"{size / 1e3 / max(episodes, 1):.1f}")
     return table

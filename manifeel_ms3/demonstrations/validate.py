@@ -59,7 +59,7 @@ def _problems(folder: Path, name: str, entry: dict[str, Any], num_replays: int) 
     """Faults of one trajectory file, given its name and its entry in the manifest."""
     path = folder / name
     if not path.resolve().is_relative_to(folder.resolve()):
-        return [f"a manifest names files in its own folder {folder} alone; get it again from its source"]
+        return [f"a manifest only names files in its own folder {folder}; get it again from its source"]
     return _problems_of_file(path, entry, num_replays)
 
 

@@ -22,6 +22,7 @@ import tyro
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, PandaGelSight
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import MachineError
+from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
@@ -29,11 +30,10 @@ from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_he
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-LOOPBACK = "127.0.0.1"
-"""Address that only this machine reaches; Rerun's own default is every address of the machine, without a password."""
 FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
 """Names of the components of the force on a whole pad, in the order of the force field's channels."""
 JOINTS = tuple(PandaGelSight.arm_joint_names)
+"""Names of the joints of the arm."""
 JOINT_AXES = {
     f"{mode}{end}": names
     for mode in ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_target_delta_pos")
@@ -53,21 +53,21 @@ class Args:
     save: Path | None = None
     """Path of a .rrd file to write, which `rerun` opens; the viewer is opened if not given."""
     web: bool = False
-    """Serve the viewer for a browser, to this machine only."""
+    """Whether the viewer is served for a browser, which must run on this machine."""
     port: int = 9090
     """Port of the viewer in the browser."""
 
 
 @dataclass(frozen=True)
 class EpisodeStreams:
-    """All that the viewer shows of an episode, by place in Rerun's tree."""
+    """Everything that the viewer shows of an episode, by its path in Rerun's tree."""
 
     title: str
-    """Task and seed."""
+    """Name of the task, and seed of the episode."""
     images: dict[str, np.ndarray]
-    """Images uint8 (T + 1, H, W, 3)."""
+    """Images uint8 (T + 1, H, W, 3) by path."""
     series: dict[str, tuple[list[str], np.ndarray]]
-    """Names of lines, and their values (T or T + 1, lines)."""
+    """Names of lines, and their values (T or T + 1, lines), by path."""
 
 
 def main(args: Args) -> None:
@@ -93,6 +93,8 @@ def main(args: Args) -> None:
 def viewer_command(file: Path, web_port: int | None) -> list[str]:
     """Command that shows a .rrd file in Rerun's viewer and listens on the loopback address only.
 
+    By default, Rerun would listen on every address of the machine, without a password.
+
     Args:
         file: Path of the .rrd file.
         web_port: Port at which the viewer is served for a browser; None for the viewer in a window of its own.
@@ -110,14 +112,14 @@ def viewer_command(file: Path, web_port: int | None) -> list[str]:
 
 
 def _free_port() -> int:
-    """A free port: at Rerun's usual one another user's viewer could listen, and be given the episode."""
+    """Number of a free port; on Rerun's default port, another user's viewer could listen and receive the episode."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return probe.getsockname()[1]
 
 
 def _show(command: list[str]) -> None:
-    """Run the viewer until it is closed or this process is interrupted; it never outlives an orderly end of this process."""
+    """Run the viewer until it is closed or this process is interrupted; then the viewer ends, too."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with subprocess.Popen(command) as viewer:
         try:
@@ -126,7 +128,7 @@ def _show(command: list[str]) -> None:
                     f"Rerun's viewer ended with exit code {viewer.returncode}; use --web or --save without a screen"
                 )
         finally:
-            viewer.kill()  # it has nothing to save
+            viewer.kill()  # the viewer has nothing to save
             viewer.wait()
 
 
@@ -154,7 +156,7 @@ def rerun_recording(file: Path, episode: int) -> Any:
 
 
 def read_streams(file: Path, episode: int) -> EpisodeStreams:
-    """Read all that is shown of an episode.
+    """Read everything that is shown of an episode.
 
     Raises:
         DemonstrationError: The file is missing or broken, or has no such episode.
@@ -200,7 +202,7 @@ def _images(group: Any) -> Iterator[tuple[str, np.ndarray]]:
 
 def _series(group: Any, action_names: list[str]) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
     """Numbers over time of an episode, by place."""
-    if "contact_force" in group:  # other programs' files have none
+    if "contact_force" in group:  # files of other programs hold no forces
         yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "force_field" in data:

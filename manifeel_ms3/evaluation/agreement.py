@@ -1,11 +1,11 @@
-"""Whether an episode that is run again has the outcome that a result says."""
+"""Check of whether an episode that is run again has the outcome that a result holds."""
 
 from typing import Any
 
 from .rollout import EpisodeOutcome, outcome_as_json
 
 FORCE_TOLERANCE = 0.01
-"""Difference in N between forces that count as the same; a result rounds them to 0.001 N."""
+"""Largest difference in N between forces that count as equal; a result rounds them to 0.001 N."""
 FORCES = ("peak_contact_force", "force_until_success")
 """Entries of an episode that are forces."""
 COMPARED = ("success_once", "success_at_end", "fail_once", "fail_at_end", "first_success", "episode_len", *FORCES)

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import file_hash
 
 TRAINING_STATE = "training.safetensors"
-"""File that only training reads; it is deleted from older checkpoints, and is not part of their hash."""
+"""File that only training reads; it is deleted from older checkpoints, and the hash leaves it out."""
 TRAINING_LOSS = "losses/total_loss"
 """Name of the training loss in log.jsonl, the log beside the checkpoints."""
 HASHED = ("model.safetensors", "config.json")
-"""Files of a checkpoint whose contents, one after the other, its published hash is of."""
-CHUNK = 2**20
-"""Number of bytes that are read at a time."""
+"""Files of a checkpoint from whose contents, one after the other, its published hash is computed."""
 
 
 class CheckpointError(InvalidFileError):
@@ -58,27 +57,13 @@ def checkpoint_hash(checkpoint: Path) -> str:
     return digest.hexdigest()
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file's content."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while chunk := file.read(CHUNK):
-            digest.update(chunk)
-    return digest.hexdigest()
-
-
 def checkpoint_sha256(checkpoint: Path) -> str:
     """The published hash of a checkpoint, which `cat model.safetensors config.json | sha256sum` prints, too.
 
     Raises:
         CheckpointError: One of the two files is missing, or cannot be read.
     """
-    digest = hashlib.sha256()
     try:
-        for name in HASHED:
-            with (checkpoint / name).open("rb") as file:
-                while chunk := file.read(CHUNK):
-                    digest.update(chunk)
+        return file_hash(*(checkpoint / name for name in HASHED))
     except OSError as error:
         raise CheckpointError(f"{checkpoint} cannot be hashed ({error}); give a folder with {' and '.join(HASHED)}") from error
-    return digest.hexdigest()

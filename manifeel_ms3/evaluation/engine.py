@@ -15,7 +15,7 @@ from manifeel_ms3.tasks.obs_modes import announce_images_of_workers
 from manifeel_ms3.tasks.registry import make_env
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
-from .policy import Policy, PolicySource
+from .policy import STEP_TIMEOUT, Policy, PolicySource
 from .policy_process import PolicyProcess, SharedPolicy
 from .redaction import secrets_in, without_secrets
 from .rollout import EpisodeOutcome, evaluate_episode, failed_outcome
@@ -35,7 +35,7 @@ class Evaluation:
     """Configuration of the policy; the result holds it without paths, passwords and tokens."""
     stop_at_success: bool = False
     """Whether episodes end at success or failure instead of at the time limit."""
-    step_timeout: float = 60.0
+    step_timeout: float = STEP_TIMEOUT
     """Longest time that the policy may take for one action, in s."""
 
 
@@ -47,8 +47,8 @@ def run_episodes(
 ) -> list[EpisodeOutcome]:
     """Run episodes in worker processes; an episode whose process dies has failed.
 
-    A policy that can answer several episodes at once is held by one more process, others by each worker. The number of
-    workers changes no outcome.
+    A policy that can answer several episodes at once runs in one additional process; any other policy runs in each worker. The
+    number of workers changes no outcome.
 
     Args:
         evaluation: The policy, and the task.
@@ -60,8 +60,8 @@ def run_episodes(
         Outcomes in the order of the seeds.
 
     Raises:
-        PolicyUnavailableError: The policy cannot be asked.
-        Exception: What making the environment or the policy raises.
+        PolicyUnavailableError: The policy cannot be reached.
+        Exception: The error that making the environment or the policy raises.
     """
     if not seeds:
         return []
@@ -104,8 +104,8 @@ def _reason(error: WorkerDiedError, evaluation: Evaluation) -> str:
 
 
 def _make_env_and_policy(evaluation: Evaluation, address: str | None) -> tuple[gym.Env, Policy]:
-    """What a worker keeps from one episode to the next."""
-    gc.freeze()  # ManiSkill collects garbage at each reset, which then passes over all that was imported
+    """The environment and the policy, which a worker keeps from one episode to the next."""
+    gc.freeze()  # ManiSkill collects garbage at each reset, and then skips all that was imported
     env = make_env(evaluation.env_id, **evaluation.env_kwargs)
     make = evaluation.source.make
     return env, make() if address is None else SharedPolicy(address, make)

@@ -1,7 +1,7 @@
 """Entries of the leaderboard whose checkpoints are in the repository, so that anyone can run them again.
 
 An entry is a folder such as leaderboard/cpu/PegInsertion/rgb+tacff. Its folder seed0 has the result of the first training seed,
-such as `00007000.json`, and the checkpoint that it is of, `checkpoints/00007000`. The submission.json of the submission (here
+such as `00007000.json`, and its checkpoint, `checkpoints/00007000`. The submission.json of the submission (here
 leaderboard/cpu) names the hash of every checkpoint.
 """
 
@@ -34,7 +34,7 @@ class Entry:
     """Folder of the checkpoint."""
 
     def agreement(self, outcomes: list[EpisodeOutcome]) -> str:
-        """In how many episodes some outcomes agree with those of the entry, as a sentence; it names what differs."""
+        """Sentence that says how many of the given outcomes agree with those of the entry, and names the first difference."""
         submitted = {episode["seed"]: episode for episode in self.result["episodes"]}
         compared = [outcome for outcome in outcomes if outcome.seed in submitted]
         differing = {one.seed: found for one in compared if (found := differences(submitted[one.seed], one))}
@@ -50,13 +50,13 @@ class Entry:
 
 
 def find_entry(name: str) -> Entry:
-    """The entry of a name.
+    """The entry with a given name.
 
     Args:
         name: Path of the entry's folder on the leaderboard, such as "cpu/PegInsertion/rgb+tacff".
 
     Raises:
-        UnknownNameError: There is no such entry with a checkpoint; the message lists those that there are.
+        UnknownNameError: There is no such entry with a checkpoint; the message lists the entries that have one.
         InvalidFileError: The checkpoint is not the one that the submission names.
         ResultError: The result is broken.
     """

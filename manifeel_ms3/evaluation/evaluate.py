@@ -34,7 +34,7 @@ from .checkpoint_config import CheckpointError, checkpoint_config
 from .engine import Evaluation, run_episodes
 from .entries import Entry, find_entry
 from .journal import Journal
-from .policy import BATCH_SIZES, PolicySource, checked_device
+from .policy import BATCH_SIZES, STEP_TIMEOUT, PolicySource, checked_device
 from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
@@ -42,8 +42,8 @@ from .seed_list import read_seeds
 
 log = logging.getLogger(__name__)
 SENSING = ("obs_mode", "cameras", "tactile_sensors")
-"""Arguments of the environment that a checkpoint's configuration holds by themselves; those of the demonstrations are in its
-entry env_kwargs."""
+"""Arguments of the environment that have entries of their own in a checkpoint's configuration; its entry env_kwargs holds the
+other arguments, with which the demonstrations were recorded."""
 BACKEND = dict(sim_backend="physx_cpu")
 """Backend of the simulation, the one that demonstrations are recorded with."""
 
@@ -96,7 +96,7 @@ class Args:
     stop_at_success: bool = False
     """End an episode at success or failure, which is cheaper; the result then lacks success_at_end and fail_at_end. Without
     this flag every episode runs to the time limit of the task, as in ManiSkill's evaluation."""
-    step_timeout: float = 60.0
+    step_timeout: float = STEP_TIMEOUT
     """Longest time that the policy may take for one action, in s."""
     env_kwargs: str = "{}"
     """Arguments of the task as json, such as '{"fit": "tight"}'."""
@@ -144,7 +144,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
     """The arguments with which the result of an entry was made, and a result in the working folder.
 
     Raises:
-        InvalidArgumentError: Another policy is given besides.
+        InvalidArgumentError: Another policy is given as well.
     """
     if args.checkpoint is not None or args.policy is not None:
         raise InvalidArgumentError("--entry brings its checkpoint; leave out --checkpoint and --policy")
@@ -161,12 +161,12 @@ def _like_entry(args: Args, entry: Entry) -> Args:
 
 
 def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Path) -> None:
-    """Check before the first episode what would else fail after the last one.
+    """Check before the first episode what would otherwise fail after the last one.
 
     Raises:
-        InvalidArgumentError: The result is a folder, or there is no episode that a video is asked of.
+        InvalidArgumentError: The result is a folder, or a video of an episode that does not exist is requested.
         ResultError: The arguments cannot be part of a result.
-        MissingExtraError: Videos are asked for, and the extra `report` is not installed.
+        MissingExtraError: Videos are requested, and the extra `report` is not installed.
     """
     try:
         if out.is_dir():
@@ -219,7 +219,9 @@ def evaluation_from_args(args: Args) -> Evaluation:
     if args.env_id is None or args.obs_mode is None:
         raise InvalidArgumentError("a --policy of your own needs --env-id and --obs-mode")
     if unused := [name for name in ("device", "batch_size") if getattr(args, name) is not None]:
-        raise InvalidArgumentError(f"{_flags(unused)} are for a --checkpoint; tell a --policy of your own by --policy-kwargs")
+        raise InvalidArgumentError(
+            f"{_flags(unused)} are for a --checkpoint; give them to a --policy of your own by --policy-kwargs"
+        )
     env_id = task_spec(args.env_id).env_id
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs, answer_timeout=args.step_timeout)
@@ -234,7 +236,8 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     config = checkpoint_config(checkpoint)
     if missing := [name for name in ("env_id", *SENSING) if name not in config]:
         raise CheckpointError(f"{checkpoint}: its config.json lacks {missing}; train the policy again")
-    config |= {name: value for name, value in kwargs.items() if name == "inference_steps" and value}  # what the policy does
+    # recorded in the result, because it changes the actions
+    config |= {name: value for name, value in kwargs.items() if name == "inference_steps" and value}
     env_id = task_spec(config["env_id"]).env_id
     trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
     sensing = {name: config[name] for name in SENSING}

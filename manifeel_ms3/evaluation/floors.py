@@ -13,7 +13,7 @@ from manifeel_ms3.files import read_json
 from manifeel_ms3.paths import data_dir
 
 FLOORS_SCHEMA = "manifeel-floors-1"
-"""Version of the form of the files."""
+"""Name and version of the form of the files."""
 POLICIES = {
     "random": "uniformly random actions",
     "mean action": "the mean action of demonstrations",

@@ -1,4 +1,4 @@
-"""Gentle success: a task is solved, and no larger force acted on the held object until then than a limit.
+"""Gentle success: the task is solved, and the contact force of the held object stayed within a limit until then.
 
 The limit of each task is `TaskSpec.force_limit`, twice the median over demonstrations of their largest contact force.
 """
@@ -10,7 +10,7 @@ import numpy as np
 
 
 def is_gentle(episode: dict[str, Any], force: float) -> bool:
-    """Whether an episode succeeded, and its contact force had stayed within a limit up to the first success.
+    """Whether an episode succeeded, and its contact force stayed within a limit up to the first success.
 
     Args:
         episode: Episode of a result file.
@@ -21,7 +21,7 @@ def is_gentle(episode: dict[str, Any], force: float) -> bool:
 
 
 def success_under_force(episodes: Iterable[dict[str, Any]], forces: Sequence[float] | np.ndarray) -> np.ndarray:
-    """The curve of success against the force allowed: the share of episodes that are gentle under each limit.
+    """The curve of success against the force allowed: the share of episodes (forces,) that succeed gently under each limit.
 
     Args:
         episodes: Episodes of one or several result files.

@@ -1,4 +1,4 @@
-"""The finished episodes of an evaluation that has not ended yet, so that an interruption loses at most those that are running.
+"""The finished episodes of an evaluation that has not ended yet, so that an interruption loses at most the running ones.
 
 The file `<name of the result>.episodes.jsonl` lies beside the result. Its first line says what is evaluated, every other line
 is the outcome of an episode and reaches the disk as soon as the episode ends. The file is deleted once the result, which holds
@@ -49,7 +49,7 @@ class Journal:
         self._first_line = json.dumps(evaluation | dict(seeds=seeds), default=str, allow_nan=False)
         self.outcomes = {} if overwrite or not self.path.exists() else self._read()
         lines = [self._first_line, *map(_line_of, self.outcomes.values())]
-        write_text(self.path, "".join(f"{line}\n" for line in lines))  # without a line that broke off
+        write_text(self.path, "".join(f"{line}\n" for line in lines))  # leaves out an incomplete last line
 
     @property
     def remaining(self) -> list[int]:
@@ -65,7 +65,7 @@ class Journal:
         """Write the outcome of an episode to the disk.
 
         Raises:
-            FileWriteError: It cannot be written.
+            FileWriteError: The outcome cannot be written.
         """
         try:
             with self.path.open("a", encoding="utf-8") as file:
@@ -78,7 +78,7 @@ class Journal:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """A context that deletes the file at its end, and that says what is kept where an exception or Ctrl-C ends it."""
+        """Context that deletes the file at its end; if an exception or Ctrl-C ends it, finished episodes stay in the file."""
         try:
             yield
         except BaseException:
@@ -94,7 +94,7 @@ class Journal:
 
     def _read(self) -> dict[int, EpisodeOutcome]:
         try:
-            whole, _, _ = self.path.read_bytes().rpartition(b"\n")  # the last line may have broken off
+            whole, _, _ = self.path.read_bytes().rpartition(b"\n")  # the last line may be incomplete
             evaluation, *episodes = map(json.loads, whole.split(b"\n"))
             schema = result_schema()["properties"]["episodes"]["items"]
             for episode in episodes:

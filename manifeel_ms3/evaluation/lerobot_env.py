@@ -1,4 +1,4 @@
-r"""The tasks as LeRobot drives them, and `make_env`, the function that LeRobot's EnvHub looks for.
+r"""The tasks as environments of LeRobot, and `make_env`, the function that LeRobot's EnvHub looks for.
 
 A repository of the EnvHub needs a file env.py with `make_env` in it: `examples/lerobot_envhub` is such a repository. With the
 command line of LeRobot, and without the Hub, the plug-in beside this module names the same environments:
@@ -32,8 +32,8 @@ class LeRobotEnv(gym.Env):
     """One task with the observations, the `info` and the attributes that LeRobot's evaluation asks for.
 
     An observation holds `pixels`, a dict with the image of each camera and of each pad (`tactile_right`); `agent_pos`, the pose
-    of the tool in the base frame (7,), m and wxyz; and `tactile.<side>.force_field`, N (LeRobot drops what it does not know
-    before version 0.5). An episode ends at success, at failure or at the time limit.
+    of the tool in the base frame (7,), m and wxyz; and `tactile.<side>.force_field`, N (LeRobot before version 0.5 drops
+    keys that it does not know). An episode ends at success, at failure or at the time limit.
 
     Args:
         env_id: Id of the task.
@@ -63,7 +63,7 @@ class LeRobotEnv(gym.Env):
         self.observation_space = _space_of(_as_lerobot(first))
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode. LeRobot's own options are for its wrappers, and are left out."""
+        """Begin an episode. The options are for LeRobot's own wrappers, and are not used here."""
         super().reset(seed=seed)
         obs, info = self._env.reset(seed=seed)
         return _as_lerobot(obs), _info_of(info)
@@ -80,7 +80,7 @@ class LeRobotEnv(gym.Env):
 
 
 def _as_lerobot(obs: dict[str, Any]) -> dict[str, Any]:
-    """The observation by LeRobot's keys."""
+    """The observation with LeRobot's keys."""
     pixels, fields = {}, {}
     for name, sensor in obs.get("sensor_data", {}).items():
         if "rgb" in sensor:
@@ -104,7 +104,7 @@ def _info_of(info: dict[str, Any]) -> dict[str, Any]:
 
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: Any = None) -> dict[str, dict[int, VectorEnv]]:
-    """Vectorised environments by the category of their task and by a number, as LeRobot's EnvHub asks for them.
+    """Vectorized environments by the category of their task and by a number, as LeRobot's EnvHub asks for them.
 
     Args:
         n_envs: Number of environments of each task.

@@ -16,9 +16,10 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.errors import InvalidFileError
 
 MEAN_FACTOR, LONGEST_FACTOR = 2.0, 1.5
-"""Time limit over the mean length of demonstrations, as ManiSkill's baselines recommend, and over the longest, at least."""
+"""Smallest ratios of the time limit to the mean length of demonstrations, as ManiSkill's baselines recommend, and to the
+longest demonstration, which is our choice."""
 FORCE_FACTOR = 2.0
-"""Force limit over the median of the demonstrations' largest contact forces."""
+"""Ratio of the force limit to the median of the demonstrations' largest contact forces: our choice."""
 STEPS = 10
 """Time limits are multiples of this number of control steps."""
 
@@ -28,6 +29,7 @@ class Limits:
     """Limits of a task, and the demonstrations that they follow from."""
 
     max_episode_steps: int
+    """Time limit, in control steps."""
     force_limit: float
     """Largest contact force of a gentle success, in N."""
     demo_steps: float
@@ -52,7 +54,7 @@ def limits_of_file(path: Path) -> Limits:
     """The limits that follow from the successful demonstrations of a trajectory file.
 
     Raises:
-        InvalidFileError: The file holds none, or does not say their forces.
+        InvalidFileError: The file holds no successful demonstration, or does not name their forces.
     """
     episodes = [episode for episode in read_header(path)["episodes"] if episode["success"]]
     forces = [episode["peak_contact_force"] for episode in episodes if "peak_contact_force" in episode]

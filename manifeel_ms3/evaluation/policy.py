@@ -13,10 +13,14 @@ import torch
 
 from manifeel_ms3 import plugins
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
+from manifeel_ms3.files import file_hash
 from manifeel_ms3.typed_modules import look_in_working_folder
 
-from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash, file_hash
+from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash
 from .redaction import redacted
+
+STEP_TIMEOUT = 60.0
+"""Longest time in s that a policy may take for one action if no other time is given; set once, not tuned."""
 
 
 class Policy(Protocol):
@@ -38,7 +42,7 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class PolicyRequest:
-    """What one episode asks of a policy that answers several episodes at once."""
+    """The request of one episode for actions, to a policy that answers several episodes at once."""
 
     seed: int
     """Seed of the episode."""
@@ -49,32 +53,34 @@ class PolicyRequest:
 
 
 Ask = Callable[[PolicyRequest], np.ndarray]
-"""Function that returns the answer to a question; what an answer is, the policy and its part beside the episode agree on."""
+"""Function that sends a request to the policy and returns its answer, an array whose form the policy and its part beside the
+episode agree on."""
 
 
 class BatchPolicy(Protocol):
-    """A policy of which one object answers all episodes, in batches: one network on one device.
+    """A policy of which one object answers the requests of all episodes in batches: one network on one device.
 
-    It keeps nothing of an episode. What an episode must remember is kept by its part beside the episode, which
-    `make_episode_part` makes in the process that simulates. A registered policy (`manifeel.policies`) may be one.
+    The object keeps no state of an episode. This state is kept by the policy's part beside the episode, which
+    `make_episode_part` makes in the process that simulates. A registered policy (`manifeel.policies`) may be a `BatchPolicy`.
     """
 
     make_episode_part: Callable[[Ask], Policy]
-    """Makes the part of the policy that runs beside an episode, a `Policy`, from the function that it asks. It is pickled."""
+    """Function that makes the part of the policy that runs beside an episode, a `Policy`. It takes the function to which this
+    part gives its requests, and is pickled."""
     batch_size: int
-    """Number of questions that are answered together."""
+    """Largest number of requests that are answered together."""
 
-    def answer(self, questions: list[PolicyRequest]) -> list[np.ndarray]:
-        """One answer for each question; it depends on the question alone, not on those beside it."""
+    def answer(self, requests: list[PolicyRequest]) -> list[np.ndarray]:
+        """One answer for each request; it depends on this request only, not on the others in the batch."""
         ...
 
 
 class PolicyError(InvalidArgumentError):
-    """A policy of the user's own cannot be made."""
+    """A class or server that the user named as the policy cannot be made."""
 
 
 class PolicyUnavailableError(ServerError):
-    """The policy cannot be asked, for a reason that is not its own: its server is not running, or does not keep episodes apart.
+    """The policy cannot be reached through no fault of its own: its server is not running, or does not keep episodes apart.
 
     It ends the evaluation. Any other error of a policy is its own fault and fails the episode.
     """
@@ -96,12 +102,12 @@ class PolicySource:
     """Device that computes a checkpoint's policy, such as "cpu" or "cuda"."""
     batch_size: int | None = None
     """Number of episodes that a checkpoint's policy answers together."""
-    answer_timeout: float = 60.0
+    answer_timeout: float = STEP_TIMEOUT
     """Longest time in s that a server may take for an answer."""
 
     @property
     def is_shared(self) -> bool:
-        """Whether one object may answer all episodes, as a registered policy may; each process makes one of the user's own."""
+        """Whether one object may answer all episodes, as for a checkpoint; other policies are made in each process."""
         return self.checkpoint is not None
 
     def make(self) -> Policy:
@@ -123,7 +129,7 @@ class PolicySource:
             return import_name(name)(**kwargs)
         except ManifeelError:
             raise
-        except Exception as error:  # the constructor is anybody's code
+        except Exception as error:  # the constructor may raise anything
             raise PolicyError(
                 f"{redacted(name)} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, "
                 "and its arguments as --policy-kwargs"
@@ -144,7 +150,7 @@ class PolicySource:
         try:
             spec = importlib.util.find_spec(str(self.policy).partition(":")[0])
             return file_hash(Path(spec.origin)) if spec and spec.origin else None
-        except Exception:  # packages are imported on the way; `make` names what is wrong
+        except Exception:  # the search imports packages, which may fail; `make` names the fault
             return None
 
 
@@ -154,11 +160,11 @@ take longer in the same proportion; a GPU computes 16 in the time of one."""
 
 
 def checked_device(name: str | None) -> str:
-    """A device of torch that this machine has: the given one, or a GPU if there is one and none is given.
+    """Name of a torch device that this machine has: the given one; if none is given, a GPU if there is one, else the CPU.
 
     Raises:
-        InvalidArgumentError: It is not the name of a device.
-        MachineError: This machine does not have it.
+        InvalidArgumentError: The name is not that of a device.
+        MachineError: This machine does not have the device.
     """
     if name is None:
         return "cuda" if torch.cuda.is_available() else "cpu"
@@ -170,7 +176,9 @@ def checked_device(name: str | None) -> str:
         torch.zeros(1, device=device)
     except Exception as error:  # torch's backends raise errors of many types
         reason = str(error).splitlines()[0]
-        raise MachineError(f"--device {name} is not there ({reason}); give --device cpu, or install a torch for it") from error
+        raise MachineError(
+            f"--device {name} is not there ({reason}); give --device cpu, or install a build of torch that supports it"
+        ) from error
     return name
 
 
@@ -202,7 +210,7 @@ def load_policy(checkpoint: Path, **kwargs: Any) -> Policy:
 
 
 def import_name(name: str) -> Any:
-    """The object that "module:Name" stands for.
+    """The object that a name such as "module:Name" stands for.
 
     Only names that the user gives on the command line are imported, never a name that a file holds.
     """

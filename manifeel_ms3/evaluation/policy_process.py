@@ -4,8 +4,9 @@
     SharedPolicy.act  --- PolicyRequest --->  PolicyProcess (a thread)  --- batch --->  answer_batches
                       <------ answer -------                            <-- answers ---
 
-The main process passes questions on, so that it knows which of them a policy that crashes or hangs was busy with. These are
-asked again one by one in a new process, and only the question that ends it alone fails its episode.
+The main process passes requests on, so that it knows which of them the policy was working on when it crashed or hung. These
+requests are sent again, one by one, to a new process, and only a request that makes the policy crash or hang on its own fails
+its episode.
 """
 
 import contextlib
@@ -32,24 +33,28 @@ from .policy import Policy, PolicyRequest, PolicySource, PolicyUnavailableError
 from .rollout import PolicyFault, begin_episode
 
 FIRST_ANSWER = 120.0
-"""Time in s that the first answer of a process may take beyond the usual limit: libraries prepare themselves."""
+"""Time in s that the first answer of a process may take beyond the usual limit, because libraries initialize themselves; set
+once, not tuned."""
 ENDED = "the process that holds the policy has ended; run the command again"
 LONGEST_FOLDER = 60
-"""Number of characters of the folder for temporary files beyond which /tmp is used: the path of a socket has 107 at most."""
+"""Largest number of characters in the path of the folder for temporary files. If it is longer, /tmp is used, because the path
+of a Unix socket has 107 characters at most (man 7 unix)."""
 BACKLOG = 128
-"""Simulating processes that may wait to be connected; more than any machine runs at once."""
+"""Number of simulating processes that may wait to be connected; more than any machine runs at once."""
 LEAST_WAIT = 0.05
-"""Time in s between two looks at a limit."""
+"""Time in s that passes after a deadline before it is checked, and that the policy's process has to end by itself before it is
+killed; set once, not tuned."""
 
 
 @dataclass(frozen=True)
 class Ready:
-    """A policy's process has made its policy."""
+    """Message of the policy's process: it has made the policy."""
 
     make_episode_part: bytes | None
     """`BatchPolicy.make_episode_part`, pickled, which the main process passes on as it is; None for a policy that answers one
     episode only."""
     batch_size: int = 1
+    """Largest number of requests that are answered together."""
 
 
 @dataclass
@@ -59,15 +64,16 @@ class _Caller:
     connection: Connection
     knows_policy: bool = False
     """Whether it has been sent the policy's description."""
-    question: PolicyRequest | None = None
-    """The question that waits for its answer."""
+    request: PolicyRequest | None = None
+    """The request that waits for its answer."""
     asked_at: float = 0.0
+    """Time of the request in s, by `time.monotonic`."""
     alone: bool = False
-    """Whether the question must be asked alone, since one of those beside it may have ended the policy's process."""
+    """Whether the request must be sent alone, because another request of its batch may have ended the policy's process."""
 
 
 class PolicyProcess:
-    """The policy's process, seen from the main process. It is used as a context, and starts at its beginning.
+    """The policy's process, as the main process sees it. It is a context manager: the process runs while the context lasts.
 
     Args:
         source: Place that the policy comes from.
@@ -80,7 +86,7 @@ class PolicyProcess:
         # only this user may enter it
         self._folder = tempfile.TemporaryDirectory(prefix="manifeel-", dir=None if short else "/tmp")
         self.address = str(Path(self._folder.name) / "policy")
-        """Path of the socket at which simulating processes ask."""
+        """Path of the socket to which simulating processes connect."""
         self._callers: dict[Connection, _Caller] = {}
         self._busy: list[_Caller] = []
         self._deadline = 0.0
@@ -128,7 +134,7 @@ class PolicyProcess:
     def _serve(self) -> None:
         try:
             self._pass_on()
-        finally:  # callers then know that nobody answers
+        finally:  # so that callers notice that nobody answers any more
             self._listener.close()
             for connection in self._callers:
                 connection.close()
@@ -167,11 +173,11 @@ class PolicyProcess:
 
     def _hear_caller(self, caller: _Caller) -> None:
         try:
-            caller.question, caller.asked_at, caller.alone = caller.connection.recv(), time.monotonic(), False
+            caller.request, caller.asked_at, caller.alone = caller.connection.recv(), time.monotonic(), False
         except (EOFError, OSError):  # the process has ended
             del self._callers[caller.connection]
             caller.connection.close()
-            caller.question = None
+            caller.request = None
 
     def _hear_policy(self) -> None:
         try:
@@ -189,7 +195,7 @@ class PolicyProcess:
             self._reply(caller, answer)
 
     def _policy_ended(self, reason: str) -> None:
-        """Start the process again; a question that was asked alone fails, others are asked again, alone."""
+        """Start the process again. A request that was sent alone fails; those of a batch are sent again, one by one."""
         self._stop()
         if self._ready is None:
             self._ready = WorkFailedError(f"{reason}, before the policy was loaded; as happens where memory runs out")
@@ -204,29 +210,29 @@ class PolicyProcess:
 
     def _reply(self, caller: _Caller, answer: Any) -> None:
         waited = max(self._begun - caller.asked_at, 0.0)
-        caller.question = None
+        caller.request = None
         _send(caller.connection, (answer, waited))
 
     def _tell_callers(self) -> None:
-        """Tell new callers what the policy is, and all who wait if it cannot be loaded any more."""
+        """Send new callers the policy's description, and waiting callers the error if the policy cannot be loaded any more."""
         for caller in self._callers.values() if self._ready is not None else ():
             if not caller.knows_policy:
                 caller.knows_policy = True
                 _send(caller.connection, self._ready)
-            elif caller.question is not None and isinstance(self._ready, Exception):
+            elif caller.request is not None and isinstance(self._ready, Exception):
                 self._reply(caller, self._ready)
 
     def _ask_next_batch(self) -> None:
         if self._busy or not isinstance(self._ready, Ready):
             return
-        waiting = sorted((c for c in self._callers.values() if c.question is not None), key=lambda c: c.asked_at)
+        waiting = sorted((c for c in self._callers.values() if c.request is not None), key=lambda c: c.asked_at)
         alone = [caller for caller in waiting if caller.alone][:1]
         batch = alone or waiting[: self._ready.batch_size]
         if not batch:
             return
         self._busy, self._begun = batch, time.monotonic()
         self._deadline = self._begun + self._timeout + (0.0 if self._answered else FIRST_ANSWER)
-        _send(self._policy, [caller.question for caller in batch])
+        _send(self._policy, [caller.request for caller in batch])
 
 
 def _send(connection: Connection, message: Any) -> None:
@@ -236,7 +242,7 @@ def _send(connection: Connection, message: Any) -> None:
 
 @contextlib.contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Processes and threads that start now never see Ctrl-C, which is for the main thread."""
+    """Context in which new processes and threads ignore Ctrl-C, which only the main thread handles."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -252,10 +258,11 @@ class SharedPolicy:
 
     Args:
         address: Address of the `PolicyProcess`.
-        make: Makes a policy for this process alone, where the policy answers one episode only.
+        make: Function that makes a policy for this process alone, if the policy answers one episode only.
 
     Raises:
-        Exception: What the policy raised when it was made.
+        Exception: The error that making the policy raised.
+        PolicyUnavailableError: The `PolicyProcess` has ended.
     """
 
     def __init__(self, address: str, make: Callable[[], Policy]):
@@ -287,15 +294,15 @@ class SharedPolicy:
         self.waited = 0.0
         return self._part.act(obs)
 
-    def _ask(self, question: PolicyRequest) -> np.ndarray:
-        """The policy's answer to a question.
+    def _ask(self, request: PolicyRequest) -> np.ndarray:
+        """The policy's answer to a request.
 
         Raises:
             PolicyFault: The policy raised an error, crashed, or did not answer in time.
-            PolicyUnavailableError: The policy cannot be asked any more.
+            PolicyUnavailableError: The policy's process has ended.
         """
         try:
-            self._connection.send(question)
+            self._connection.send(request)
             answer, self.waited = self._connection.recv()
         except (EOFError, OSError) as error:
             raise PolicyUnavailableError(ENDED) from error
@@ -312,11 +319,11 @@ def _raised(message: Any) -> Any:
 
 
 def answer_batches(source: PolicySource, connection: Connection) -> None:
-    """Make the policy, and answer batches of questions until the other end of the connection is closed.
+    """Make the policy, and answer batches of requests until the other end of the connection is closed.
 
     Each answer is an array, or the exception that the policy raised.
     """
-    torch.set_num_threads(1)  # sums, and so the episodes, depend on the number of threads
+    torch.set_num_threads(1)  # the rounding of sums, and so the episodes, depend on the number of threads
     threading.Thread(target=end_with_parent, daemon=True).start()
     try:
         policy: Any = source.make()
@@ -332,15 +339,15 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
             connection.send(_answers(policy, connection.recv()))
 
 
-def _answers(policy: Any, questions: list[PolicyRequest]) -> list[np.ndarray | Exception]:
+def _answers(policy: Any, requests: list[PolicyRequest]) -> list[np.ndarray | Exception]:
     try:
-        answers = policy.answer(questions)
-        if len(answers) != len(questions):
-            raise PolicyFault(f"it gave {len(answers)} answers to {len(questions)} questions")
+        answers = policy.answer(requests)
+        if len(answers) != len(requests):
+            raise PolicyFault(f"it gave {len(answers)} answers to {len(requests)} requests")
         return list(answers)
-    except Exception as error:  # a policy is anybody's code
-        if len(questions) > 1:
-            return [answer for question in questions for answer in _answers(policy, [question])]
+    except Exception as error:  # a policy may raise anything
+        if len(requests) > 1:
+            return [answer for request in requests for answer in _answers(policy, [request])]
         known = isinstance(error, PolicyFault | PolicyUnavailableError)
         return [error if known else PolicyFault(f"{type(error).__name__}: {error}")]
 

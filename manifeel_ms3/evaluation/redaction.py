@@ -1,4 +1,4 @@
-"""Passwords and tokens are left out of everything that an evaluation writes, since results are published.
+"""Removal of passwords and tokens from everything that an evaluation writes, since results are published.
 
 An entry counts as a secret by its name ("api_key"), or by its value: the password of an address
 ("http://user:password@host"), or a token of a common service ("hf_...").
@@ -11,7 +11,7 @@ from typing import Any
 MARK = "(redacted)"
 """Mark that replaces a secret."""
 SHORTEST_SECRET = 4
-"""Number of characters from which on a secret is also searched for in messages; shorter ones occur by chance."""
+"""Smallest number of characters of a secret that is also replaced in messages; shorter ones occur by chance."""
 _WORDS = (
     r"token|password|passwd|passphrase|pwd|secret|credentials?|auth|authorization|bearer|cookie|"
     r"(?:api|access|private|auth|secret)[_-]?key"

@@ -1,4 +1,4 @@
-"""A policy in another process or on another machine, asked over HTTP; `examples/policy_server.py` is a server for it.
+"""A policy in another process or on another machine, reached over HTTP; `examples/policy_server.py` is a server for it.
 
 `POST /reset` has an empty body and an empty answer. The body of `POST /act` is an npz with one array for each observation,
 named by its path ("sensor_data/wrist/rgb", uint8 (H, W, 3)); the answer is an npz with the array "action", (A,). An error is a
@@ -37,28 +37,29 @@ from mani_skill.utils import common
 
 from manifeel_ms3.errors import InvalidArgumentError, ServerError
 
-from .policy import PolicyUnavailableError
+from .policy import STEP_TIMEOUT, PolicyUnavailableError
 
 EPISODE = "X-Episode"
 """Header that names the episode."""
 UNAVAILABLE = (*range(300, 400), 401, 403, 407, 410, 502, 503, 504)
-"""Statuses that are no fault of the policy: the server is elsewhere, refuses the password, or has forgotten the episode; a
-proxy misses it."""
+"""HTTP statuses that are no fault of the policy: the server has moved, refuses the password or has forgotten the episode, or a
+proxy cannot reach it."""
 LONGEST_MESSAGE = 500
-"""Characters of a server's error message that are shown; the rest, often a page of HTML, is cut off."""
+"""Number of characters of a server's error message that are shown; the rest, often a page of HTML, is cut off. Set once, not
+tuned."""
 CONNECT_TIMEOUT = 10.0
 """Longest time in s to wait for a connection; at most half of the time for an answer. It is short, so that a server that cannot
 be reached can be distinguished from a slow policy, which has a time limit of its own."""
 MAX_ANSWER = 2**20
-"""Largest number of bytes of an answer that are read; an npz with one action has some hundreds."""
+"""Largest number of bytes of an answer that are read; an npz with one action has a few hundred."""
 MAX_HEADER = 256
 """Largest number of bytes of an array's header; numpy writes 118 for an action."""
 MAX_NUMBERS = 4096
-"""Largest number of elements of an action."""
+"""Largest number of elements of an action, far more than a robot has joints."""
 LARGEST_NUMBER = 16
-"""Largest number of bytes of an element, that of a long double."""
+"""Largest number of bytes of one element, that of a long double."""
 ARRAY_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-"""Readers of the header by the version of the npy format; later versions differ in names of fields only."""
+"""Readers of the header by the version of the npy format; later versions only differ in the names of fields."""
 
 
 class RemotePolicy:
@@ -69,10 +70,10 @@ class RemotePolicy:
         timeout: Longest time to wait for an answer, in s.
 
     Raises:
-        InvalidArgumentError: The address is not one.
+        InvalidArgumentError: The address is not that of a web server.
     """
 
-    def __init__(self, address: str, timeout: float = 60.0):
+    def __init__(self, address: str, timeout: float = STEP_TIMEOUT):
         parts = _parts_of(address)
         login, _, host = parts.netloc.rpartition("@")
         self.address, self.timeout = parts._replace(netloc=host).geturl().rstrip("/"), timeout
@@ -96,7 +97,7 @@ class RemotePolicy:
         """The answer to a request.
 
         Raises:
-            PolicyUnavailableError: The server cannot be reached, or is no server of this kind.
+            PolicyUnavailableError: The server cannot be reached, or is not a policy server.
             ServerError: The server answers with an error, with too many bytes, or not in time.
         """
         request = Request(f"{self.address}/{endpoint}", body, {**self._headers, EPISODE: self._episode})
@@ -127,7 +128,7 @@ def read_action(content: bytes) -> np.ndarray:
     """The array "action" of an npz that a server sent.
 
     Raises:
-        ServerError: It is not an npz with such an array of numbers, or the array is too large.
+        ServerError: The content is not an npz with such an array of numbers, or the array is too large.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -179,12 +180,14 @@ def _parts_of(address: str) -> SplitResult:
     except ValueError:
         valid = False
     if not valid:
-        raise InvalidArgumentError("the address of the policy's server is not one; give one like http://localhost:8000")
+        raise InvalidArgumentError(
+            "the address of the policy's server is not a web address; give one like http://localhost:8000"
+        )
     return parts
 
 
 def _opener_for(host: str) -> OpenerDirector:
-    """What sends requests to a host: directly to this machine itself, else through the proxy that the environment names."""
+    """Opener of a host's addresses: directly if it is this machine, else through the proxy that the environment names."""
     try:
         loopback = ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -205,7 +208,7 @@ class _Connects(HTTPConnection):
 
 
 class _ConnectsSafely(_Connects, HTTPSConnection):
-    """The same with TLS."""
+    """A connection with TLS whose establishment has a time limit of its own."""
 
 
 class _Http(HTTPHandler):
@@ -219,7 +222,7 @@ class _Https(HTTPSHandler):
 
 
 class _NoRedirects(HTTPRedirectHandler):
-    """Redirections are errors: they would carry observations and passwords to an address that nobody gave."""
+    """Handler to which redirections are errors, because they would send observations and passwords to another address."""
 
     def redirect_request(self, *_: Any) -> None:
         return None

@@ -33,7 +33,7 @@ with missing_extras_named():
     from .video import Frame, encode_video, record_episode
 
 STRIP_FRAMES = 8
-"""Number of steps that the strip of images shows."""
+"""Number of steps that the strip of images shows; set once, not tuned."""
 STRIP_SIDE = 160
 """Width and height of an image in the strip, in pixels; report.html.j2 has the same height for the names of the rows."""
 CURVE_HEIGHT = 340
@@ -41,7 +41,7 @@ CURVE_HEIGHT = 340
 CURVE_MARGINS = dict(l=60, r=20, t=20, b=50)
 """Left, right, upper and lower margin of a figure, in pixels."""
 FORCE_MARGIN, FORCE_POINTS = 1.2, 601
-"""End of the axis of forces over the largest force on it, and number of its points."""
+"""Ratio of the end of the force axis to the largest force on it, and number of points of the curve."""
 RATES = {
     "success_once": "success at any step",
     "success_at_end": "success at the end",
@@ -79,7 +79,7 @@ def _square(image: np.ndarray) -> np.ndarray:
 
 
 def force_curve(result: dict[str, Any]) -> str:
-    """HTML of a plotly figure with the success against the contact force allowed, and the task's limit."""
+    """HTML of a plotly figure with the success against the contact force allowed, and the limit of the task."""
     limit, episodes = result.get("force_limit"), result["episodes"]
     reached = [episode["force_until_success"] for episode in episodes if episode["success_once"]]
     forces = np.linspace(0.0, FORCE_MARGIN * max([*reached, limit or 0.0, 1.0]), FORCE_POINTS)
@@ -114,7 +114,7 @@ def training_curve(log_file: Path) -> str:
 
 
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
-    """The task's randomisation in an evaluation: pairs of its value there and the task's default, by its name."""
+    """The task's randomization in an evaluation: pairs of the value there and the task's default, by the field's name."""
     kwargs: dict[str, Any] = result["env_kwargs"] | dict(obs_mode="none", render_backend="none")
     env = make_env(result["env_id"], **kwargs)
     task: Any = env.unwrapped
@@ -124,13 +124,13 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
 
 
 def _floors_of(result: dict[str, Any]) -> dict[str, Floor]:
-    """Success of policies that have learnt nothing; {} where it was not measured, or the task has other arguments here."""
+    """Success of policies that have learnt nothing; {} if it was not measured, or if the result has other task arguments."""
     changed = result["env_kwargs"].keys() & {"fit", "lighting", "occlusion", "randomization"}
     return {} if changed else floors_of(result["env_id"], result["revision"])
 
 
 def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
-    """The device and the batch size of an evaluation, with which an episode goes as it went there."""
+    """The device and the batch size of an evaluation, with which an episode runs as it did there."""
     return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
 
 

@@ -1,4 +1,4 @@
-"""Result files: an evaluation writes one, the leaderboard and the pages of results read them."""
+"""Result files: an evaluation writes one, and the leaderboard and the pages of results read them."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from manifeel_ms3.tasks.registry import task_spec
 
 from .gentle import is_gentle
 from .redaction import redacted
-from .rollout import ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
+from .rollout import MEAN_DECIMALS, ONLY_TO_THE_END, EpisodeOutcome, outcome_as_json
 from .statistics import wilson_interval
 
 RESULT_SCHEMA = "manifeel-evaluation-3"
@@ -25,15 +25,17 @@ EARLIER = {
     "manifeel-evaluation-1": "does not say the revision of the task",
     "manifeel-evaluation-2": "is of episodes that ended at success, with other time limits",
 }
-"""Earlier versions, and why results of them cannot be compared with those of today."""
+"""Earlier versions, and why their results cannot be compared with those of the present version."""
 PATHS = ("demos", "run_dir", "tacrgb_weights")
 """Entries of a policy's configuration that are paths on the machine where it was trained."""
 PRIVATE = ("policy_name", "policy_kwargs")
 """Entries of a policy's configuration that come from the command line, and may hold passwords and tokens."""
 MEANS = ("return", "reward", "episode_len")
 """Numbers of an episode whose means a result holds."""
+RATE_DECIMALS = 4
+"""Decimals of the ends of a success rate's interval in a file; the interval is wider by far."""
 LONGEST_MESSAGE = 300
-"""Characters of a message of jsonschema that are shown; the rest repeats the faulty data."""
+"""Number of characters of a message of jsonschema that are shown; the rest repeats the faulty data. Set once, not tuned."""
 
 
 class ResultError(InvalidFileError):
@@ -98,20 +100,20 @@ def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dic
     if force_limit is not None:
         gentle = [is_gentle(episode, force_limit) for episode in episodes]
         summary |= dict(force_limit=force_limit, gentle_success=_rate(gentle))
-    return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), 6) for name in MEANS}
+    return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), MEAN_DECIMALS) for name in MEANS}
 
 
 def _rate(happened: list[bool]) -> dict[str, float]:
     low, high = wilson_interval(sum(happened), len(happened))
-    return dict(rate=sum(happened) / len(happened), low=round(low, 4), high=round(high, 4))
+    return dict(rate=sum(happened) / len(happened), low=round(low, RATE_DECIMALS), high=round(high, RATE_DECIMALS))
 
 
 def write_result(result: dict[str, Any], path: Path) -> None:
     """Check that a result has the published form, and write it.
 
     Raises:
-        ResultError: It does not have the published form.
-        FileWriteError: The file cannot be written; the old one is as it was.
+        ResultError: The result does not have the published form.
+        FileWriteError: The file cannot be written; an old one stays as it was.
     """
     write_json(path, as_published(result, path))
 
@@ -124,7 +126,7 @@ def as_published(result: dict[str, Any], path: Path) -> dict[str, Any]:
         path: Path of the file, for messages.
 
     Raises:
-        ResultError: It does not have the published form.
+        ResultError: The result does not have the published form.
     """
     result = json.loads(json.dumps(result, default=str))
     check_result(result, path)
@@ -176,7 +178,7 @@ def check_result(result: Any, source: Path) -> None:
         source: Path of the file, for messages.
 
     Raises:
-        ResultError: It does not have the form; the message names the place.
+        ResultError: The result does not have the form; the message names the place.
     """
     given = result.get("schema") if isinstance(result, dict) else None
     if isinstance(given, str) and given in EARLIER:

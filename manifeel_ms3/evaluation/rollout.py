@@ -1,4 +1,4 @@
-"""Run a policy for one episode per seed. Whatever the policy does, there is an outcome, unless it cannot be asked at all."""
+"""Run a policy for one episode per seed. Every episode has an outcome, whatever the policy does, if it can be reached."""
 
 import faulthandler
 import math
@@ -14,11 +14,15 @@ import numpy as np
 
 from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
 from .policy import Policy, PolicyUnavailableError
 
 HANGS_FOR_GOOD = 10.0
-"""Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts."""
+"""Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts; set
+once, not tuned."""
+MEAN_DECIMALS, TIME_DECIMALS = 6, 3
+"""Decimals of rewards and means in a result, and of times in ms; finer than any comparison needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,9 +39,9 @@ class EpisodeOutcome:
     success_at_end: bool | None = None
     """Whether the task had succeeded at the last step; None if the episode was stopped at success or failure."""
     fail_once: bool = False
-    """Whether the task could not be won any more at any step."""
+    """Whether the task failed at any step, that is, could not be solved any more."""
     fail_at_end: bool | None = None
-    """Whether the task could not be won any more at the last step; None if the episode was stopped at success or failure."""
+    """Whether the task had failed at the last step; None if the episode was stopped at success or failure."""
     first_success: int | None = None
     """Number of control steps until the first success; None without success."""
     return_: float = 0.0
@@ -53,7 +57,7 @@ class EpisodeOutcome:
     inference_ms: float = 0.0
     """Mean time of `Policy.act`, in ms, without the time that it waited for other episodes."""
     ending: str | None = None
-    """How the episode ended: "success"; "lost", if it could not be won any more; "error"; what was missing at the time
+    """How the episode ended: "success"; "lost", if the task could not be solved any more; "error"; what was missing at the time
     limit (`VisuotactileEnv.shortcomings`), or "time-out" for a task that does not say; None where nothing was measured."""
     error: str | None = None
     """What the policy did wrong, if anything; the episode then counts as failed."""
@@ -109,7 +113,7 @@ def evaluate_episode(
         stop_at_success: End the episode at success or failure.
 
     Raises:
-        PolicyUnavailableError: The policy cannot be asked, so that the episode has no outcome.
+        PolicyUnavailableError: The policy cannot be reached, so that the episode has no outcome.
     """
     obs, _ = env.reset(seed=seed)
     task: Any = env.unwrapped
@@ -145,12 +149,15 @@ class _Metrics:
     thinking: float = 0.0
     """Time in s that the policy took."""
     returned: float = 0.0
+    """Sum of the rewards."""
     peak: float = 0.0
+    """Largest contact force, in N."""
     force_until_success: float | None = None
     first_success: int | None = None
     success: bool = False
-    """At the last step, as `fail`."""
+    """Whether the task has succeeded at the last step."""
     fail: bool = False
+    """Whether the task has failed at the last step."""
     fail_once: bool = False
     last: dict[str, Any] = field(default_factory=dict)
     """The info of the last step."""
@@ -171,7 +178,7 @@ class _Metrics:
         self.success, self.fail = bool(info["success"]), bool(info["fail"])
         self.fail_once |= self.fail
         if self.success and self.first_success is None:
-            self.first_success, self.force_until_success = self.steps, round(self.peak, 3)
+            self.first_success, self.force_until_success = self.steps, round(self.peak, FORCE_DECIMALS)
 
     def outcome(self, to_the_end: bool, error: str | None, shortcoming: str) -> EpisodeOutcome:
         """The outcome; with an error the episode has failed, whatever was reached before.
@@ -190,12 +197,12 @@ class _Metrics:
             fail_once=self.fail_once,
             fail_at_end=self.fail if to_the_end else None,
             first_success=self.first_success if won else None,
-            return_=round(self.returned, 6),
-            reward=round(self.returned / max(self.steps, 1), 6),
+            return_=round(self.returned, MEAN_DECIMALS),
+            reward=round(self.returned / max(self.steps, 1), MEAN_DECIMALS),
             episode_len=self.steps,
-            peak_contact_force=round(self.peak, 3),
+            peak_contact_force=round(self.peak, FORCE_DECIMALS),
             force_until_success=self.force_until_success if won else None,
-            inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), 3),
+            inference_ms=round(max(1e3 * self.thinking, 0.0) / max(self.steps, 1), TIME_DECIMALS),
             ending=ending,
             error=error,
         )
@@ -208,7 +215,7 @@ def _shortcoming(task: Any, metrics: _Metrics) -> str:
 
 
 def begin_episode(policy: Policy, seed: int) -> None:
-    """Tell the policy that an episode begins, and its seed if it wants to know."""
+    """Tell the policy that an episode begins, and the seed of the episode if the policy takes it."""
     begin = getattr(policy, "begin_episode", None)
     policy.reset() if begin is None else begin(seed)
 
@@ -218,14 +225,14 @@ def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
 
     Raises:
         PolicyFault: The method raised an error, or took too long.
-        PolicyUnavailableError: The policy cannot be asked.
+        PolicyUnavailableError: The policy cannot be reached.
     """
     try:
         with _time_limit(step_timeout):
             return ask()
     except (PolicyFault, PolicyUnavailableError):
         raise
-    except Exception as error:  # a policy is anybody's code
+    except Exception as error:  # a policy may raise anything
         raise PolicyFault(f"{type(error).__name__}: {error}") from error
 
 
@@ -233,7 +240,7 @@ def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return the policy's action as an array.
 
     Raises:
-        PolicyFault: The task does not take it.
+        PolicyFault: The task does not take the action.
     """
     try:
         return checked_action(action, (shape,)).numpy()

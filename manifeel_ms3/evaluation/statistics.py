@@ -7,9 +7,9 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     Args:
         successes: Number of episodes that succeeded.
         trials: Number of episodes.
-        confidence: Share of intervals that hold the true rate.
+        confidence: Share of such intervals that contain the true rate.
     """
-    from scipy.stats import binomtest  # a third of a second, which no command waits for that computes no interval
+    from scipy.stats import binomtest  # takes a third of a second, needed only where an interval is computed
 
     interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
     return float(interval.low), float(interval.high)

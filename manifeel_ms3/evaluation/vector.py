@@ -1,4 +1,4 @@
-"""Vectorised environments for evaluation, made as ManiSkill's baselines make theirs (`make_eval_envs`)."""
+"""Vectorized environments for evaluation, made as ManiSkill's baselines make theirs (`make_eval_envs`)."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -23,7 +23,7 @@ TILE_HEIGHT = 240
 BLOCK = 8
 """Widths and heights of a video are made multiples of this number of pixels; H.264 needs an even number."""
 QUALITY = 7
-"""Quality of the encoding from 0 to 10, as imageio has it; text and touch stay sharp."""
+"""Quality of the encoding on imageio's scale from 0 to 10, at which text and touch stay sharp."""
 
 
 @dataclass
@@ -77,7 +77,7 @@ def encode_mp4(images: Iterable[np.ndarray], fps: int, block: int) -> bytes:
         block: Number of pixels of which widths and heights are made multiples.
     """
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "video.mp4"  # imageio knows the format by the suffix
+        path = Path(folder) / "video.mp4"  # imageio recognizes the format by the suffix
         writer: Any  # the stubs of imageio lack `append_data`
         with imageio.get_writer(path, fps=fps, macro_block_size=block, quality=QUALITY) as writer:
             for image in images:

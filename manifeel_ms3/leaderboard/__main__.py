@@ -6,8 +6,8 @@
 
 A submission is a folder with submission.json ({"name", "authors", "link"}), with the result files of a policy in any
 subfolders, one for each checkpoint and training seed, and optionally with `videos/*.mp4`. `hash` writes into submission.json
-which checkpoint each result is of. `submit` checks a submission, runs episodes of all its results again, and copies it into the
-leaderboard's folder; `build` makes index.html and README.md from all submissions there.
+the hash of each result's checkpoint. `submit` checks a submission, runs episodes of all its results again, and copies it into
+the leaderboard's folder; `build` makes index.html and README.md from all submissions there.
 """
 
 import logging
@@ -56,9 +56,9 @@ class Submit:
     policy_kwargs: str = "{}"
     """Keyword arguments of the policy, as json."""
     rerun: int | None = None
-    """Largest number of episodes that are run again for each row of the page. If not given, as many as find out a row with a
-    tenth of invented outcomes in 99 of 100 cases; a smaller number proves less, and the page says so. With 0 no policy is
-    needed."""
+    """Largest number of episodes that are run again for each row of the page. If not given, as many as it takes to detect a
+    row with a tenth of invented outcomes in 99 of 100 cases; a smaller number proves less, and the page says so. With 0 no
+    policy is needed."""
     seed: int | None = None
     """Seed of the draw of these episodes, to repeat an earlier draw; a new one if not given."""
     workers: Annotated[int, tyro.conf.arg(name="num-eval-envs", aliases=["--workers"])] = 1
@@ -90,7 +90,7 @@ def main(args: Hash | Submit | Build) -> Path:
     Raises:
         SubmissionError: The submission cannot be accepted; the message lists what is wrong with it.
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
-        InvalidArgumentError: No policy is given to run episodes with, or a --checkpoint is none.
+        InvalidArgumentError: No policy is given to run episodes with, or a folder of --checkpoint holds no checkpoint.
     """
     if isinstance(args, Build):
         return _build(args)

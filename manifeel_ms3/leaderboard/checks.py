@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
+from manifeel_ms3.analysis.protocol import FEWEST_EPISODES
 from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
@@ -16,14 +17,14 @@ from .rerun import INVENTED
 from .submission import Submission, SubmissionError
 from .untrusted import quoted
 
-EPISODES = 50
-"""Number of evaluation episodes of a result, as in the paper."""
+EPISODES = FEWEST_EPISODES
+"""Number of evaluation episodes of a result: that of the paper's protocol."""
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 MOST_FORCE = 500.0
-"""Contact force in N, more than the arm can press with; demonstrations stay below 60 N."""
+"""Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 60 N."""
 RATE_TOLERANCE = 1e-3
-"""Difference between numbers that count as the same, where a result rounds them to four digits."""
+"""Largest difference between rates or means that count as equal; a result rounds the ends of intervals to four decimals."""
 SHOWN = 5
 """Number of wrong seeds that a message lists."""
 SAME_OUTCOME = np.array([2 * FORCE_TOLERANCE if name in FORCES else 0 for name in COMPARED])
@@ -32,14 +33,15 @@ other."""
 
 
 def check(submission: Submission, to_take: bool = True) -> None:
-    """Check that results are of the tasks as they are now, on the evaluation seeds, of possible numbers, and no copies.
+    """Check that results are of the current tasks and the evaluation seeds, have possible numbers, and are no copies.
 
     Args:
         submission: The submission.
-        to_take: Whether it is to be taken into the leaderboard; its simulator must then be the one that is installed here.
+        to_take: Whether the submission is to be taken into the leaderboard; its simulator must then be the one that is
+            installed.
 
     Raises:
-        SubmissionError: Some results are not.
+        SubmissionError: Some results are not as required; the message says which and why.
     """
     faults = [
         f"{quoted(path)}: {fault}"

@@ -36,6 +36,7 @@ with missing_extras_named():
 
 log = logging.getLogger(__name__)
 PAGE, TABLE = "index.html", "README.md"
+"""Files of the leaderboard's page and of its table."""
 TEMPLATE = Path(__file__).with_name("page.html.j2")
 FULL = (3, LAST, EPISODES)
 """Numbers of training seeds, checkpoints and evaluation episodes in the paper's protocol."""
@@ -48,7 +49,9 @@ class Row:
     submission: Submission
     condition: Condition
     success: Estimate
+    """Mean success with its interval."""
     results: ConditionResults
+    """Success in every episode."""
     inference_ms: float
     """Median over episodes of the mean time of an inference, in ms."""
     force: float
@@ -73,7 +76,7 @@ class Row:
 
     @property
     def is_confirmed(self) -> bool:
-        """Whether as many episodes were run again as invented outcomes need to be found."""
+        """Whether enough episodes were run again to detect invented outcomes."""
         run, total = self.rerun
         return run >= episodes_to_run_again(total)
 

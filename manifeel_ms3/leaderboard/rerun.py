@@ -33,13 +33,16 @@ from .untrusted import quoted
 
 log = logging.getLogger(__name__)
 INVENTED = 0.1
-"""Share of invented episodes in a row of the page from which on the row must be found out."""
+"""Smallest share of invented episodes in a row of the page that must be detected."""
 CHANCE = 0.01
-"""Largest chance of such a row not to be found out."""
+"""Largest probability that such a row is not detected."""
 COINCIDENCE = 0.1
-"""Chance that an invented episode has the outcome of the one that is run again, assumed. It must agree in success and
-force within 0.01 N: of the 50 episodes of either result in this repository, at most 3 have forces so near to any one value. A
-success that the policy does not have never agrees."""
+"""Assumed probability that an invented episode has the same outcome as its repetition, that is, the same success and forces
+within 0.01 N. In 14 of the 15 results under leaderboard/cpu, at most 3 of the 50 episodes have forces so near to any one value;
+in that of ObjectSearch with rgb, 13 episodes do, all of them failures. An invented success agrees only where the policy
+succeeds, too."""
+SEED_BITS = 63
+"""Number of random bits in the seed of a draw, which fits into a signed integer of 64 bits."""
 NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num_demos", "policy")
 """Entries of a policy's configuration that a result must share with its checkpoint."""
 
@@ -93,7 +96,7 @@ def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
 
 
 def name_checkpoints(submission: Submission, folders: Iterable[Path]) -> dict[str, str]:
-    """The hash of the checkpoint of each result, found by the configuration that both hold.
+    """The hash of the checkpoint of each result, found by the configuration that the result and the checkpoint hold.
 
     Raises:
         SubmissionError: A result fits none of the checkpoints, or several.
@@ -170,7 +173,9 @@ def _differing_settings(result: dict[str, Any], config: dict[str, Any]) -> list[
 
 
 def draw(submission: Submission, most: int | None, seed: int) -> dict[Path, list[int]]:
-    """Numbers of the episodes to run again, by result file: from each row of the page as many as it needs, of all its files.
+    """Draw the episodes to run again, and return their numbers, counted from 0, by result file.
+
+    From each row of the page, as many episodes are drawn as it needs, from all of its files.
 
     Args:
         submission: The submission.
@@ -208,7 +213,7 @@ def run_again(
     Raises:
         SubmissionError: An outcome differs.
     """
-    seed = secrets.randbits(63) if seed is None else seed
+    seed = secrets.randbits(SEED_BITS) if seed is None else seed
     drawn = draw(submission, most, seed)
     log.info("%d episodes of %d results are run again, drawn with --seed %d", sum(map(len, drawn.values())), len(drawn), seed)
     faults, files = [], {}

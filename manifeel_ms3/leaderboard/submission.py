@@ -12,6 +12,7 @@ from typing import Any
 import jsonschema
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.evaluation.entries import ABOUT as ABOUT_NAME
 from manifeel_ms3.evaluation.result import check_result
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.paths import data_dir
@@ -19,10 +20,12 @@ from manifeel_ms3.paths import data_dir
 from .text import is_safe_link
 from .untrusted import FolderReader, UntrustedFileError, parse_json, quoted
 
-ABOUT, RERUN = Path("submission.json"), Path("rerun.json")
-"""What the submission is, by its authors; and which episodes the leaderboard ran again."""
+ABOUT, RERUN = Path(ABOUT_NAME), Path("rerun.json")
+"""Files of a submission: its description by the authors, and the episodes that the leaderboard ran again."""
 SHOWN_FAULTS = 20
-"""Number of faults that a message lists."""
+"""Largest number of faults that a message lists."""
+SHOWN_FOREIGN = 3
+"""Largest number of unknown files that a message lists."""
 
 
 class SubmissionError(InvalidFileError):
@@ -123,7 +126,8 @@ def read_submission(folder: Path) -> Submission:
     if about is None or faults:
         raise SubmissionError(folder, faults)
     if foreign := sorted(set(about.checkpoints) - {path.as_posix() for path in results}):
-        raise SubmissionError(folder, [f"{ABOUT} names checkpoints of {foreign[:3]}, which are no result files here"])
+        faults = [f"{ABOUT} names checkpoints of {foreign[:SHOWN_FOREIGN]}, which are no result files here"]
+        raise SubmissionError(folder, faults)
     shown = {path: content for path, content in read.contents.items() if path in results or _is_video(path)}
     return Submission(folder, about, results, {ABOUT: read.contents[ABOUT]} | shown, rerun)
 

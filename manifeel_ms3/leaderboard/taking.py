@@ -6,16 +6,16 @@ import shutil
 from pathlib import Path
 
 from manifeel_ms3.errors import FileExistsAlreadyError
-from manifeel_ms3.files import FileWriteError, atomic_write
+from manifeel_ms3.files import FileWriteError, atomic_write, flush
 from manifeel_ms3.ownership import owned
 
 from .submission import RERUN, Rerun, Submission, SubmissionError
 
 INCOMING = ".incoming"
-"""Folder of the leaderboard that a submission is copied to before it takes its name; what is left of a copy that was killed is
-removed by the next one."""
+"""Folder of the leaderboard that a submission is copied to before it takes its name; the rest of an interrupted
+copy is removed by the next one."""
 NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
-"""Names of folders that the leaderboard takes."""
+"""Names of folders that the leaderboard takes: at most 100 letters, digits, underscores, dots and hyphens."""
 
 
 def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Path:
@@ -32,7 +32,7 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
         FileWriteError: The leaderboard's folder cannot be written.
         InUseError: Another process copies a submission.
-        SubmissionError: The name of the folder cannot be taken.
+        SubmissionError: The name of the folder has characters that are not allowed, or is too long.
     """
     name = submission.folder.resolve().name
     if not NAME.fullmatch(name):
@@ -49,9 +49,10 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
             for path, content in contents.items():
                 with atomic_write(incoming / path) as partial:
                     partial.write_bytes(content)
-            _flush(incoming, *{incoming / parent for path in contents for parent in path.parents})
+            for folder in {incoming / parent for path in contents for parent in path.parents}:
+                flush(folder)
             incoming.rename(target)
-            _flush(board)
+            flush(board)
         except FileWriteError:
             raise
         except OSError as error:
@@ -59,13 +60,3 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
         finally:
             shutil.rmtree(incoming, ignore_errors=True)
     return target
-
-
-def _flush(*folders: Path) -> None:
-    """Let the entries of folders reach the disk."""
-    for folder in folders:
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -22,10 +22,11 @@ LARGEST_TOTAL = 128 * 2**20
 MOST_ENTRIES = 4000
 """Largest number of files and folders; the paper's protocol needs 30 results for each row of the page."""
 DEEPEST_FOLDER = 8
-"""Largest number of folders inside each other."""
+"""Largest number of folders inside each other; the results in this repository have 3."""
 DEEPEST_JSON = 32
 """Largest number of lists and objects inside each other; a result has 5."""
 LARGEST_INTEGER = 2**63 - 1
+"""Largest integer of 64 bits with a sign."""
 
 
 class UntrustedFileError(InvalidFileError):
@@ -48,7 +49,7 @@ class FolderReader:
             return
         try:
             for place, folders, files, descriptor in os.fwalk(folder, onerror=_reraise):
-                # not read: maintainers keep the checkpoints of an entry beside its results
+                # checkpoints are not read; maintainers keep those of an entry beside its results
                 folders[:] = [name for name in folders if name != CHECKPOINTS]
                 self._read_level(Path(place).relative_to(folder), folders, files, descriptor)
         except UntrustedFileError as error:
@@ -99,7 +100,7 @@ def parse_json(content: bytes, path: Path) -> Any:
     try:
         value = json.loads(content.decode("utf-8"), parse_constant=_refuse_constant)
     except RecursionError:
-        raise UntrustedFileError(f"{quoted(path)} is nested too deep; a result is never") from None
+        raise UntrustedFileError(f"{quoted(path)} is nested too deeply; a result never is") from None
     except ValueError as error:  # includes errors of Unicode, of json, and of integers with thousands of digits
         reason = str(error)[:SHOWN_LENGTH]
         raise UntrustedFileError(f"{quoted(path)} cannot be read as json ({reason}); evaluate the policy again") from None

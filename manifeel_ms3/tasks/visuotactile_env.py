@@ -35,6 +35,8 @@ from .states import is_part_of, unflattened
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
+FORCE_DECIMALS = 3
+"""Decimals of a contact force in json files, in N: millinewtons, far below what matters in contact."""
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
 HOLD_SECONDS = 0.5

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
+from manifeel_ms3.network import LOOPBACK_NAMES
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 from .devices import DEVICES, follow
@@ -58,7 +59,6 @@ def main(args: Args) -> Path:
         MissingExtraError: viser, which serves the page, is not installed.
     """
     with missing_extras_named():
-        from .local_server import LOOPBACK_NAMES
         from .page import Page
     args = replace(args, env_id=task_spec(args.env_id).env_id)
     kwargs: dict[str, Any] = dict(obs_mode=args.obs_mode, sim_backend="physx_cpu", tactile_sensors=list(args.tactile_sensors))

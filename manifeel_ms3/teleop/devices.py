@@ -13,12 +13,14 @@ from .operator import Operator
 
 log = logging.getLogger(__name__)
 RATE = 200.0
-"""Rate in Hz at which a device is read. A SpaceMouse queues its readings, so that motions lag if it is read too seldom."""
+"""Rate in Hz at which a device is read. A SpaceMouse queues its readings, so that motions lag if it is read too slowly."""
 DEAD_ZONE = 0.08
-"""Share of the full deflection below which an axis counts as released: sticks at rest do not read exactly 0."""
+"""Share of the full deflection below which an axis counts as released: sticks at rest do not read exactly 0. Set
+once, not tuned."""
 STICK_RANGE = 32767
 """Reading of a gamepad's stick at full deflection: SDL gives int16."""
 SIX_AXES = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Names of the axes of a SpaceMouse."""
 NO_DEVICE = "no {name} was found: plug one in, or leave out --device; the page's keys and buttons work without a device"
 
 
@@ -40,7 +42,7 @@ def spacemouse() -> Iterator[Reading]:
     """Readings of a 3Dconnexion SpaceMouse, without end.
 
     Raises:
-        DeviceError: None is plugged in, or its library is not installed.
+        DeviceError: No such device is plugged in, or its library is not installed.
     """
     try:
         import pyspacemouse  # pyright: ignore
@@ -63,7 +65,7 @@ def gamepad() -> Iterator[Reading]:
     from gamepad to gamepad and between operating systems.
 
     Raises:
-        DeviceError: None is plugged in, or its library is not installed.
+        DeviceError: No such device is plugged in, or its library is not installed.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # events need a display, which a server does not have

@@ -1,7 +1,7 @@
 """viser's server, closed to everybody but those who were given the page's address.
 
-viser itself takes every connection: of a web page that is open in the same browser, of a name that somebody made point to this
-machine, and of whoever reaches the port. This server takes a connection only if all of these hold:
+viser itself accepts every connection: from any web page that is open in the same browser, through any name that points to this
+machine, and from everybody who reaches the port. This server accepts a connection only if all of these hold:
 
 - The path of the address begins with a token that is drawn anew at each start.
 - The header `Host` names this machine, so that no foreign name leads here (DNS rebinding).
@@ -28,12 +28,11 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from manifeel_ms3.errors import MachineError
+from manifeel_ms3.network import LOOPBACK_NAMES
 
 log = logging.getLogger(__name__)
 TOKEN_BYTES = 16
 """Length of the token in bytes: 128 bits, which nobody guesses."""
-LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-"""Names under which only this machine reaches itself."""
 ANY_ADDRESS = frozenset({"0.0.0.0", "::", ""})
 """Values of `host` that stand for all addresses of this machine."""
 
@@ -47,7 +46,7 @@ class LocalServer(viser.ViserServer):
         label: Title of the page.
 
     Raises:
-        MachineError: The installed viser starts its server in another way, so that it cannot be closed to others.
+        MachineError: The installed version of viser starts its server in another way, so that it cannot be closed to others.
     """
 
     def __init__(self, host: str, port: int, label: str):
@@ -110,10 +109,10 @@ class LocalServer(viser.ViserServer):
 
 @contextmanager
 def _serving_with(serve_guarded: Callable[..., Any]) -> Iterator[None]:
-    """Put a function in the place of websockets' `serve`: viser has no argument for the check of a connection.
+    """Context that replaces websockets' `serve` by a function, because viser has no argument for a check of connections.
 
     Args:
-        serve_guarded: Takes websockets' `serve`, and what `serve` takes.
+        serve_guarded: Function that takes websockets' `serve`, followed by the arguments of `serve`.
     """
     serve = websockets.asyncio.server.serve
     websockets.asyncio.server.serve = partial(serve_guarded, serve)

@@ -1,4 +1,4 @@
-"""What the person who steers wants: set from any thread, and read by the thread that moves the robot."""
+"""Motions and commands of the person who steers: set from any thread, and read by the thread that moves the robot."""
 
 import threading
 import time
@@ -13,7 +13,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 HOLD = 0.25
 """Time in s for which one key press moves the arm; a key that is held down repeats faster, so that the arm keeps moving."""
 FIRST_SPEED = 0.5
-"""Share of the full speed at which the arm moves until the person sets another."""
+"""Share of the full speed at which the arm moves until the person sets another speed; set once, not tuned."""
 
 
 class Mode(Enum):
@@ -54,7 +54,7 @@ class Operator:
 
     Args:
         axes: Names of an action's entries, such as ("x", "y", "z", "yaw", "gripper").
-        clock: Returns the time in s.
+        clock: Function that returns the time in s.
     """
 
     def __init__(self, axes: tuple[str, ...], clock: Callable[[], float] = time.monotonic):
@@ -131,7 +131,7 @@ class Operator:
             return self._changed.wait_for(lambda: self._mode is Mode.RUNNING or self.is_over, patience) and not self.is_over
 
     def take_command(self, patience: float) -> EpisodeCommand | None:
-        """The command that was given, which is forgotten then; None if none is given within `patience` seconds."""
+        """Return the command that was given, and forget it; None if none is given within `patience` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._command is not None or self._mode is Mode.CLOSED, patience)
             command, self._command = self._command, None

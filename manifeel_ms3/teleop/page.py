@@ -17,17 +17,17 @@ from .local_server import LocalServer
 from .operator import EpisodeCommand, Mode, Operator
 
 TILE_HEIGHT = 360
-"""Height of each image on the page, in pixels."""
+"""Height of each image on the page, in pixels; set once, not tuned."""
 NUM_PLOTTED = 150
 """Number of steps that the plot of the contact force shows: the last 15 s at 10 Hz."""
 PLOT_HEIGHT = 150
 """Height of that plot, in pixels."""
 JPEG_QUALITY = 80
-"""Quality of the images that the page is sent, of 100; enough to see, and little to send."""
+"""Quality, from 0 to 100, of the images that are sent to the page: good enough to steer by, and small."""
 NOTICE_SECONDS = 4.0
 """Time for which the page shows who steers, in s."""
 HOLD_HZ = 10.0
-"""Rate in Hz at which a button that is held down pushes; faster than `HOLD` needs."""
+"""Rate in Hz at which a button that is held down repeats its push; `HOLD` needs at least 4 Hz."""
 SPEED_RANGE, SPEED_STEP = (0.05, 1.0), 0.05
 """Smallest and largest speed on the slider, and its step, as shares of the full speed."""
 KEYS = {
@@ -50,7 +50,7 @@ HELP = """Keys (hold them): **W S** forward, back · **A D** left, right · **R 
 
 
 class Page:
-    """The page. One client steers; others watch, and one of them can take over after that client has left.
+    """The page in a browser. One client steers; others watch, and one of them can take over after that client has left.
 
     Args:
         operator: Receives the motions and commands of the client that steers.

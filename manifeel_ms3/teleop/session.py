@@ -43,7 +43,7 @@ class Session:
         env_id: Id of its task.
         env_kwargs: Arguments that it was made with.
         out: Path of the trajectory file; episodes that it holds already are kept.
-        seed: Seed of the first episode; later ones if the file holds that seed.
+        seed: Seed of the first episode; the seed after the largest one in the file if that is larger.
         operator: Motions and commands of the person.
 
     Raises:
@@ -59,7 +59,7 @@ class Session:
         with ExitStack() as stack:
             self._recording = stack.enter_context(open_recording(out, header))
             self._recording.begin()
-            for kept in list(self._recording.kept):  # a kill came just before it was entered into the file
+            for kept in list(self._recording.kept):  # its session was killed before the episode entered the file
                 self._recording.accept_kept(kept)
             self._held = stack.pop_all()
         self._seed = max([seed, *(saved + 1 for saved in self._recording.infos)])
@@ -93,7 +93,7 @@ class Session:
             yield self.operator.action()
 
     def _decision(self, screen: Screen, episode: Episode) -> EpisodeCommand | None:
-        """The command that an episode which is over was ended by; the episode is kept until it is saved or dropped."""
+        """Wait for the command that saves, discards or repeats an episode that is over; None if the session ends before it."""
         command = self.operator.take_command(0.0)
         self.operator.end()
         result = "success" if episode.info["success"] else "no success"
@@ -110,7 +110,7 @@ class Session:
         return None
 
     def _save(self, screen: Screen, episode: Episode) -> bool:
-        """Write an episode, and return whether that worked; the person reads the reason where it did not."""
+        """Write an episode, and return whether that worked; if it did not, the page shows the reason."""
         try:
             write_episode(self._recording.drafts, episode)
             self._recording.accept(episode.seed, episode.info)

@@ -28,21 +28,21 @@ class Part:
 
 
 class Moody:
-    """Answers with seed, step and the number of questions beside it; what it does depends on the seed."""
+    """Answers with seed, step and the number of requests in the batch; what it does depends on the seed."""
 
     make_episode_part = Part
     batch_size = 4
 
-    def answer(self, questions):
-        seeds = [question.seed // 10 * 10 for question in questions]
+    def answer(self, requests):
+        seeds = [request.seed // 10 * 10 for request in requests]
         if RAISES in seeds:
             raise RuntimeError("out of ideas")
         if CRASHES in seeds:
             os._exit(7)
         if HANGS in seeds:
             time.sleep(1000)
-        time.sleep(0.2)  # so that questions gather
-        answers = [np.array([question.seed, question.step, len(questions)]) for question in questions]
+        time.sleep(0.2)  # so that requests gather
+        answers = [np.array([request.seed, request.step, len(requests)]) for request in requests]
         return answers[1:] if MISCOUNTS in seeds else answers
 
 

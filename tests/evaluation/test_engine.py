@@ -68,12 +68,12 @@ def answer_to(process, seed):
 
 
 def answers_to(process, *seeds):
-    """The answers to questions that are asked at the same time."""
+    """The answers to requests that are sent at the same time."""
     with ThreadPoolExecutor(len(seeds)) as threads:
         return list(threads.map(lambda seed: answer_to(process, seed), seeds))
 
 
-def test_questions_of_all_episodes_are_answered_in_batches_each_with_its_own_answer(process):
+def test_requests_of_all_episodes_are_answered_in_batches_each_with_its_own_answer(process):
     answers = answers_to(process, *range(FINE, FINE + 8))
     assert [answer[:2] for answer in answers] == [[seed, 0] for seed in range(FINE, FINE + 8)]
     assert max(answer[2] for answer in answers) > 1
@@ -84,7 +84,7 @@ def test_questions_of_all_episodes_are_answered_in_batches_each_with_its_own_ans
     ("bad", "reason"),
     [
         (RAISES, "RuntimeError: out of ideas"),
-        (MISCOUNTS, "0 answers to 1 questions"),
+        (MISCOUNTS, "0 answers to 1 requests"),
         (CRASHES, "exit code 7"),
         (HANGS, "no answer within 2 s"),
     ],
@@ -128,7 +128,7 @@ def checkpoint(tmp_path_factory):
     return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "00000001")
 
 
-def questions(count: int) -> list[PolicyRequest]:
+def requests(count: int) -> list[PolicyRequest]:
     chance = np.random.default_rng(0)
     return [
         PolicyRequest(
@@ -145,8 +145,8 @@ def questions(count: int) -> list[PolicyRequest]:
 
 @pytest.mark.parametrize("steps", [20, 4])  # DDPM, which draws noise at every step, and DDIM
 @pytest.mark.parametrize("batch_size", [1, 4])
-def test_an_answer_does_not_depend_on_the_questions_beside_it(checkpoint, batch_size, steps):
-    agent, asked = SPEC.load(checkpoint, batch_size=batch_size, inference_steps=steps), questions(6)
+def test_an_answer_does_not_depend_on_the_other_requests_of_its_batch(checkpoint, batch_size, steps):
+    agent, asked = SPEC.load(checkpoint, batch_size=batch_size, inference_steps=steps), requests(6)
     together = agent.answer(asked)
     assert len({answer.tobytes() for answer in together}) == 6
     for order in ([5, 3, 1], [2], [4, 0], [0, 4, 2, 1, 3, 5]):
@@ -155,14 +155,14 @@ def test_an_answer_does_not_depend_on_the_questions_beside_it(checkpoint, batch_
 
 
 def test_batch_sizes_differ_by_rounding_alone(checkpoint):
-    asked = questions(6)
+    asked = requests(6)
     answers = [np.stack(SPEC.load(checkpoint, batch_size=size).answer(asked)) for size in (1, 3, 4)]
     for other in answers[1:]:
         np.testing.assert_allclose(other, answers[0], atol=5e-5)  # of actions in [-1, 1], after 20 steps of inference
 
 
 def test_noise_depends_on_the_seed_of_the_episode_and_on_the_step(checkpoint):
-    agent, (first, *_) = SPEC.load(checkpoint), questions(1)
+    agent, (first, *_) = SPEC.load(checkpoint), requests(1)
     answers = agent.answer([first, replace(first, seed=7), replace(first, step=7), first])
     assert len({answer.tobytes() for answer in answers}) == 3
     np.testing.assert_array_equal(answers[0], answers[3])

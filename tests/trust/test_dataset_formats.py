@@ -101,7 +101,7 @@ def test_b7_a_manifest_names_files_in_its_folder_alone(name, tmp_path):
     (folder / "link").symlink_to(elsewhere)
     (folder / "manifest.json").write_text(json.dumps({"schema": "manifeel-demonstrations-1", "files": {name: {}}}))
     (problem,) = validate(folder)
-    assert "names files in its own folder" in problem
+    assert "only names files in its own folder" in problem
 
 
 # ------------------------------------------------------------------ zarr

@@ -1,4 +1,4 @@
-"""What this package needs of a format in which demonstrations are stored."""
+"""What this package needs to know of a format in which demonstrations are stored."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ from manifeel_ms3.errors import InvalidFileError
 Episode = dict[str, np.ndarray]
 """Arrays of one episode: "actions" (T, A), and observations (T + 1, ...) by their keys, such as "sensor_data/wrist/rgb"."""
 Progress = Callable[[Any], Iterable[int]]
-"""Wraps a sequence of episode numbers to show a progress bar; `iter` shows none."""
+"""Function that wraps a sequence of episode numbers to show a progress bar; `iter` shows none."""
 MAX_COMPRESSION = 1032
-"""Largest ratio by which gzip's deflate compresses (zlib's technical details, zlib.net/zlib_tech.html). Arrays that claim to be
-larger than that many times the bytes that are stored of them are refused before they are read."""
+"""Largest ratio by which gzip's deflate compresses (zlib's technical details, zlib.net/zlib_tech.html). An array that claims to
+be larger than its stored bytes times this ratio is refused before it is read."""
 
 
 class DemonstrationError(InvalidFileError):
@@ -23,7 +23,7 @@ class DemonstrationError(InvalidFileError):
 
 
 class ReadEpisodes(Protocol):
-    """Reads episodes."""
+    """Function that reads episodes."""
 
     def __call__(
         self, path: Path, keys: list[str], /, *, num: int | None = None, progress: Progress = iter, env_id: str | None = None
@@ -51,13 +51,14 @@ class DemonstrationFormat:
     name: str
     """Name on the command line, such as "lerobot"."""
     matches: Callable[[Path], bool]
-    """Tells whether a file or folder is of this format, from the names of the files in it."""
+    """Function that tells whether a file or folder is of this format, from the names of the files in it."""
     count: Callable[[Path], int]
-    """Number of episodes in a file or folder."""
+    """Function that returns the number of episodes in a file or folder."""
     read: ReadEpisodes
-    """Reads episodes."""
+    """Function that reads episodes."""
     write: Callable[[Path, Path, Progress], None] | None = None
-    """Writes the episodes of a trajectory file (first path) into a new folder (second path); None where only recording does."""
+    """Function that writes the episodes of a trajectory file (first path) into a new folder (second path); None for a format
+    that only recording writes."""
     env_kwargs: Callable[[Path], dict[str, Any] | None] | None = None
-    """Arguments of the environment with which the episodes were recorded, None where a file does not hold them; None for a
-    format that never does."""
+    """Function that returns the arguments of the environment with which the episodes were recorded, or None if a file does not
+    hold them. The field itself is None for a format that never holds them."""

@@ -37,7 +37,7 @@ PAPERS_ARGUMENTS: dict[str, Any] = {"tactile": {"units": "tacsl"}}
 MOST_PENETRATION = 0.02
 """Penetration, in m, above which a force field cannot be in the paper's units: five times the thickness of the gel."""
 STEPS_PER_CHUNK = 64
-"""Number of steps in a chunk of an array."""
+"""Number of steps in a chunk of an array; set once, not tuned."""
 XYZW = [0, 1, 2, 4, 5, 6, 3]
 """Order that turns a pose with a quaternion wxyz into one with xyzw."""
 WXYZ = [0, 1, 2, 6, 3, 4, 5]
@@ -45,7 +45,7 @@ WXYZ = [0, 1, 2, 6, 3, 4, 5]
 
 
 def is_zarr(path: Path) -> bool:
-    """Whether a folder is such a store."""
+    """Whether a folder is a zarr store in the paper's layout."""
     return (Path(path) / "meta").is_dir() and (Path(path) / "data").is_dir() and not (Path(path) / "meta/info.json").is_file()
 
 
@@ -61,7 +61,7 @@ def array_name(key: str) -> str:
 
 
 def recorded_arguments(folder: Path) -> dict[str, Any]:
-    """Arguments of the environment that a store names; those that stand for the paper's data where it names none.
+    """Arguments of the environment that a store names; `PAPERS_ARGUMENTS` if it names none.
 
     Raises:
         DemonstrationError: The attributes of the store are broken.

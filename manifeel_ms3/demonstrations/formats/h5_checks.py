@@ -1,4 +1,4 @@
-"""Checks of a trajectory file from anywhere: nothing is read from it before all of its structure has passed.
+"""Checks of a trajectory file from anywhere: nothing is read from it before its whole structure has passed.
 
 HDF5 lets a file name other files (external storage, virtual data sets, links) and declare sizes that it does not hold. A
 trajectory file needs neither: the only links allowed are those of an index to the episodes beside it.
@@ -25,7 +25,7 @@ GROUPS = ("obs", "obs/sensor_data", "obs/extra", "env_states", "env_states/actor
 PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force", "rewards")
 """Parts of an episode with one number for each step."""
 POSE_SIZE = 7
-"""Numbers of a pose: position and quaternion."""
+"""Number of entries of a pose: 3 of the position, 4 of the quaternion."""
 
 
 def check_trajectories(file: h5py.File, path: Path, episodes: Path) -> None:
@@ -103,7 +103,7 @@ def _checked_size(item: h5py.Dataset, path: Path) -> int:
 
 
 def _check_episode(episode: Any, path: Path) -> None:
-    """Check that the parts of an episode that are read are what they must be: groups, or arrays with so many axes."""
+    """Check that the parts of an episode that are read are groups, or arrays with the right number of axes."""
     if not isinstance(episode, h5py.Group):
         raise _refused(path, f"{episode.name} is not an episode")
     flat = isinstance(episode.get("obs"), h5py.Dataset) and episode["obs"].ndim == 2  # ManiSkill's vectors of states

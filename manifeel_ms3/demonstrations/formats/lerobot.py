@@ -6,9 +6,9 @@ Features are named after what they hold: `observation.images.wrist`, `observatio
 
 The files are written here and not by lerobot's own library, because lerobot 0.4.4 cannot be installed beside the versions that
 this package is locked to. It requires torch < 2.11 with torchvision and torchcodec, opencv-python-headless < 4.13, packaging
-< 26 and diffusers < 0.36; locked are torch 2.13, beside whose CPU build torchvision cannot be imported, OpenCV 5, packaging 26
-and diffusers 0.42. With torch 2.10 the two work together. The tests read datasets that lerobot 0.4.4 has written, and let its
-reader, where it is installed, read what is written here.
+< 26 and diffusers < 0.36. This package is locked to torch 2.13, OpenCV 5, packaging 26 and diffusers 0.42, and torchvision
+cannot be imported beside the CPU build of torch 2.13. With torch 2.10 the two packages work together. The tests read datasets
+that lerobot 0.4.4 has written; where lerobot is installed, its reader also reads what is written here.
 """
 
 import math
@@ -35,7 +35,7 @@ MP4 = b"ftyp"
 PNG = b"\x89PNG\r\n\x1a\n"
 """First bytes of a PNG file (W3C PNG, section 5.2); width and height follow as big-endian numbers in bytes 16 to 24."""
 WORD = 8
-"""Largest number of bytes of a number in a table."""
+"""Largest number of bytes of one number in a table."""
 DESCRIPTION = {
     "type": "object",
     "required": ["codebase_version"],
@@ -60,7 +60,7 @@ DESCRIPTION = {
         },
     },
 }
-"""Json schema of the fields that are read from meta/info.json."""
+"""Json schema of the fields that are read from meta/info.json; its upper bounds are far above those of any dataset."""
 ABOUT = {
     "type": "object",
     "required": ["env_id", "env_kwargs"],
@@ -162,10 +162,10 @@ def _names(key: str) -> tuple[str, str]:
 
 
 def _entries(folder: Path, files: dict[Path, int], videos: list[str]) -> list[dict[str, Any]]:
-    """The entries of meta/episodes in order, as far as they are read.
+    """The entries of meta/episodes in order, with the columns that are read here.
 
     Raises:
-        DemonstrationError: They are broken.
+        DemonstrationError: The entries are broken.
     """
     parts = ["chunk_index", "file_index", "from_timestamp"]
     numbers = ["episode_index", "dataset_from_index", "length", *(f"videos/{name}/{part}" for name in videos for part in parts)]

@@ -3,9 +3,11 @@
 from manifeel_ms3.tasks.obs_modes import PAD
 
 INFO = "meta/info.json"
+"""File that describes a dataset; a folder without it is none."""
 ORIGIN = "meta/manifeel.json"
-"""File beside LeRobot's own that names the task and its arguments, by which evaluation goes."""
+"""File beside LeRobot's own that names the task and its arguments, with which policies are evaluated."""
 CARD = "README.md"
+"""File of the dataset's card."""
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 """Paths of the files in LeRobot's layout 3.0. The layout that a data set describes is compared and never filled in, because a

@@ -7,7 +7,7 @@ import numpy as np
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 """Quantiles by the names that lerobot gives them."""
 BRIGHTEST = 255
-"""Value of a uint8 image that lerobot takes for 1."""
+"""Value of a uint8 image that lerobot maps to 1."""
 
 
 def episode_statistics(values: np.ndarray) -> dict[str, list]:
@@ -21,7 +21,7 @@ def episode_statistics(values: np.ndarray) -> dict[str, list]:
 
 
 def joined_statistics(name: str, entries: list[dict[str, Any]]) -> dict[str, list]:
-    """Statistics of a feature over all episodes, from those of each; quantiles are weighted means, as with lerobot.
+    """Statistics of a feature over all episodes, from those of each; quantiles are weighted means, as in lerobot.
 
     Args:
         name: Name of the feature.

@@ -1,4 +1,4 @@
-"""Writing of LeRobot datasets (format 3.0): images without loss, or the cameras' images as videos."""
+"""Writing of LeRobot datasets (format 3.0): all images without loss, or the cameras' images as videos."""
 
 import json
 from pathlib import Path
@@ -29,7 +29,8 @@ POSE_AXES = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 IMAGE_AXES, FIELD_AXES = ["height", "width", "channels"], ["rows", "columns", "force"]
 """Names of the components of the tool's pose, and of the axes of an image and of a force field."""
 CRF, KEYFRAME_EVERY = 18, 2
-"""Quality of a video, which is high, and how often a frame can be read without those before it, lerobot's default."""
+"""Constant rate factor of H.264, nearly without visible loss (FFmpeg's H.264 guide), and number of frames from one key frame to
+the next, lerobot's default."""
 OUTCOMES: dict[str, tuple[str, type]] = {"rewards": ("next.reward", np.float32), "success": ("next.success", np.bool_)}
 """Arrays of a trajectory file about what follows an action, with LeRobot's names and types."""
 
@@ -44,7 +45,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
         videos: Store the cameras' images as videos (H.264), which loses a little, instead of PNG. Touch is always PNG.
 
     Raises:
-        DemonstrationError: The trajectory file is broken, or holds no observations; or videos of an odd size are asked for.
+        DemonstrationError: The trajectory file is broken, or holds no observations; or videos of an odd size are requested.
         MissingExtraError: pyarrow or imageio is not installed.
     """
     pa, pq = pyarrow()
@@ -111,7 +112,7 @@ class _Features:
         """Features that are stored as videos."""
 
     def describe(self, values: dict[str, np.ndarray]) -> None:
-        """Take the features from the arrays of the first episode.
+        """Derive the features from the arrays of the first episode.
 
         Raises:
             DemonstrationError: An image of an odd size cannot become a video.

@@ -27,7 +27,7 @@ from .maniskill_h5 import DemonstrationError, episode_folder, open_trajectories,
 COMPRESSION_LEVEL = 4
 """Level of gzip, which is lossless; 4 is h5py's default."""
 IMAGE_NDIM = 4
-"""Axes of an array over time of images or force fields: (T, H, W, channels)."""
+"""Number of axes of an array over time of images or force fields: (T, H, W, channels)."""
 ENTRY = {"type": "object", "required": ["episode_seed"], "properties": {"episode_seed": {"type": "integer"}}}
 """Json schema of what is read from the json beside the file of one episode."""
 
@@ -77,7 +77,7 @@ def _new_h5(path: Path) -> Iterator[h5py.File]:
         try:
             with h5py.File(partial, "w") as file:
                 yield file
-        except RuntimeError as error:  # h5py's error where a file cannot be closed, because the disk is full
+        except RuntimeError as error:  # h5py raises it if it cannot close a file because the disk is full
             raise OSError(str(error)) from error
 
 
@@ -85,7 +85,7 @@ def is_index(path: Path) -> bool:
     """Whether a trajectory file is an index of links to episodes, or is empty, as an index is before the first episode.
 
     Raises:
-        DemonstrationError: It cannot be read.
+        DemonstrationError: The file cannot be read.
     """
     with open_trajectories(path) as file:
         return not any(isinstance(file.get(name, getlink=True), h5py.HardLink) for name in file)
@@ -98,10 +98,10 @@ def finished_episodes(folder: Path) -> dict[int, dict[str, Any]]:
 
 
 def indexed_seeds(path: Path) -> list[int]:
-    """Seeds of the episodes that an index links to, in their order.
+    """Seeds of the episodes that an index links to, in the order of the index.
 
     Raises:
-        DemonstrationError: It cannot be read.
+        DemonstrationError: The index cannot be read.
     """
     with open_trajectories(path) as index:
         links = [index.get(f"traj_{i}", getlink=True) for i in range(len(index))]
@@ -114,10 +114,10 @@ def write_index(path: Path, header: dict[str, Any], infos: dict[int, dict[str, A
     Args:
         path: The trajectory file.
         header: The json of the file, without its episodes.
-        infos: Json entries of the episodes by seed, in the order that they shall have.
+        infos: Json entries of the episodes by seed, in the order of the file.
     """
     folder = episode_folder(path)
-    if not path.exists():  # what is recorded is known before there is a file
+    if not path.exists():  # the json says what is recorded before there is a file
         write_json(path.with_suffix(".json"), header | dict(episodes=[]))
     with _new_h5(path) as index:
         for i, seed in enumerate(infos):

@@ -1,4 +1,4 @@
-"""A data set in a folder reads files of that folder alone, wherever the folder came from."""
+"""Checks that a data set in a folder only reads files of that folder, wherever the folder came from."""
 
 import os
 from collections.abc import Iterator
@@ -32,13 +32,13 @@ def stored_bytes(folder: Path) -> dict[Path, int]:
 
 
 def read_origin(path: Path, schema: dict[str, Any], what: str, advice: str) -> dict[str, Any]:
-    """What a data set says of the task that it was recorded of, such as `env_id` and `env_kwargs`; {} if it says nothing.
+    """What a data set says about the task that was recorded, such as `env_id` and `env_kwargs`; {} if it says nothing.
 
     Args:
         path: Path of the json file, which need not exist.
         schema: Json schema of the file.
         what: What the file is, for the message.
-        advice: How to mend a broken file.
+        advice: What to do about a broken file, for the message.
 
     Raises:
         DemonstrationError: The file is broken.
@@ -53,7 +53,7 @@ def require_task(folder: Path, origin: dict[str, Any], env_id: str | None) -> No
     """Check that a data set is of a task, if one is asked for and the data set names its own.
 
     Raises:
-        DemonstrationError: It is of another task.
+        DemonstrationError: The data set is of another task.
     """
     if env_id not in (None, found := origin.get("env_id", env_id)):
         raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
@@ -74,7 +74,7 @@ def broken_if_fails(folder: Path, what: str) -> Iterator[None]:
         yield
     except ManifeelError:
         raise
-    except Exception as error:  # numcodecs, pyarrow and ffmpeg raise many kinds
+    except Exception as error:  # numcodecs, pyarrow and ffmpeg raise errors of many types
         raise DemonstrationError(
             f"{folder}: {what} cannot be read ({type(error).__name__}: {error}); copy or export the data set again"
         ) from error

@@ -1,4 +1,4 @@
-"""Opens arrays of a zarr store from anywhere, after their metadata have passed a check.
+"""Opening of the arrays of a zarr store from anywhere, after their metadata have passed a check.
 
 A store can ask for decoders that run code (numcodecs' pickle), hold Python objects, and declare sizes that it does not have.
 Each array's own metadata are read as json, and the array is opened by itself, so that what was checked is what zarr reads.
@@ -16,11 +16,14 @@ from .demonstration_format import MAX_COMPRESSION, DemonstrationError
 from .own_files import broken_if_fails, stored_bytes
 
 CHUNKS_PER_FILE = 64
-"""Number of chunks of an array for each file of the store, at most: zarr leaves out chunks of zeros, but not of all arrays."""
+"""Largest number of chunks of an array per file of the store. zarr does not store chunks that hold only zeros, but not every
+array of a store is one of zeros. Set once, not tuned."""
 COUNTS = {"type": "array", "items": {"type": "integer", "minimum": 0, "maximum": 2**40}}
 LENGTHS = {"type": "array", "items": {"type": "integer", "minimum": 1, "maximum": 2**40}}
+"""Json schemas of an array's shape and of its chunks' shape; the upper bound is far above the length of any recording."""
 CODECS = ["blosc", "gzip", "lz4", "zlib", "zstd"]
 COMPRESSOR = {"type": "object", "properties": {"id": {"enum": CODECS}, "name": {"enum": CODECS}}}
+"""Json schema of a compressor, of one of the kinds that run no code from the file."""
 ARRAY_V2 = {
     "type": "object",
     "required": ["zarr_format", "shape", "chunks", "dtype", "compressor", "filters"],

@@ -34,7 +34,7 @@ class ManiFeelEnvConfig(EnvConfig):
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further arguments of the task; json on the command line."""
     features: dict[str, Any] = field(default_factory=dict)
-    """Features of a policy; those of the task."""
+    """Features that a policy takes; those of the task are added."""
     features_map: dict[str, str] = field(default_factory=dict)
     """LeRobot's names of the features."""
 
