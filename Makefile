@@ -51,7 +51,7 @@ benchmark-smoke: $(READY)
 	$(PYTHON) -m manifeel_ms3.analysis.results_page --results runs/smoke --out runs/smoke/results.md
 
 test: $(READY)
-	OMP_NUM_THREADS=1 .venv/bin/pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 12
+	OMP_NUM_THREADS=1 .venv/bin/pytest -n 3 --dist loadfile --no-loadscope-reorder --durations 12
 
 lint: $(READY)
 	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/lint-imports

@@ -7,6 +7,7 @@ with WorkerPool(2, partial(gym.make, "ManiFeel-PegInsertion-v1")) as pool:
         print(finished.task, finished.result())
 """
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -200,6 +201,7 @@ def _start(worker: _Worker, modules: tuple[str, ...]) -> None:
     global _this_worker
     for module in modules:
         import_module(module)
+    gc.freeze()  # ManiSkill collects garbage at every reset; it need not search the modules, which takes 0.1 s and more
     torch.set_num_threads(1)
     threading.Thread(target=end_with_parent, daemon=True).start()
     _this_worker = worker

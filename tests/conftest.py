@@ -1,5 +1,6 @@
 """Shared fixtures. Tests run on the real simulator; those that need images are skipped only where there is no renderer."""
 
+import gc
 from collections import Counter
 from pathlib import Path
 
@@ -28,6 +29,11 @@ def pytest_collection_modifyitems(items):
         for item in items:
             if item.get_closest_marker("gpu"):
                 item.add_marker(pytest.mark.skip(reason="needs a CUDA GPU"))
+
+
+def pytest_collection_finish():
+    """Keep the modules that are imported out of the garbage collection that ManiSkill starts at every reset."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")

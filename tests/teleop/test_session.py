@@ -192,3 +192,12 @@ def test_modes_follow_each_other():
 def test_a_control_mode_that_cannot_be_steered_is_refused():
     with pytest.raises(InvalidArgumentError, match=r"control_mode='pd_joint_pos' .* choose from \['pd_ee_delta_pose'"):
         steerable_axes("pd_joint_pos")
+
+
+@pytest.mark.parametrize("seed", [-1, 100_000])
+def test_seeds_that_are_not_for_demonstrations_are_refused(seed, make_env, tmp_path):
+    env = make_env(**KWARGS)
+    operator = Operator(steerable_axes(env.unwrapped.control_mode))
+    with pytest.raises(InvalidArgumentError, match=f"--seed {seed}: demonstrations have the seeds 0 to 99999"):
+        Session(env, PEG, KWARGS, tmp_path / "trajectory.h5", seed, operator)
+    assert not list(tmp_path.iterdir())
