@@ -17,6 +17,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 import ray
+import torch
 import tyro
 from ray._private import ray_constants
 from ray.exceptions import RayError, RayTaskError
@@ -293,6 +294,8 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
         )
     table.add_section()
     table.add_row("", "all jobs that are left whose cost is known", "", f"{cpu:.2f}", f"{gpu:.2f}", "")
+    if gpu > 0 and not torch.cuda.is_available():
+        table.caption = "These hours follow from trials on the CPU, because this machine has no CUDA GPU."
     return table
 
 

@@ -100,6 +100,8 @@ def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     assert table.row_count == len({(job.kind, job.title.partition(", seed")[0]) for job in jobs}) + 1
     assert list(table.columns[1].cells)[-1] == "all jobs that are left whose cost is known"
     assert float(list(table.columns[3].cells)[-1]) > 0
+    on_gpus = float(list(table.columns[4].cells)[-1]) > 0
+    assert ("no CUDA GPU" in str(table.caption)) == (on_gpus and not torch.cuda.is_available())
     assert {json.dumps(trial.arguments) for trial in trials if trial.measure is cost.gradient_step}
     for job in jobs:
         if job.kind == "train":
