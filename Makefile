@@ -50,6 +50,7 @@ benchmark-smoke: $(READY)
 	$(PYTHON) -m baselines.studies configs/smoke.yaml --root runs/smoke
 	$(PYTHON) -m manifeel_ms3.analysis.results_page --results runs/smoke --out runs/smoke/results.md
 
+# three processes keep two cores busy, since tests also wait for processes and files
 test: $(READY)
 	OMP_NUM_THREADS=1 .venv/bin/pytest -n 3 --dist loadfile --no-loadscope-reorder --durations 12
 

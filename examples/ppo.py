@@ -17,7 +17,6 @@ import gymnasium as gym
 import numpy as np
 import torch
 import tyro
-import wandb
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from mani_skill.utils.wrappers import CPUGymWrapper, RecordEpisode
 from mani_skill.utils.wrappers.flatten import FlattenObservationWrapper
@@ -297,6 +296,8 @@ def main(args: Args) -> dict[str, float]:
     random.seed(args.seed)
     folder = Path("runs") / args.exp_name
     if args.track:
+        import wandb  # not above, where every process of an environment would import it
+
         names = dict(project=args.wandb_project_name, entity=args.wandb_entity, name=args.exp_name)
         wandb.init(**names, config=asdict(args), sync_tensorboard=True, group="PPO", tags=["ppo", args.env_id])
     videos = folder / "videos" if args.capture_video else None

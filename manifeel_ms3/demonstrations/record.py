@@ -24,7 +24,16 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
-from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording, trajectory_name
+from .recording import (
+    Recorder,
+    Recording,
+    make_header,
+    make_recorder,
+    next_step,
+    open_recording,
+    require_demonstration_seeds,
+    trajectory_name,
+)
 
 log = logging.getLogger(__name__)
 
@@ -83,11 +92,8 @@ class Args:
         """
         if self.num < 1:
             raise InvalidArgumentError(f"--num-demos {self.num}: at least 1 episode must be asked for")
-        if not 0 <= self.seed <= FIRST_EVALUATION_SEED - self.num:
-            raise InvalidArgumentError(
-                f"{self.num} episodes from seed {self.seed} on are asked for; demonstrations have the seeds 0 to "
-                f"{FIRST_EVALUATION_SEED - 1}, because those from {FIRST_EVALUATION_SEED} on are for evaluation"
-            )
+        asked = f"{self.num} episodes from seed {self.seed} on are asked for; "
+        require_demonstration_seeds(self.seed, self.num, asked)
         return range(self.seed, min(self.seed + self.max_tries * self.num, FIRST_EVALUATION_SEED))
 
 

@@ -9,11 +9,12 @@ from uuid import uuid4
 
 import gymnasium as gym
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
-from manifeel_ms3.tasks.registry import make_env, task_spec
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
 
 from .formats.maniskill_h5 import DemonstrationError, read_header
 from .formats.maniskill_h5_writing import (
@@ -34,6 +35,24 @@ STATES_FILE = "trajectory.h5"
 """Name of a file of states and actions, without observations, as ManiSkill's users expect."""
 SESSION = "session-"
 """First part of the name of the folder into which the workers of one recording session write."""
+
+
+def require_demonstration_seeds(first: int, count: int, asked: str) -> None:
+    """Check that seeds are for demonstrations, and not for evaluation.
+
+    Args:
+        first: First seed.
+        count: Number of seeds from the first one on.
+        asked: Beginning of the error's message, which says what was asked for.
+
+    Raises:
+        InvalidArgumentError: A seed is negative, or for evaluation.
+    """
+    if not 0 <= first <= FIRST_EVALUATION_SEED - count:
+        raise InvalidArgumentError(
+            f"{asked}demonstrations have the seeds 0 to {FIRST_EVALUATION_SEED - 1}, because those from "
+            f"{FIRST_EVALUATION_SEED} on are for evaluation"
+        )
 
 
 def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:

@@ -12,9 +12,7 @@ import numpy as np
 
 from manifeel_ms3.demonstrations.episode import run_episode
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, write_episode
-from manifeel_ms3.demonstrations.recording import make_header, open_recording
-from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
+from manifeel_ms3.demonstrations.recording import make_header, open_recording, require_demonstration_seeds
 
 from .operator import EpisodeCommand, Mode, Operator
 
@@ -55,11 +53,7 @@ class Session:
     """
 
     def __init__(self, env: gym.Env, env_id: str, env_kwargs: dict[str, Any], out: Path, seed: int, operator: Operator):
-        if not 0 <= seed < FIRST_EVALUATION_SEED:
-            raise InvalidArgumentError(
-                f"--seed {seed}: demonstrations have the seeds 0 to {FIRST_EVALUATION_SEED - 1}, because those from "
-                f"{FIRST_EVALUATION_SEED} on are for evaluation"
-            )
+        require_demonstration_seeds(seed, 1, f"--seed {seed}: ")
         self.env, self.out, self.operator = env, out, operator
         base: Any = env.unwrapped
         self._period = 1.0 / base.control_freq

@@ -35,6 +35,10 @@ def test_each_epoch_holds_every_sample_once():
     assert first.tolist() != second.tolist()
 
 
+def test_a_batch_may_be_larger_than_the_data():
+    assert sorted(SampleOrder(3, seed=0).take(6).tolist()) == [0, 0, 1, 1, 2, 2]
+
+
 def test_an_order_continues_from_its_state():
     order = SampleOrder(7, seed=0)
     order.take(4)
