@@ -298,7 +298,7 @@ def main(args: Args) -> dict[str, float]:
     if args.track:
         import wandb  # not above, where every process of an environment would import it
 
-        names = dict(project=args.wandb_project_name, entity=args.wandb_entity, name=args.exp_name)
+        names = dict(project=args.wandb_project_name, entity=args.wandb_entity, name=args.exp_name, dir=str(folder.resolve()))
         wandb.init(**names, config=asdict(args), sync_tensorboard=True, group="PPO", tags=["ppo", args.env_id])
     videos = folder / "videos" if args.capture_video else None
     eval_envs = make_envs(args, args.num_eval_envs, videos, ignore_terminations=True)

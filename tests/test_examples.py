@@ -204,7 +204,7 @@ def test_ppo_films_an_evaluation_and_is_tracked(tmp_path, monkeypatch):
     ppo.main(ppo.Args(exp_name="film", total_timesteps=0, track=True, capture_video=True, **few))
     (video,) = Path("runs/film/videos").glob("*.mp4")
     assert video.stat().st_size > 0
-    assert list(Path("wandb").glob("offline-run-*/*.wandb"))
+    assert list(Path("runs/film/wandb").glob("offline-run-*/*.wandb"))
 
 
 def test_ppo_needs_weights_to_evaluate():
