@@ -138,17 +138,18 @@ def test_the_success_under_a_force_counts_the_force_until_the_first_success():
     assert "gentle_success" not in summary_of(episodes, None)
 
 
-TIGHT_LIMIT = 250
-"""Time limit that follows from the demonstrations of the insertion tasks with the tight fit; the longest has 163 steps."""
+LONGEST = dict(PegInsertion=157, USBInsertion=157, PowerPlugInsertion=157, GearAssembly=391)
+"""Control steps of the longest of 100 demonstrations where those of the sample are shorter: of the gear, and of the tight USB
+plug, whose limit the other plugs share."""
 
 
 @pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
 def test_limits_follow_from_demonstrations(spec):
     sample = limits_of_file(states_sample(spec.env_id))
-    assert spec.max_episode_steps >= LONGEST_FACTOR * sample.longest
+    longest = max(sample.longest, LONGEST.get(spec.name, 0))
+    assert spec.max_episode_steps >= LONGEST_FACTOR * longest
     assert spec.max_episode_steps >= MEAN_FACTOR * spec.demo_steps - STEPS
-    tight = TIGHT_LIMIT if spec.category == "insertion" else 0
-    assert spec.max_episode_steps <= max(1.5 * MEAN_FACTOR * spec.demo_steps, sample.max_episode_steps, tight)
+    assert spec.max_episode_steps <= max(1.5 * MEAN_FACTOR * spec.demo_steps, LONGEST_FACTOR * longest + STEPS)
     assert spec.force_limit == pytest.approx(sample.force_limit, rel=0.35)  # of two demonstrations
 
 

@@ -32,7 +32,7 @@ class GearRandomization(InsertionRandomization):
 @register_task(
     "ManiFeel-GearAssembly-v1",
     instruction="Put the gear onto its shaft between the two other gears.",
-    max_episode_steps=390,
+    max_episode_steps=590,
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
