@@ -27,6 +27,8 @@ TWIST_DRAG = 0.01
 """Drag of the pressed object's rotation, in N m s."""
 FRICTION = 0.8
 """Coulomb's friction coefficient of an indenter: averaged with the gel's 0.5, that of the contact is 0.65."""
+LIFTED = 0.05
+"""Height, in m, at which nothing touches the pad."""
 MASS, INERTIA = 0.1, 1e-4
 """Mass, in kg, and moments of inertia, in kg m^2, of an indenter."""
 
@@ -125,18 +127,27 @@ class Press:
     def place(self, height: float, x: float = 0.0, y: float = 0.0) -> None:
         """Put the object's origin over a point of the pad, and begin a new episode of the sensor.
 
+        The object is lifted for one step, because the engine keeps the friction of a contact that is merely moved: after
+        another load, a rod on the DIGIT's dome then slid off the gel.
+
         Args:
             height: Height over the untouched face, m.
             x: Position of the point across the finger, pad frame, m.
             y: Position of the point along the finger, pad frame, m.
         """
-        self.env.place(self.actor, sapien.Pose([x, y, height]))
-        self.body.set_linear_velocity([0, 0, 0])
-        self.body.set_angular_velocity([0, 0, 0])
+        self._rest_at(sapien.Pose([x, y, LIFTED]))
+        self.env.scene.step()
+        self._rest_at(sapien.Pose([x, y, height]))
         self.load = np.zeros(4)
         self._placed = np.array([x, y])
         self._last = self.actor.pose.sp
         self.sensor.reset(torch.arange(1))
+
+    def _rest_at(self, pose: sapien.Pose) -> None:
+        """Put the object at rest at a pose in the pad's frame."""
+        self.env.place(self.actor, pose)
+        self.body.set_linear_velocity([0, 0, 0])
+        self.body.set_angular_velocity([0, 0, 0])
 
     def push(
         self, normal: float, rows: float = 0.0, cols: float = 0.0, twist: float = 0.0, seconds: float = RAMP_SECONDS
