@@ -1,28 +1,37 @@
-"""Feed our recordings to the data loader of ManiSkill's Diffusion Policy: `python examples/diffusion_policy_loader.py peg.h5`.
+"""Feed our recordings to the data loader of ManiSkill's Diffusion Policy:
+`python examples/diffusion_policy_loader.py peg.h5 --maniskill ManiSkill/examples/baselines/diffusion_policy`.
 
-`train_rgbd.py` of ManiSkill's `examples/baselines/diffusion_policy` reads a file with its `load_demo_dataset` and then turns
-each observation into `rgb` and `state` with a function `obs_process_fn`. Ours is below. Put it into that script, and wrap the
-environments of its `make_eval_envs` as `FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env))`, which makes `rgb` and
-`state` in the same way: images of pads become channels of `rgb`, in the size of the cameras' images, and force fields become a
-part of `state`.
+ManiSkill's loader is the class `SmallDemoDataset_DiffusionPolicy` of `train_rgbd.py` in that folder of its repository; its
+package does not contain it. It turns each observation into `rgb` and `state` with a function `obs_process_fn`. Ours is below.
+To train with that script, give it this function, and wrap the environments of its `make_eval_envs` as
+`FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(env))`, which makes `rgb` and `state` in the same way: images of pads become
+channels of `rgb`, in the size of the cameras' images, and force fields become a part of `state`.
+
+ManiSkill's loader takes the last component of an action for the gripper's and repeats it after an episode's end. Record with
+`--env-kwargs '{"control_mode": "pd_ee_delta_pose"}'`, whose actions have one, to train with it.
+
+Without `--maniskill`, the same windows are made by the class `DiffusionPolicyDataset` below.
 """
 
+import importlib
 import logging
+import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
 from torch.utils.data import DataLoader, Dataset
 
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.wrappers import resized
 
 OBS_HORIZON, PRED_HORIZON = 2, 16  # the defaults of ManiSkill's script
 
 
 def leaves(tree):
-    """Arrays (T + 1, ...) of a group of the file, in the order in which they were observed."""
+    """Arrays (T + 1, ...) of a group of the file, or of the dictionary that ManiSkill reads, in their order."""
     for value in tree.values():
         yield from leaves(value) if hasattr(value, "values") else [value[()]]
 
@@ -64,14 +73,33 @@ class DiffusionPolicyDataset(Dataset):
         )
 
 
-def main(path: tyro.conf.Positional[Path], batch_size: int = 8) -> dict:
+def maniskills_dataset(path: Path, folder: Path) -> Dataset:
+    """ManiSkill's own dataset of a recording.
+
+    Args:
+        path: Trajectory file with observations.
+        folder: Folder `examples/baselines/diffusion_policy` of a clone of ManiSkill, whose `train_rgbd.py` is imported.
+    """
+    sys.path.insert(0, str(folder))
+    script = importlib.import_module("train_rgbd")
+    recorded = read_header(path)["env_info"]
+    env = gym.make(recorded["env_id"], **recorded["env_kwargs"])
+    script.args = script.Args(control_mode=env.unwrapped.control_mode, obs_horizon=OBS_HORIZON, pred_horizon=PRED_HORIZON)
+    space = env.observation_space
+    env.close()
+    return script.SmallDemoDataset_DiffusionPolicy(str(path), obs_process_fn, space, True, False, "cpu", None)
+
+
+def main(path: tyro.conf.Positional[Path], maniskill: Path | None = None, batch_size: int = 8) -> dict:
     """Read a recording, and return its first batch.
 
     Args:
         path: Trajectory file with observations.
+        maniskill: Folder `examples/baselines/diffusion_policy` of a clone of ManiSkill, whose loader reads the recording.
         batch_size: Number of windows in a batch.
     """
-    loader = DataLoader(DiffusionPolicyDataset(path), batch_size=batch_size, shuffle=True)
+    dataset = maniskills_dataset(path, maniskill) if maniskill else DiffusionPolicyDataset(path)
+    loader = DataLoader(dataset, batch_size=batch_size, shuffle=True)
     batch = next(iter(loader))
     for name, values in (*batch["observations"].items(), ("actions", batch["actions"])):
         logging.info("%s %s %s", name, tuple(values.shape), values.dtype)

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 from pathlib import Path
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.utils.wrappers import FlattenRGBDObservationWrapper
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
@@ -20,6 +22,8 @@ from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG, needs_renderer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+MANISKILLS_FOLDER = "MANISKILL_DIFFUSION_POLICY"
+"""Variable that names the folder `examples/baselines/diffusion_policy` of a clone of ManiSkill, which its package lacks."""
 
 
 def load(name: str):
@@ -123,6 +127,32 @@ def test_our_recordings_feed_the_loader_of_maniskills_diffusion_policy():
     first, last = dataset[0], dataset[len(dataset.actions[0]) - 1]
     assert np.array_equal(first["observations"]["state"][0], first["observations"]["state"][1])  # padded
     assert np.array_equal(last["actions"][1], dataset.actions[0][-1])
+
+
+def test_maniskills_trajectory_dataset_reads_our_recordings():
+    path = observed_sample(PEG)
+    dataset = ManiSkillTrajectoryDataset(str(path), device="cpu", success_only=True)
+    with h5py.File(path) as file:
+        fields, actions = (file[f"traj_0/{name}"][()] for name in ("obs/sensor_data/tactile_right/force_field", "actions"))
+    assert len(dataset) == sum(episode["elapsed_steps"] for episode in read_header(path)["episodes"])
+    for step in (0, len(actions) - 1):
+        sample = dataset[step]
+        assert np.array_equal(sample["obs"]["sensor_data"]["tactile_right"]["force_field"], fields[step])
+        assert np.array_equal(sample["action"], actions[step])
+    assert dataset[len(actions) - 1]["success"]
+
+
+@needs_renderer
+def test_maniskills_own_loader_is_fed():
+    folder = os.environ.get(MANISKILLS_FOLDER)
+    if not folder:
+        pytest.skip(f"{MANISKILLS_FOLDER} does not name ManiSkill's folder examples/baselines/diffusion_policy")
+    example = load("diffusion_policy_loader")
+    theirs = example.main(observed_sample(PEG), maniskill=Path(folder))
+    ours = example.main(observed_sample(PEG))
+    assert theirs["observations"]["rgb"].shape == ours["observations"]["rgb"].shape
+    assert theirs["observations"]["state"].shape == ours["observations"]["state"].shape
+    assert theirs["actions"].shape == ours["actions"].shape
 
 
 @needs_renderer
