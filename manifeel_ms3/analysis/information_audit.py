@@ -142,7 +142,7 @@ def run_probe(probe: Probe, env_id: str, path: Path) -> list[ProbeResult]:
         path: Trajectory file of the task.
 
     Raises:
-        DemonstrationError: The file lacks an observation, or has too few episodes to cross-validate.
+        DemonstrationError: The file lacks an observation, has too few episodes to cross-validate, or always the same answer.
     """
     data = _read(probe, env_id, path)
     numeric = bool(probe.unit)
@@ -180,6 +180,11 @@ def _read(probe: Probe, env_id: str, path: Path) -> _Data:
     if len(set(episodes)) < FEWEST_EPISODES:
         raise DemonstrationError(
             f"{path}: {len(set(episodes))} episodes answer {probe.question!r}, {FEWEST_EPISODES} are needed; record more"
+        )
+    if len(set(truth)) < 2:
+        raise DemonstrationError(
+            f"{path}: the answer to {probe.question!r} is {truth[0]:g} at all {len(truth)} moments; "
+            "record episodes that differ in it"
         )
     stacked = {modality: np.stack(rows) for modality, rows in features.items()}
     return _Data(np.array(truth), np.array(episodes), stacked)

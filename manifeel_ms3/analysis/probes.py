@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from manifeel_ms3.experts.skills import CONFIG as SKILLS
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
 from manifeel_ms3.tasks.registry import task_spec
@@ -27,13 +26,14 @@ Samples = Iterator[tuple[int, float]]
 Sampler = Callable[[Episode], Samples]
 
 IN_CONTACT = 1.5
-"""Contact force in N above which a held part touches the world."""
+"""Force in N, beyond its weight, above which a held part touches the world."""
 IN_FREE_MOTION = 0.5
-"""Contact force in N below which a held part moves freely; forces between the two are ambiguous and not asked about."""
+"""Force in N, beyond its weight, below which a held part moves freely; forces between the two are ambiguous and not asked
+about."""
 CLOSING = 0.5
 """Action of the gripper below which the fingers close; 1 opens, and demonstrators command -0.4 (balls) and -1 to close."""
-CLOSING_STEPS = SKILLS.gripper_steps
-"""Control steps that the fingers take to close."""
+STILL = 0.05
+"""Largest component of an action of the arm that keeps the hand where it is."""
 EARLY = (1, 4, 7)
 """Observations at the beginning of an episode, 0.3 s apart, before the demonstrator has reached anything."""
 BETWEEN_FINGERS = 0.04
@@ -85,10 +85,12 @@ def _position(episode: Episode, actor: str) -> np.ndarray:
 
 
 def _moments_after_closing(episode: Episode) -> list[int]:
-    """Observations at which the fingers have just closed."""
-    closed = episode["actions"][:, -1] < CLOSING
-    starts = np.flatnonzero(closed & ~np.r_[False, closed[:-1]])
-    return [int(start) + CLOSING_STEPS for start in starts if start + CLOSING_STEPS < len(closed)]
+    """Last observations before the hand, whose fingers have closed, lifts or lets go: nothing shows yet what it felt."""
+    arm, gripper = np.abs(episode["actions"][:, :-1]).max(1), episode["actions"][:, -1]
+    closing = np.r_[False, (gripper < CLOSING) & (arm < STILL), False].astype(int)
+    starts, ends = np.flatnonzero(np.diff(closing) == 1), np.flatnonzero(np.diff(closing) == -1)
+    opened = np.r_[True, gripper >= CLOSING]  # whether the fingers were open before each action
+    return [int(end) for start, end in zip(starts, ends, strict=True) if opened[start] and end < len(gripper)]
 
 
 @register_probe("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1", question="ball in the hand: golf or table tennis")
@@ -126,15 +128,21 @@ def _pitch_in_hand(episode: Episode) -> Samples:
 
 @register_probe("ManiFeel-PegInsertion-v1", "ManiFeel-PegReorientation-v1", question="peg touches or not")
 def _in_contact(episode: Episode) -> Samples:
-    force = episode["contact_force"][()]
+    force = _force_beyond_weight(episode)
     for t in range(0, len(force), CONTACT_STRIDE):
         if force[t] > IN_CONTACT or force[t] < IN_FREE_MOTION:
             yield t + 1, float(force[t] > IN_CONTACT)  # the force of step t belongs to the observation after it
 
 
+def _force_beyond_weight(episode: Episode) -> np.ndarray:
+    """Contact force (T,), in N, beyond the smallest of the episode, with which the fingers carry the part's weight."""
+    force = episode["contact_force"][()]
+    return force - force.min()
+
+
 def _touching(episode: Episode, stride: int) -> Iterator[int]:
     """Observations at which a held part touches the world."""
-    force = episode["contact_force"][()]
+    force = _force_beyond_weight(episode)
     return (t + 1 for t in range(0, len(force), stride) if force[t] > IN_CONTACT)
 
 

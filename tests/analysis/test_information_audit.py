@@ -72,6 +72,7 @@ def recorded(tmp_path):
             place, steps = i % 2, 12
             group = file.create_group(f"traj_{i}")
             group["actions"] = np.zeros((steps, 7))
+            group["actions"][6:, 2] = 0.5  # the hand lifts after its fingers have closed
             group["contact_force"] = np.zeros(steps, np.float32)
             group["env_states/actors/battery"] = np.tile([0.425 + 0.15 * place, *np.zeros(12)], (steps + 1, 1))
             group["obs/extra/tcp_pose"] = np.tile([0.425, 0, 0.1, 0, 1, 0, 0], (steps + 1, 1))
@@ -122,6 +123,38 @@ def test_questions_are_asked_where_the_paper_says_that_touch_decides():
     assert len(questions) == 7
     assert sum(map(len, questions.values())) == 10
     assert questions["PegInsertion"] == ["peg's pitch in the hand", "peg touches or not"]
+
+
+def test_the_weight_of_a_held_part_is_not_a_contact_with_the_world():
+    (contact,) = [probe for probe in task_spec("ManiFeel-PegReorientation-v1").probes if probe.question == "peg touches or not"]
+    force = np.full(40, 0.7, np.float32)  # a steel peg of 70 g
+    force[20:] = 6.0
+    samples = dict(contact.samples(dict(contact_force=force)))
+    assert {t for t, touches in samples.items() if touches} == {t for t in samples if t > 20}
+    assert len(samples) == 10
+
+
+@pytest.mark.parametrize("after", ["opens", "lifts"])
+def test_a_ball_is_judged_before_the_hand_does_what_follows_from_it(after):
+    """Fingers that have opened, or a hand that lifts, would show in the camera what the demonstrator felt."""
+    (held,) = task_spec("ManiFeel-BallSorting-v1").probes
+    actions = np.zeros((20, 7), np.float32)
+    actions[:, -1] = 1.0
+    actions[8:12, -1] = -0.4
+    if after == "lifts":
+        actions[12:, -1], actions[12:, 2] = -0.4, 0.2
+    balls = {f"env_states/actors/{name}_ball": np.zeros((21, 13)) for name in ("golf", "tennis")}
+    balls["env_states/actors/tennis_ball"][:, 1] = 0.05
+    episode = dict(actions=actions) | balls | {"obs/extra/tcp_pose": np.zeros((21, 7))}
+    assert list(held.samples(episode)) == [(12, 1.0)]
+
+
+def test_audit_refuses_a_question_with_one_answer(recorded, tmp_path):
+    with h5py.File(recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5", "r+") as file:
+        for episode in file.values():
+            episode["env_states/actors/battery"][:, 0] = 0.425
+    with pytest.raises(DemonstrationError, match='before contact" is 0 at all 72 moments'):
+        information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
 
 
 def test_audit_says_what_is_missing(recorded, tmp_path):
