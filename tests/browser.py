@@ -89,3 +89,11 @@ def wait_until(condition, seconds: float = 60.0) -> None:
     while not condition():
         assert time.monotonic() < end, "the condition did not become true in time"
         time.sleep(0.1)
+
+
+def wait_for(text: str, page: Browser, seconds: float = 60.0) -> None:
+    """Wait until a page shows a text."""
+    end = time.monotonic() + seconds
+    while text not in (shown := page.text):
+        assert time.monotonic() < end, f"{text!r} did not appear; the page shows {shown!r}"
+        time.sleep(0.1)

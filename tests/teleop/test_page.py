@@ -11,7 +11,7 @@ import pytest
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.replay import replay
-from tests.browser import Browser, browser_program, wait_until
+from tests.browser import Browser, browser_program, wait_for, wait_until
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trust.listening import free_port
 
@@ -24,7 +24,9 @@ SPACE, ENTER, DOWN, AHEAD = (" ", "Space", 32), ("Enter", "Enter", 13), ("f", "K
 def address(tmp_path):
     """Address of a page that `python -m manifeel_ms3.teleop` serves, with the token, as the command prints it."""
     port = free_port()
-    command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, "--out", str(tmp_path / "human.h5"), "--port", str(port)]
+    files = ["--out", str(tmp_path / "human.h5"), "--port", str(port)]
+    slow_machine = ["--env-kwargs", '{"max_episode_steps": 3000}']  # the task's own limit ends after 24 s
+    command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, *files, *slow_machine]
     heeding = ["env", "--default-signal=INT", *command]  # a background job's processes ignore SIGINT by default
     process = subprocess.Popen(heeding, stderr=subprocess.PIPE, text=True)
     address = next(line for line in process.stderr if "shows the robot" in line).split()[0]
@@ -53,22 +55,22 @@ def test_a_person_records_an_episode(address, tmp_path):
     with Browser(address, tmp_path / "second") as second:
         wait_until(lambda: "you watch" in second.text and "discard" in second.text)
         first.press(*SPACE)
-        wait_until(lambda: "recording" in second.text)
+        wait_for("recording", second)
         first.press(*DOWN, times=10)
         second.press(*AHEAD, times=5)  # ignored
         second.press(*SPACE)
-        wait_until(lambda: "recording" in second.text)
+        wait_for("recording", second)
         first.close()
-        wait_until(lambda: "paused" in second.text)
+        wait_for("paused", second)
         second.press(*SPACE)  # ignored, too, before this page has taken over
         second.click("take over")
-        wait_until(lambda: "you steer" in second.text)
+        wait_for("you steer", second)
         assert "paused" in second.text
         second.press(*SPACE)
-        wait_until(lambda: "recording" in second.text)
+        wait_for("recording", second)
         second.press(*DOWN, times=5)
         second.press(*ENTER)
-        wait_until(lambda: "1 saved" in second.text)
+        wait_for("1 saved", second)
 
     with open_trajectories(path) as file:
         actions = np.asarray(file["traj_0/actions"])
