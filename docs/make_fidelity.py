@@ -164,7 +164,10 @@ def task_rows() -> Iterator[Row]:
 
 def limit_rows() -> Iterator[Row]:
     """A row on the time limit of each task."""
-    why = "About twice the length of a demonstration, so that waiting is not rewarded and evaluation stays cheap."
+    why = (
+        "At least about twice the mean length of a demonstration, and 1.5 times the longest: waiting is not rewarded, and "
+        "evaluation stays cheap."
+    )
     for spec in paper_tasks():
         yield _row(spec.name, "", f"{CODE_LIMIT} steps", f"{spec.max_episode_steps} steps", why)
 

@@ -84,16 +84,9 @@ class Browser:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot")["data"]))
 
 
-def wait_until(condition, seconds: float = 60.0) -> None:
+def wait_until(condition, seconds: float = 60.0, page: Browser | None = None) -> None:
+    """Wait until a condition holds; where it does not, the error says what the page shows."""
     end = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < end, "the condition did not become true in time"
-        time.sleep(0.1)
-
-
-def wait_for(text: str, page: Browser, seconds: float = 60.0) -> None:
-    """Wait until a page shows a text."""
-    end = time.monotonic() + seconds
-    while text not in (shown := page.text):
-        assert time.monotonic() < end, f"{text!r} did not appear; the page shows {shown!r}"
+        assert time.monotonic() < end, "the condition did not become true in time" + (f" on {page.text!r}" if page else "")
         time.sleep(0.1)

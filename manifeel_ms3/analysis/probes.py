@@ -84,19 +84,17 @@ def _position(episode: Episode, actor: str) -> np.ndarray:
     return episode[f"env_states/actors/{actor}"][:, :3]
 
 
-def _moments_after_closing(episode: Episode) -> list[int]:
-    """Last observations before the hand, whose fingers have closed, lifts or lets go: nothing shows yet what it felt."""
+def _end_of_first_closing(episode: Episode) -> list[int]:
+    """Last observation before the hand, whose fingers have closed, lifts or lets go: nothing shows yet what it felt."""
     arm, gripper = np.abs(episode["actions"][:, :-1]).max(1), episode["actions"][:, -1]
-    closing = np.r_[False, (gripper < CLOSING) & (arm < STILL), False].astype(int)
-    starts, ends = np.flatnonzero(np.diff(closing) == 1), np.flatnonzero(np.diff(closing) == -1)
-    opened = np.r_[True, gripper >= CLOSING]  # whether the fingers were open before each action
-    return [int(end) for start, end in zip(starts, ends, strict=True) if opened[start] and end < len(gripper)]
+    closing = (gripper < CLOSING) & (arm < STILL)
+    return [int(t) + 1 for t in np.flatnonzero(closing[:-1] & ~closing[1:])[:1]]
 
 
 @register_probe("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1", question="ball in the hand: golf or table tennis")
 def _golf_ball_held(episode: Episode) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
-    for t in _moments_after_closing(episode)[:1]:  # the first grasp takes the wrong ball half of the time
+    for t in _end_of_first_closing(episode):  # the first grasp takes the wrong ball half of the time
         distance = [np.linalg.norm(_position(episode, f"{ball}_ball")[t] - tool[t]) for ball in ("golf", "tennis")]
         yield t, float(distance[0] < distance[1])
 
@@ -111,7 +109,7 @@ def _battery_in_far_half(episode: Episode) -> Samples:
 @register_probe("ManiFeel-ObjectSearch-v1", question="battery between the fingers or not, once closed")
 def _battery_held(episode: Episode) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
-    for t in _moments_after_closing(episode)[:1]:
+    for t in _end_of_first_closing(episode):
         distance = np.linalg.norm((_position(episode, "battery")[t] - tool[t])[:2])
         yield t, float(distance < BETWEEN_FINGERS)
 

@@ -11,7 +11,7 @@ import pytest
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.replay import replay
-from tests.browser import Browser, browser_program, wait_for, wait_until
+from tests.browser import Browser, browser_program, wait_until
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trust.listening import free_port
 
@@ -55,22 +55,22 @@ def test_a_person_records_an_episode(address, tmp_path):
     with Browser(address, tmp_path / "second") as second:
         wait_until(lambda: "you watch" in second.text and "discard" in second.text)
         first.press(*SPACE)
-        wait_for("recording", second)
+        wait_until(lambda: "recording" in second.text, page=second)
         first.press(*DOWN, times=10)
         second.press(*AHEAD, times=5)  # ignored
         second.press(*SPACE)
-        wait_for("recording", second)
+        wait_until(lambda: "recording" in second.text, page=second)
         first.close()
-        wait_for("paused", second)
+        wait_until(lambda: "paused" in second.text, page=second)
         second.press(*SPACE)  # ignored, too, before this page has taken over
         second.click("take over")
-        wait_for("you steer", second)
+        wait_until(lambda: "you steer" in second.text, page=second)
         assert "paused" in second.text
         second.press(*SPACE)
-        wait_for("recording", second)
+        wait_until(lambda: "recording" in second.text, page=second)
         second.press(*DOWN, times=5)
         second.press(*ENTER)
-        wait_for("1 saved", second)
+        wait_until(lambda: "1 saved" in second.text, page=second)
 
     with open_trajectories(path) as file:
         actions = np.asarray(file["traj_0/actions"])
