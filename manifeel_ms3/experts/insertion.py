@@ -51,6 +51,11 @@ class InsertionExpertConfig:
 
     press_force: float = 10.0
     """Downward force that presses the plug in, in N. Tuned."""
+    light_press: float | None = None
+    """Downward force, in N, that alternates with `press_force` on a plug that sticks, so that friction does not hold it where it
+    sticks; None if the demonstrator never presses less. Tuned."""
+    unload_every: int = 10
+    """Number of steps between changes from `press_force` to `light_press` and back. Tuned."""
     compliance: float = 1.5e-4
     """Motion of the hand per step and per newton of unwanted force, in m/N. Tuned."""
     force_step: float = 0.0012
@@ -211,7 +216,9 @@ class InsertionExpert:
 
     def _press_force(self, stuck: int) -> float:
         """Downward force, in N, on a plug that has not advanced for `stuck` steps."""
-        return self.config.press_force
+        config = self.config
+        unloaded = stuck // config.unload_every % 2 == 1
+        return config.light_press if unloaded and config.light_press is not None else config.press_force
 
     def _is_on_top(self) -> bool:
         """Whether the plug's end has not entered the hole."""

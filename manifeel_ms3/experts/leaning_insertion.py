@@ -119,6 +119,12 @@ class LeaningInsertionExpert(InsertionExpert):
                 yield skills.command(target + np.array(config.stand_up_push), facing)
 
 
+class LeaningPowerPlugExpert(LeaningInsertionExpert):
+    """Presses less now and then, so that blades that stand on the rim slide into their holes while the plug is wriggled."""
+
+    config = LeaningConfig(light_press=1.0)  # tuned
+
+
 class LeaningGearExpert(LeaningInsertionExpert):
     """Puts a gear's bore over its shaft like a plug into a socket, feeling for the shaft's side with the bore's rim."""
 

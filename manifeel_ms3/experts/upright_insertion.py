@@ -8,7 +8,7 @@ from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .insertion import STRAIGHT, InsertionExpert, InsertionExpertConfig
-from .leaning_insertion import LeaningGearExpert, LeaningInsertionExpert
+from .leaning_insertion import LeaningGearExpert, LeaningInsertionExpert, LeaningPowerPlugExpert
 from .skills import Actions, above
 
 
@@ -40,10 +40,6 @@ class UprightConfig(InsertionExpertConfig):
     """Motion of the plug away from the edge that it stands on, in m per step. Tuned."""
     sure_force: float = 1.5
     """Downward force, in N, from which the place of a contact can be told. Tuned."""
-    unload_every: int = 10
-    """Number of steps between changes of the force on a gear whose teeth stand on others. Tuned."""
-    light_press: float = 1.0
-    """Downward force, in N, that alternates with `press_force` on a gear whose teeth stand on others. Tuned."""
     slipped: float = float(np.deg2rad(3.0))
     """Lean of a gear, in rad, from which on it has slipped in the hand and is set down anew. Tuned."""
     shallow: float = 0.012
@@ -101,7 +97,7 @@ class UprightGearExpert(UprightInsertionExpert):
     Where teeth stand on teeth, it presses less now and then, so that the gear turns over its neighbours instead of with them.
     """
 
-    config = UprightConfig(twist=0.10, press_force=6.0)  # tuned
+    config = UprightConfig(twist=0.10, press_force=6.0, light_press=1.0)  # tuned
 
     def _is_outside(self, stuck: int) -> bool:
         _, facing = self.skills.tool
@@ -110,15 +106,17 @@ class UprightGearExpert(UprightInsertionExpert):
         shallow = self._place(self._end)[2] > self._rim - self.config.shallow
         return bool(lean > self.config.slipped and shallow) or super()._is_outside(stuck)
 
-    def _press_force(self, stuck: int) -> float:
-        unloaded = stuck // self.config.unload_every % 2 == 1
-        return self.config.light_press if unloaded else self.config.press_force
 
-
-@register_demonstrator("ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1")
+@register_demonstrator("ManiFeel-PegInsertion-v1", "ManiFeel-USBInsertion-v1")
 def insertion_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
     """Make the demonstrator that fits the sizes of the parts: upright where they have play, leaning where they have not."""
     return (UprightInsertionExpert if env.fit.goes_in_upright else LeaningInsertionExpert)(env, seed)
+
+
+@register_demonstrator("ManiFeel-PowerPlugInsertion-v1")
+def power_plug_expert(env: InsertionEnv, seed: int) -> InsertionExpert:
+    """Make the demonstrator of the power plug that fits the sizes of the parts."""
+    return (UprightInsertionExpert if env.fit.goes_in_upright else LeaningPowerPlugExpert)(env, seed)
 
 
 @register_demonstrator("ManiFeel-GearAssembly-v1")
