@@ -24,7 +24,7 @@ TARGETS = {"state": 150, "rgb": 50, "rgb+tacff": 35, "rgb+tacrgb+tacff": 25}
 PARTS = {
     "physics": [("~", "pysapien.step")],
     "rendering": [("~", "get_picture"), ("~", "take_picture"), ("~", "update_render")],
-    "control": [("panda_gelsight", "pad_joint_forces"), ("agents/controllers.py", "set_action")],
+    "control": [("structs/articulation.py", "get_link_incoming_joint_forces"), ("agents/controllers.py", "set_action")],
     "rays": [("raycast.py", "look"), ("raycast.py", "heights")],
     "gel mechanics": [("contact.py", "solve_indentation"), ("touch_model.py", "_slide"), ("taxels.py", "forces")],
     "optics": [("optics.py", "surface"), ("optics.py", "shade")],

@@ -296,18 +296,15 @@ class PandaGelSight(BaseAgent):
         """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; TacFF adds up to it."""
         return self._gauges[side].read()
 
-    @property
-    def pad_joint_forces(self) -> torch.Tensor:
-        """Force and moment (N, 2, 6), N and N m, of both pads' joints, in the joints' frames; it costs little."""
-        return self.robot.get_link_incoming_joint_forces()[:, self._gel_indices]
-
-    def held_object_force(self, pad_joint_forces: torch.Tensor) -> torch.Tensor:
+    def held_object_force(self, joint_forces: torch.Tensor) -> torch.Tensor:
         """Norm (...), in N, of the force of both pads together on the held object, which equals that of the world on it.
 
         Args:
-            pad_joint_forces: Values (..., 2, 6) of the property of that name.
+            joint_forces: Forces and moments (..., L, 6) of the joints of all L links, N and N m, in the joints' frames, as
+                `robot.get_link_incoming_joint_forces` returns them.
         """
-        return torch.linalg.norm(torch.einsum("...kj,kij->...i", pad_joint_forces[..., :3], self._joint_to_hand), dim=-1)
+        forces = joint_forces[..., self._gel_indices, :3]
+        return torch.linalg.norm(torch.einsum("...kj,kij->...i", forces, self._joint_to_hand), dim=-1)
 
     def torque_on_held(self, point: torch.Tensor) -> torch.Tensor:
         """Torque (N,), in N m, of both pads on the held object about the vertical through `point` (N, 3).

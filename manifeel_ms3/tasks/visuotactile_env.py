@@ -334,9 +334,9 @@ class VisuotactileEnv(SceneryEnv):
         if action is not None:
             shape: Any = self.single_action_space.shape
             action = checked_action(action, (shape, (self.num_envs, *shape)), self.device)
-        self._pad_forces = []
+        self._joint_forces = []
         action = super()._step_action(action)
-        self._contact_force = self.agent.held_object_force(torch.stack(self._pad_forces)).amax(dim=0)
+        self._contact_force = self.agent.held_object_force(torch.stack(self._joint_forces)).amax(dim=0)
         self._touch_is_fresh = False
         self._measured = self.measure()  # for the `evaluate` that follows
         reached = self.goal_reached(self._measured)
@@ -347,7 +347,7 @@ class VisuotactileEnv(SceneryEnv):
         return action
 
     def _after_simulation_step(self):
-        self._pad_forces.append(self.agent.pad_joint_forces)
+        self._joint_forces.append(self.agent.robot.get_link_incoming_joint_forces())
 
     def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None):
         """Set the state. Setting the present state again changes nothing.
