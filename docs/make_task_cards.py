@@ -64,8 +64,8 @@ def _head(spec: TaskSpec) -> str:
     made = "*Made by `python -m docs.make_task_cards` from the class of the task, the registry and what was measured.*"
     shown = f"![{spec.name} from all cameras and on both pads](../images/tasks/{spec.name}.jpg)\n\n*{CAPTION}*\n"
     if (FILMS / f"{spec.name}.mp4").is_file():
-        film = f"../../films/{spec.name}.mp4"  # the site has each page in a folder of its own
-        shown = f'<video src="{film}" controls autoplay loop muted playsinline style="width: 100%"></video>\n\n{shown}'
+        video = f"../../films/{spec.name}.mp4"  # the site has each page in a folder of its own
+        shown = f'<video src="{video}" controls autoplay loop muted playsinline style="width: 100%"></video>\n\n{shown}'
     return f"# {spec.name}\n\n{made}\n\n{shown}"
 
 

@@ -152,7 +152,7 @@ def test_a_task_plugin_that_does_not_import_is_named_and_others_work(tmp_path):
     assert "the plug-in 'broken' of broken (my_package) cannot be loaded" in ran.stderr
     said = refusal(tmp_path, "tasks", "Knitting")
     assert "'Knitting' is not registered; registered are ['ManiFeel-PegInsertion-v1'" in said
-    assert said.endswith("(1 plug-ins do not import: broken)")
+    assert said.endswith("(plug-ins that do not import: broken)")
 
 
 def test_a_policy_or_a_command_that_does_not_import_is_one_line(tmp_path):

@@ -87,8 +87,8 @@ class BackgroundEvaluation:
             log.warning("the evaluation of %s failed; %s says why", checkpoint, path.with_suffix(".log"))
             return []
         step, result = int(checkpoint.name), json.loads(path.read_text())
-        if (film := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
-            film.replace(film.with_name(f"{step}.mp4"))  # the next evaluation records the same episode
+        if (video := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
+            video.replace(video.with_name(f"{step}.mp4"))  # the next evaluation records the same episode
         scalars: dict[str, float] = {name: result[name]["rate"] for name in RATES if name in result} | {
             name: result[name] for name in MEANS
         }

@@ -32,10 +32,10 @@ def for_cpu(
         action_horizon=4,  # ball sorting succeeds more often with 8, and insertion, which must react to contact, with 2
         obs_horizon=1,  # with 2, a policy infers the next action from its own motion and ignores the images
         encoder=encoder,
-        action_network="mlp",
-        diffusion_step_embed_dim=64,
-        pose_noise=0.1,
-        noise_draws=8,
+        action_network="mlp",  # a step costs a fifteenth of the U-Net's
+        diffusion_step_embed_dim=64,  # features
+        pose_noise=0.1,  # standard deviation, where the pose has the range [-1, 1]; one of 0.03 did worse
+        noise_draws=8,  # for each sample: the MLP costs little beside the encoders
         **policy,
     )
     return replace(
@@ -44,13 +44,13 @@ def for_cpu(
         inference_steps=inference_steps,
         camera_view="work",
         image_size=image_size,
-        tactile_image_size=96,
+        tactile_image_size=96,  # pixels, height and width
         pose="rotation_6d",
-        batch_size=16,
+        batch_size=16,  # samples; more steps of small batches were tried beside fewer steps of 64
         steps=steps,
-        lr=1e-3,
-        warmup_steps=100,
-        save_freq=1000,
+        lr=1e-3,  # the paper's 8e-5 is for a hundred times as many steps
+        warmup_steps=100,  # gradient steps
+        save_freq=1000,  # gradient steps
         device="cpu",
         precision="fp32",
         compile=False,

@@ -19,7 +19,9 @@ class EquivariantConfig(DiffusionConfig):
     """Settings of the Equivariant Diffusion Policy; the defaults are those of the paper's public code."""
 
     prediction: Literal["epsilon", "sample"] = "sample"
+    """What the network predicts: the noise, or the actions themselves."""
     sampler: Literal["ddpm", "ddim"] = "ddim"
+    """Scheme of the generation."""
     encoder: EncoderConfig = field(
         default_factory=lambda: EncoderConfig(tacrgb="resnet18_keypoints", tactile_features=128, crop=230)
     )

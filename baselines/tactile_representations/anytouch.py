@@ -69,10 +69,10 @@ class AnyTouch(TokenRepresentation):
     def prepare(self, image):
         return self.normalisation(image)
 
-    def embed(self, picture):
-        video = picture[:, None].expand(-1, FRAMES, -1, -1, -1)  # (B, frame, colour, H, W)
+    def embed(self, prepared):
+        video = prepared[:, None].expand(-1, FRAMES, -1, -1, -1)  # (B, frame, colour, H, W)
         patches = self.touch_model.embeddings.patch_embedding(video).flatten(2).transpose(1, 2)
-        grid = [side // self.patch for side in picture.shape[2:]]
+        grid = [side // self.patch for side in prepared.shape[2:]]
         return patches + interpolate_pos_embed(self.touch_model.embeddings.position_embedding.weight[None, 1:], grid)
 
     def encode(self, tokens):

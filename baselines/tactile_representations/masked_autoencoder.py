@@ -37,14 +37,14 @@ class MaskedAutoencoder(nn.Module):
 
     def forward(self, image: torch.Tensor) -> torch.Tensor:
         """Mean squared error of the hidden patches, each normalised to mean 0 and standard deviation 1."""
-        picture = self.representation.prepare(image)
-        tokens = self.representation.embed(picture)
+        prepared = self.representation.prepare(image)
+        tokens = self.representation.embed(prepared)
         order = torch.rand(tokens.shape[:2], device=image.device).argsort(1)
         kept = order[:, : round((1 - self.masked) * tokens.shape[1])]
         seen = self.representation.encode(_pick(tokens, kept))[:, self.representation.leading :]
         predicted = self._decoded(seen, kept, tokens.shape[1])
         patch = self.representation.patch
-        patches = F.unfold(picture, patch, stride=patch).transpose(1, 2)
+        patches = F.unfold(prepared, patch, stride=patch).transpose(1, 2)
         target = (patches - patches.mean(-1, keepdim=True)) / (patches.var(-1, keepdim=True) + VARIANCE_EPS).sqrt()
         hidden = order[:, kept.shape[1] :]
         return F.mse_loss(_pick(predicted, hidden), _pick(target, hidden))

@@ -112,11 +112,11 @@ class TokenRepresentation(Representation):
     """Number of tokens before those of the patches, such as the class token."""
 
     def prepare(self, image: torch.Tensor) -> torch.Tensor:
-        """The pictures (B, 3, h, w) that the authors' preprocessing makes of images in [-1, 1]."""
+        """The images (B, 3, h, w) that the authors' preprocessing makes of images in [-1, 1]."""
         raise NotImplementedError
 
-    def embed(self, picture: torch.Tensor) -> torch.Tensor:
-        """Tokens (B, N, width) of a prepared picture's patches, their position embeddings added."""
+    def embed(self, prepared: torch.Tensor) -> torch.Tensor:
+        """Tokens (B, N, width) of a prepared image's patches, their position embeddings added."""
         raise NotImplementedError
 
     def encode(self, tokens: torch.Tensor) -> torch.Tensor:

@@ -22,7 +22,7 @@ LONGEST_WAVE = 1e4
 PREFIXES = ("teacher_encoder.backbone.", "target_encoder.backbone.")
 """Prefixes of the encoder's weights in the checkpoints trained by DINO and by I-JEPA; the safetensors files have none."""
 UPRIGHT = (320, 240)
-"""Rows and columns of the pictures that the published weights were trained on."""
+"""Rows and columns of the images that the published weights were trained on."""
 OFFSET = 0.5
 """Brightness, as a share of the range, of a place at which an image does not differ from the untouched sensor's."""
 
@@ -68,9 +68,9 @@ class Sparsh(TokenRepresentation):
         untouched = F.interpolate(self.untouched, levels.shape[2:], mode="bilinear", antialias=True).round()
         return (levels - untouched + 255 * OFFSET).clamp(0, 255).floor() / 255
 
-    def embed(self, picture):
-        grid = (picture.shape[2] // self.patch, picture.shape[3] // self.patch)
-        return self.patch_embed(torch.cat([picture, picture], dim=1)) + self.pos_embed(grid)
+    def embed(self, prepared):
+        grid = (prepared.shape[2] // self.patch, prepared.shape[3] // self.patch)
+        return self.patch_embed(torch.cat([prepared, prepared], dim=1)) + self.pos_embed(grid)
 
     def encode(self, tokens):
         tokens = torch.cat([self.register_tokens.expand(len(tokens), -1, -1), tokens], dim=1)

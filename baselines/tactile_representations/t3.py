@@ -63,9 +63,9 @@ class T3(TokenRepresentation):
     def prepare(self, image):
         return self.normalisation(image)
 
-    def embed(self, picture):
-        grid = [side // self.patch for side in picture.shape[2:]]
-        return self.encoder.patch_embed(picture) + interpolate_pos_embed(self.encoder.pos_embed[:, 1:], grid)
+    def embed(self, prepared):
+        grid = [side // self.patch for side in prepared.shape[2:]]
+        return self.encoder.patch_embed(prepared) + interpolate_pos_embed(self.encoder.pos_embed[:, 1:], grid)
 
     def encode(self, tokens):
         first = (self.encoder.cls_token + self.encoder.pos_embed[:, :1]).expand(len(tokens), -1, -1)

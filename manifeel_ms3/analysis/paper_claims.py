@@ -59,7 +59,7 @@ def _touch_claims() -> Iterator[Comparison]:
 
 
 def _picture_claims() -> Iterator[Comparison]:
-    """The claims about TacRGB in tasks that its pictures do not help."""
+    """The claims about TacRGB in tasks that its images do not help."""
     for task in tasks_in_table("I", "insertion", "screwing"):
         if task != "PegInsertion":  # there, the paper found a gain of seven points
             claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg"

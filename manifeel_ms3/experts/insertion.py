@@ -52,8 +52,8 @@ class InsertionExpertConfig:
     press_force: float = 10.0
     """Downward force that presses the plug in, in N. Tuned."""
     light_press: float | None = None
-    """Downward force, in N, that alternates with `press_force` on a plug that sticks, so that friction does not hold it where it
-    sticks; None if the demonstrator never presses less. Tuned."""
+    """Downward force, in N, that alternates with `press_force` on a plug that sticks, so that friction does not hold it there;
+    None if the demonstrator never presses less. Tuned."""
     unload_every: int = 10
     """Number of steps between changes from `press_force` to `light_press` and back. Tuned."""
     compliance: float = 1.5e-4

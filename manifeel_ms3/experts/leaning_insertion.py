@@ -19,7 +19,9 @@ class LeaningConfig(InsertionExpertConfig):
     """
 
     feel_press: float = 2.0
+    """As in `InsertionExpertConfig`, in N; smaller, since the leading corner is a small contact. Tuned."""
     press_force: float = 8.0
+    """As in `InsertionExpertConfig`, in N. Tuned."""
     search_radius: float = 0.0012
     """Distance of the second and later landing places from the first, in m. Tuned."""
     search_places: int = 6

@@ -20,6 +20,7 @@ class UprightConfig(InsertionExpertConfig):
     """
 
     keeps_hand: bool = True
+    """As in `InsertionExpertConfig`: with play, the walls right a plug that has slipped in the hand."""
     hover_height: float = 0.015
     """Height over the rim, in m, from which the plug is lowered. Tuned."""
     aim_error: float = 0.006

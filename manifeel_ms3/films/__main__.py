@@ -7,7 +7,7 @@ pad; arrows are shear) and the contact force over time, under the names of task,
     manifeel film runs/peg/evaluation.json --out evaluated.mp4
     manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
 
-The episode of a trajectory file is replayed from its actions, and every picture is rendered anew, so that the file needs no
+The episode of a trajectory file is replayed from its actions, and every image is rendered anew, so that the file needs no
 observations. A result holds no actions: its episode is run again with the policy, from `checkpoints/last` beside the result if
 no other is given.
 """

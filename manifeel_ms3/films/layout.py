@@ -79,11 +79,11 @@ def _draw_title(draw: ImageDraw.ImageDraw, take: Take, step: int) -> None:
 
 def _fitted(image: np.ndarray, width: int, height: int) -> Image.Image:
     """Tile with an image (H, W, 3) in its middle, as large as fits; sizes in pixels."""
-    picture = Image.fromarray(image)
-    scale = min(width / picture.width, height / picture.height)
-    size = (round(picture.width * scale), round(picture.height * scale))
+    source = Image.fromarray(image)
+    scale = min(width / source.width, height / source.height)
+    size = (round(source.width * scale), round(source.height * scale))
     tile = Image.new("RGB", (width, height), PAPER)
-    tile.paste(picture.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, (height - size[1]) // 2))
+    tile.paste(source.resize(size, Image.Resampling.LANCZOS), ((width - size[0]) // 2, (height - size[1]) // 2))
     return tile
 
 

@@ -242,7 +242,7 @@ def _load_plugins() -> dict[str, str]:
 
 def _left_out() -> str:
     failed = _load_plugins()
-    return f" ({len(failed)} plug-ins do not import: {', '.join(failed)})" if failed else ""
+    return f" (plug-ins that do not import: {', '.join(failed)})" if failed else ""
 
 
 def _qualified(kind: Any) -> str:

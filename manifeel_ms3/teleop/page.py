@@ -12,14 +12,17 @@ import viser
 import viser.uplot
 
 from manifeel_ms3.sensors.visualisation import observation_images
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .local_server import LocalServer
 from .operator import EpisodeCommand, Mode, Operator
 
 TILE_HEIGHT = 360
 """Height of each image on the page, in pixels; set once, not tuned."""
-NUM_PLOTTED = 150
-"""Number of steps that the plot of the contact force shows: the last 15 s at 10 Hz."""
+PLOTTED_SECONDS = 15
+"""Time that the plot of the contact force shows, in s; set once, not tuned."""
+NUM_PLOTTED = PLOTTED_SECONDS * CONTROL_FREQ
+"""Number of control steps in this time."""
 PLOT_HEIGHT = 150
 """Height of that plot, in pixels."""
 JPEG_QUALITY = 80

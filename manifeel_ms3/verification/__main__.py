@@ -122,7 +122,7 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
         checks=checks,
         figure=Markup(figure(found)),
         strip=_strip(found),
-        names=[picture.shape for picture in found.pictures],
+        names=[touch.shape for touch in found.images],
         readings=found.readings + found.limits,
         left_out=found.left_out,
     )
@@ -131,10 +131,10 @@ def page(sensor: str, changes: dict[str, Any], found: Measurements, checks: list
 def _strip(found: Measurements) -> str:
     """TacRGB over force field of every shape, as a PNG in base64."""
     columns = []
-    for picture in found.pictures:
-        height, width = picture.rgb.shape[:2]
-        field = force_field_images(torch.as_tensor(picture.force_field)[None], (height, width))[0].numpy()
-        columns.append(np.vstack([picture.rgb, field]))
+    for touch in found.images:
+        height, width = touch.rgb.shape[:2]
+        field = force_field_images(torch.as_tensor(touch.force_field)[None], (height, width))[0].numpy()
+        columns.append(np.vstack([touch.rgb, field]))
     return base64.b64encode(cv2.imencode(".png", np.hstack(columns)[..., ::-1])[1].tobytes()).decode()
 
 

@@ -27,7 +27,7 @@ SHEAR_SHARES = (0.25, -0.15)
 TWIST_ARM = 4e-4
 """Moment about the normal over the normal load, in m."""
 PICTURED_LOAD = 10.0
-"""Load under which pictures are taken, in N."""
+"""Load under which images are taken, in N."""
 LOOP_LOADS = (2.0, 4.0, 6.0, 8.0, 10.0)
 """Loads, in N, of the loop of loading and unloading, which begins and ends at 0."""
 DEPTH_LOADS = (1.0, 3.0, 10.0)
@@ -98,7 +98,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Picture:
+class TouchImages:
     """TacRGB and force field under one load."""
 
     shape: str
@@ -115,7 +115,7 @@ class Measurements:
 
     readings: list[Reading]
     """Readings of every shape under every load."""
-    pictures: list[Picture]
+    images: list[TouchImages]
     """Images of every shape."""
     loop: np.ndarray
     """Applied and reported normal force (n, 2), N, during loading and unloading."""
@@ -153,7 +153,7 @@ def measure(
         on_shape(name)
         press = Press(indenter(name, **shape), **arguments)
         found.readings += _readings(press, name, touching, loads, found.left_out)
-        found.pictures.append(_picture(press, name, touching))
+        found.images.append(_images(press, name, touching))
         if name.startswith("box"):
             found.loop = _loop(press, touching)
         if name == "ball, 10 mm":
@@ -197,13 +197,13 @@ def _readings(press: Press, name: str, touching: float, loads: tuple[float, ...]
         yield Reading(name, press.applied, press.wrench, press.sums, centre_error, indented)
 
 
-def _picture(press: Press, name: str, touching: float) -> Picture:
+def _images(press: Press, name: str, touching: float) -> TouchImages:
     sensor = TactileSensor(press.sensor.config, press.env.scene, press.env.agent.robot)
     load = min(PICTURED_LOAD, largest_load(press, name))
     press.place(touching + CLEARANCE, *PLACE)
     press.push(load, *(share * load for share in SHEAR_SHARES))
     sensor.capture()
-    return Picture(name, sensor.get_obs()["rgb"][0].cpu().numpy(), press.field)
+    return TouchImages(name, sensor.get_obs()["rgb"][0].cpu().numpy(), press.field)
 
 
 def _loop(press: Press, touching: float) -> np.ndarray:

@@ -104,8 +104,8 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     span = b.max() - b.min()
     c1, c2 = (SSIM_K1 * span) ** 2, (SSIM_K2 * span) ** 2
 
-    def mean(picture: np.ndarray) -> np.ndarray:
-        return gaussian_filter(picture, SSIM_WINDOW, axes=(0, 1))
+    def mean(image: np.ndarray) -> np.ndarray:
+        return gaussian_filter(image, SSIM_WINDOW, axes=(0, 1))
 
     ma, mb = mean(a), mean(b)
     va, vb, cov = mean(a * a) - ma**2, mean(b * b) - mb**2, mean(a * b) - ma * mb

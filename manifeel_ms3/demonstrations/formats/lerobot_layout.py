@@ -20,7 +20,7 @@ def feature_name(key: str) -> str:
     """LeRobot's name of an observation.
 
     Images are `observation.images.<camera>` and `observation.images.tactile_<side>`, which policies of LeRobot take like any
-    other picture. Further outputs of a pad are `observation.tactile.<side>.<output>`.
+    other image. Further outputs of a pad are `observation.tactile.<side>.<output>`.
 
     Args:
         key: Key of the observation, such as "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose".

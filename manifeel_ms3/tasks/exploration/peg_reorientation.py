@@ -30,10 +30,13 @@ class PegReorientationRandomization(InsertionRandomization):
     """Half ranges of the uniform distributions; the defaults are those of the paper's public code."""
 
     socket_xy: float = 0.0
+    """Position of the box and its rim on each axis, in m."""
     start_rotation: float = 0.05
+    """Rotation of the tool at the start about each horizontal axis of the robot's base, in rad."""
     start_yaw: float = 0.5
-    """Rotation of the tool at the start about the vertical, in rad; `start_rotation` is about the other two axes."""
+    """Rotation of the tool at the start about the vertical, in rad."""
     in_hand_pitch: float = float(np.deg2rad(30))
+    """Pitch of the peg in the hand about the closing axis, in rad."""
 
 
 @register_task(
