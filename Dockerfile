@@ -21,4 +21,4 @@ COPY . .
 # torch for CUDA of the version in scripts/setup.sh, then every other package by its hash
 RUN pip install --no-cache-dir --no-compile "$(sed -n 's/^TORCH_VERSION=/torch==/p' scripts/setup.sh)" \
  && pip install --no-cache-dir --no-compile --no-deps --require-hashes -r requirements.lock \
- && pip install --no-cache-dir --no-compile --no-deps -e .
+ && pip install --no-cache-dir --no-compile --no-deps --no-build-isolation -e .

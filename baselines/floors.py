@@ -23,9 +23,9 @@ from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file
+from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, FORM, POLICIES, floors_file
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.files import write_json
+from manifeel_ms3.files import read_json, write_json
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
@@ -79,7 +79,6 @@ def _measure_task(env_id: str, args: Args, command: str) -> Path:
         floors[name] = numbers
         log.info("%s, %s: %s", spec.env_id, name, numbers)
         about = dict(schema=FLOORS_SCHEMA, env_id=spec.env_id, revision=spec.revision, git_commit=result["git_commit"])
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, about | dict(command=command, floors={known: floors[known] for known in POLICIES if known in floors}))
     return path
 
@@ -101,7 +100,7 @@ def _earlier(path: Path, revision: int) -> dict[str, Any]:
     """The floors of this revision of the task that a file holds."""
     if not path.is_file():
         return {}
-    content = json.loads(path.read_text(encoding="utf-8"))
+    content = read_json(path, FORM, "the failure floors of a task")
     return content["floors"] if content["revision"] == revision else {}
 
 

@@ -19,6 +19,7 @@ from baselines.registry import all_policies
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import training_demos
+from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks import scenery
 from manifeel_ms3.tasks import visuotactile_env as env
 from manifeel_ms3.tasks.insertion import base as insertion
@@ -125,7 +126,7 @@ NAMES = ("", "paper", "public code", "here", "", "why")
 
 def main() -> None:
     """Write the page."""
-    PAGE.write_text("".join(page()), encoding="utf-8")
+    write_text(PAGE, "".join(page()))
 
 
 def page() -> Iterator[str]:

@@ -20,6 +20,7 @@ import cv2
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import training_demos
+from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, description_of
 from manifeel_ms3.tasks.scenery import LIGHTING
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, VisuotactileEnv
@@ -41,7 +42,7 @@ def main() -> None:
     for k, spec in enumerate(specs):
         row = gallery[k * height : (k + 1) * height]
         cv2.imwrite(str(PICTURES / f"{spec.name}.jpg"), row, [cv2.IMWRITE_JPEG_QUALITY, 88])
-        card_path(spec).write_text(card(spec), encoding="utf-8")
+        write_text(card_path(spec), card(spec))
 
 
 def own_tasks() -> list[TaskSpec]:

@@ -4,7 +4,9 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
@@ -12,6 +14,7 @@ from typing import Any
 from uuid import uuid4
 
 import jsonschema
+import numpy as np
 
 from .errors import InvalidFileError, ManifeelError
 
@@ -19,6 +22,13 @@ PARTIAL = ".partial"
 """End of the name of a file or folder while it is written or deleted."""
 SHOWN_LENGTH = 200
 """Number of characters that a message shows of an error of jsonschema, which quotes the whole content; set once, not tuned."""
+MOST_UNPACKED = 2**29
+"""Number of bytes up to which an npz file may unpack; set once, not tuned. Taxim's largest file unpacks to a third of it."""
+NOT_NPZ = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""What numpy raises for a file that is no npz file, is damaged, or holds objects, which it would have to unpickle."""
 HASH_BLOCK = 2**20
 """Number of bytes that are read at a time for a hash; set once, not tuned."""
 
@@ -28,8 +38,12 @@ class FileWriteError(ManifeelError, OSError):
 
 
 @contextmanager
-def _failures_named(path: Path) -> Iterator[None]:
-    """Turn a failure of the file system into an error that names the path that was to be written."""
+def failures_named(path: Path) -> Iterator[None]:
+    """Turn a failure of the file system into an error that names the path that was to be written.
+
+    Raises:
+        FileWriteError: The context raised an `OSError`.
+    """
     try:
         yield
     except OSError as error:
@@ -54,7 +68,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
     path = Path(path)
     partial = _temporary(path)
     try:
-        with _failures_named(path):
+        with failures_named(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _delete_abandoned(path)
             yield partial
@@ -72,15 +86,17 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
     Args:
         path: Path of the folder. Its parent folder is made where it does not exist.
         replace: Let the new folder take the place of an old one, which is deleted afterwards. Without it, the folder must not
-            exist, or be empty.
+            exist, or be empty. `restore_folder` completes what a process that was killed in between has left.
 
     Raises:
         FileWriteError: The folder cannot be written; the message has the path and the reason.
     """
     path = Path(path)
-    partial, old = _temporary(path), _temporary(path)
+    partial, old = _temporary(path), _replaced(path)
+    if replace:
+        restore_folder(path)
     try:
-        with _failures_named(path):
+        with failures_named(path):
             partial.mkdir(parents=True)
             _delete_abandoned(path)
             yield partial
@@ -91,13 +107,30 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
             try:
                 partial.rename(path)
             except OSError:
-                if old.exists():
-                    old.rename(path)
+                restore_folder(path)
                 raise
             flush(path.parent)
+            _delete(old)
     finally:
         _delete(partial)
+
+
+def restore_folder(path: Path) -> None:
+    """Put a folder back that a killed process was replacing; delete the old one where the new one is in its place already.
+
+    Raises:
+        FileWriteError: The folder cannot be renamed.
+    """
+    old = _replaced(path)
+    if path.exists():
         _delete(old)
+    elif old.exists():
+        move(old, path)
+
+
+def _replaced(path: Path) -> Path:
+    """Path of a folder from the moment when it makes room for a new one until that is in its place."""
+    return path.with_name(f".{path.name}.replaced")
 
 
 def _temporary(path: Path) -> Path:
@@ -143,6 +176,28 @@ def read_json(path: Path, schema: dict[str, Any], kind: str) -> Any:
     except (OSError, ValueError, RecursionError) as error:
         raise InvalidFileError(_not(path, kind, str(error))) from error
     return content
+
+
+def read_npz(path: Path, kind: str, names: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    """Arrays of an npz file by their names; nothing in the file is unpickled.
+
+    Args:
+        path: Path of the file.
+        kind: What the file should be, with its article, for the error message, such as "a shader file".
+        names: Names of the arrays to read; all if None.
+
+    Raises:
+        InvalidFileError: The file cannot be read, is no npz file, lacks an array, or unpacks to more than `MOST_UNPACKED`.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > MOST_UNPACKED:
+            raise ValueError(f"it unpacks to {size:,} bytes, more than {MOST_UNPACKED:,}")
+        with np.load(path) as stored:
+            return {name: stored[name] for name in (stored.files if names is None else names)}
+    except NOT_NPZ as error:
+        raise InvalidFileError(_not(path, kind, str(error))) from error
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:

@@ -142,7 +142,7 @@ install_python_packages() {
   fi
   say "Installing the packages of requirements.lock"
   "${pip[@]}" --no-deps --require-hashes -r requirements.lock
-  "${pip[@]}" --no-deps -e .
+  "${pip[@]}" --no-deps --no-build-isolation -e .
   # without libGL the opencv that mani-skill brings does not import; the headless one does
   .venv/bin/python -c 'import cv2' 2>/dev/null ||
     "${pip[@]}" --force-reinstall --no-deps --require-hashes -r <(locked opencv-python-headless)

@@ -3,11 +3,25 @@
 import json
 import os
 import signal
+import zipfile
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
-from manifeel_ms3.files import atomic_folder, atomic_write, read_json, read_json_lines, write_json, write_text
+from manifeel_ms3.files import (
+    MOST_UNPACKED,
+    atomic_folder,
+    atomic_write,
+    read_json,
+    read_json_lines,
+    read_npz,
+    restore_folder,
+    write_json,
+    write_text,
+)
+from tests.trust.kills import forked
 
 SCHEMA = {"type": "object", "required": ["count"], "properties": {"count": {"type": "integer"}}}
 
@@ -95,3 +109,43 @@ def test_lines_of_a_log_that_broke_off_are_left_out(tmp_path):
     assert read_json_lines(log) == []
     log.write_bytes(b'{"step": 1}\n[2]\n\xff\n' + b"[" * 10**5 + b'\n{"step": 3}\n{"st')
     assert read_json_lines(log) == [dict(step=1), dict(step=3)]
+
+
+def test_a_folder_that_is_replaced_is_the_old_or_the_new_one_whenever_its_writer_is_killed(tmp_path):
+    def replace(path: Path, text: str) -> None:
+        with atomic_folder(path, replace=True) as partial:
+            (partial / "file").write_text(text)
+
+    path = tmp_path / "counted/x"
+    replace(path, "old")
+    events = forked(lambda _: replace(path, "new"))[1]
+    assert events > 5
+    for moment in range(events):
+        path = tmp_path / f"killed{moment}/x"
+        replace(path, "old")
+        assert forked(lambda _, path=path: replace(path, "new"), moment)[0] == -signal.SIGKILL
+        restore_folder(path)
+        assert (path / "file").read_text() in ("old", "new")
+        replace(path, "newer")
+        assert (path / "file").read_text() == "newer"
+        assert [entry.name for entry in path.parent.iterdir()] == ["x"]
+
+
+def test_what_is_no_npz_is_refused(tmp_path):
+    path = tmp_path / "x.npz"
+    np.savez(path, a=np.arange(3))
+    assert read_npz(path, "a table")["a"].tolist() == [0, 1, 2]
+    with pytest.raises(InvalidFileError, match=r"x.npz is not a table \(.*'?b"):
+        read_npz(path, "a table", ["b"])
+    np.savez(path, a=np.array([dict()], dtype=object))
+    with pytest.raises(InvalidFileError, match=r"x.npz is not a table \(Object arrays cannot be loaded"):
+        read_npz(path, "a table")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("a.npy", "w", force_zip64=True) as file:
+        for _ in range(MOST_UNPACKED // 2**20 + 1):
+            file.write(bytes(2**20))
+    with pytest.raises(InvalidFileError, match=r"it unpacks to 537,919,488 bytes, more than 536,870,912"):
+        read_npz(path, "a table")
+    for content in (b"", b"PK\x03\x04junk", b"\x93NUMPY"):
+        path.write_bytes(content)
+        with pytest.raises(InvalidFileError, match=r"x\.npz is not a table"):
+            read_npz(path, "a table")

@@ -35,10 +35,7 @@ def save_checkpoint(
     """
     with atomic_folder(folder) as partial:
         for name, tensors in ((WEIGHTS, weights), (TRAINING, training)):
-            try:
-                save_file({key: tensor.contiguous() for key, tensor in tensors.items()}, partial / name)
-            except SafetensorError as error:  # raised if the disk is full
-                raise OSError(str(error)) from error
+            write_tensors(partial / name, tensors)
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
 
@@ -56,9 +53,21 @@ def save_in_half_precision(checkpoint: Path, folder: Path) -> None:
     weights = read_tensors(checkpoint / WEIGHTS)
     rounded = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in weights.items()}
     with atomic_folder(folder) as partial:
-        save_file(rounded, partial / WEIGHTS)
+        write_tensors(partial / WEIGHTS, rounded)
         config = published_config(checkpoint_config(checkpoint))
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
+
+
+def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
+    """Write a safetensors file.
+
+    Raises:
+        OSError: The file cannot be written, as when the disk is full.
+    """
+    try:
+        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+    except SafetensorError as error:
+        raise OSError(str(error)) from error
 
 
 def make_last(folder: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage] (torch does not list it)
 
 from manifeel_ms3.errors import ServerError
-from manifeel_ms3.files import read_json_lines, write_text
+from manifeel_ms3.files import failures_named, read_json_lines, write_text
 from manifeel_ms3.tasks.registry import short_name
 
 from .train_args import TrainArgs
@@ -82,13 +82,14 @@ class RunLog:
         self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
         """Entries of the earlier log that are kept."""
-        write_text(folder / LOG, "".join(map(_line, self.entries)))
+        self._path = folder / LOG
+        write_text(self._path, "".join(map(_line, self.entries)))
         for events in folder.glob(EVENTS):
             events.unlink()
         self._board = SummaryWriter(str(folder))
         for entry in self.entries:
             self._show(entry)
-        self._lines = (folder / LOG).open("a", encoding="utf-8")
+        self._lines = self._path.open("a", encoding="utf-8")
 
     def write(self, entry: Mapping[str, float], video: Path | None = None) -> None:
         """Write an entry: scalars by ManiSkill's names, and "step", which may be earlier than that of the entry before.
@@ -96,18 +97,27 @@ class RunLog:
         Args:
             entry: The entry.
             video: Video of the evaluation that the entry is about, for Weights & Biases.
+
+        Raises:
+            FileWriteError: The entry cannot be written.
         """
         # without times, the log is the same in every run of a seed
         kept = {name: value for name, value in entry.items() if not name.startswith(TIME)}
-        self._lines.write(_line(kept))
-        self._lines.flush()
-        self._show(entry)
+        with failures_named(self._path):
+            self._lines.write(_line(kept))
+            self._lines.flush()
+            self._show(entry)
         if self._wandb:
             self._wandb.log({GLOBAL_STEP if name == "step" else name: value for name, value in entry.items()} | _film(video))
 
     def sync(self) -> None:
-        """Let all entries reach the disk; a checkpoint of their step may follow."""
-        os.fsync(self._lines.fileno())
+        """Let all entries reach the disk; a checkpoint of their step may follow.
+
+        Raises:
+            FileWriteError: The entries cannot be written.
+        """
+        with failures_named(self._path):
+            os.fsync(self._lines.fileno())
 
     def _show(self, entry: Mapping[str, float]) -> None:
         """Write an entry to tensorboard."""

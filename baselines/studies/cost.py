@@ -74,7 +74,6 @@ class Trial:
         if self.key not in known:
             what = f"{self.measure.__name__}: {', '.join(self.arguments)}"
             known[self.key] = dict(seconds=self.measure(*self.arguments), what=what)
-            root.mkdir(parents=True, exist_ok=True)
             write_json(root / TRIALS, known)
         return known[self.key]["seconds"]
 

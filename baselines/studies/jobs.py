@@ -49,7 +49,7 @@ def is_running(job: Job, root: Path) -> bool:
     started = read_status(folder / STARTED)
     if not started or is_done(job, root) or (folder / FAILED).is_file():
         return False
-    return started["host"] != socket.gethostname() or psutil.pid_exists(started["pid"])
+    return started.get("host") != socket.gethostname() or psutil.pid_exists(int(started.get("pid", 0)))
 
 
 def perform_in(working_folder: Path, job: Job, root: Path, workers: int, *needed: None) -> None:
@@ -172,6 +172,6 @@ def read_status(path: Path) -> dict[str, Any]:
     """The content of a status file; {} if there is none, or if it was cut off."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -12,7 +12,7 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.entries import ABOUT
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.files import atomic_folder, read_json, write_json
+from manifeel_ms3.files import atomic_folder, read_json, restore_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS, data_dir
 from manifeel_ms3.tasks.registry import task_spec
@@ -46,20 +46,28 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         raise InvalidArgumentError(
             f"no evaluation with `half_precision: true` is done in {root}; run the study first, or give its --root"
         )
-    if folder.is_dir() and not (folder / ABOUT).is_file():
-        raise FileExistsAlreadyError(f"{folder} exists and is not a submission: it has no {ABOUT}; give another folder")
-    with owned(folder), atomic_folder(folder, replace=True) as partial:
-        hashes = _copy_old(folder, partial)
-        results = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]
-        for run in {_run_folder(partial, read_result(path)) for path in results}:
-            shutil.rmtree(run, ignore_errors=True)
-        for path in results:
-            checkpoint = path.parent / CHECKPOINTS / path.stem
-            copied = _publish_result(path, checkpoint, partial)
-            hashes[copied.relative_to(partial).as_posix()] = checkpoint_sha256(checkpoint)
-        hashes = {result: sha256 for result, sha256 in hashes.items() if (partial / result).is_file()}
-        write_json(partial / ABOUT, dict(name=name, authors=authors, checkpoints=hashes))
+    results = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]
+    with owned(folder):
+        restore_folder(folder)
+        if folder.is_dir() and not (folder / ABOUT).is_file():
+            raise FileExistsAlreadyError(f"{folder} exists and is not a submission: it has no {ABOUT}; give another folder")
+        with atomic_folder(folder, replace=True) as partial:
+            hashes = _copy_old(folder, partial) | _publish_results(results, partial)
+            hashes = {result: sha256 for result, sha256 in hashes.items() if (partial / result).is_file()}
+            write_json(partial / ABOUT, dict(name=name, authors=authors, checkpoints=hashes))
     return len(hashes)
+
+
+def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
+    """Copy results in the place of earlier ones of the same runs, and return the hashes of their checkpoints."""
+    for run in {_run_folder(folder, read_result(path)) for path in results}:
+        shutil.rmtree(run, ignore_errors=True)
+    hashes = {}
+    for path in results:
+        checkpoint = path.parent / CHECKPOINTS / path.stem
+        copied = _publish_result(path, checkpoint, folder)
+        hashes[copied.relative_to(folder).as_posix()] = checkpoint_sha256(checkpoint)
+    return hashes
 
 
 def _copy_old(folder: Path, partial: Path) -> dict[str, str]:

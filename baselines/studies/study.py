@@ -17,6 +17,7 @@ from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.command_line import PACKAGE
 from manifeel_ms3.errors import InvalidFileError, UnknownNameError
+from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
@@ -26,6 +27,8 @@ SIMULATING: tuple[Kind, ...] = ("record", "evaluate")
 """Kinds of jobs that simulate, in several processes at once."""
 OF_THE_MACHINE = ("device", "precision", "compile")
 """Settings of a preset that depend on the machine on which it is read."""
+MOST_VALUES = 10_000
+"""Largest number of values in a study's file with its aliases expanded; set once, not tuned."""
 TABLE = "table "
 """Prefix of `tasks` if it names a table of the paper instead of listing tasks: "table I"."""
 
@@ -162,7 +165,10 @@ def read_study(path: Path, _including: tuple[Path, ...] = ()) -> Study:
 def _content(path: Path) -> dict[str, Any]:
     """The file's mapping, with keys of the right kinds."""
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if (size := _num_values(yaml.compose(text, yaml.SafeLoader), {})) > MOST_VALUES:
+            raise ValueError(f"its aliases and values expand to {size:,} values or more, {MOST_VALUES:,} at most")
+        content = yaml.safe_load(text)
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         reason = " ".join(str(error).split())  # yaml's own message has several lines
         raise StudyError(f"{path} cannot be read as a study ({reason}); see configs/ for examples") from error
@@ -171,8 +177,29 @@ def _content(path: Path) -> dict[str, Any]:
     _require_known(content, {"grids", "include", "resources"}, f"{path}")
     for name, expected in (("grids", list[Any]), ("include", list[str]), ("resources", dict[str, Any])):
         if name in content and not _is_of(content[name], expected):
-            raise StudyError(f"{path}: `{name}` has the wrong type: {content[name]!r}; see configs/ for examples")
+            raise StudyError(f"{path}: `{name}` has the wrong type: {_shown(content[name])}; see configs/ for examples")
     return content
+
+
+def _num_values(node: yaml.Node | None, known: dict[yaml.Node | None, int]) -> int:
+    """Number of values of a node with all aliases expanded, which doubles with every level of aliases of aliases.
+
+    Args:
+        node: The node; None if the file is empty.
+        known: Numbers of the nodes that were counted before; an alias of a node inside itself counts as too many.
+    """
+    if node not in known:
+        known[node] = MOST_VALUES + 1
+        inner = node.value if isinstance(node, yaml.CollectionNode) else ()
+        parts = (part for item in inner for part in (item if isinstance(item, tuple) else (item,)))
+        known[node] = 1 + sum(_num_values(part, known) for part in parts)
+    return known[node]
+
+
+def _shown(value: Any) -> str:
+    """A value as an error shows it: only the beginning of a long one."""
+    text = repr(value)
+    return text if len(text) <= SHOWN_LENGTH else f"{text[:SHOWN_LENGTH]}..."
 
 
 def _grid(entry: Any, place: str) -> Grid:
@@ -198,12 +225,12 @@ def _grid(entry: Any, place: str) -> Grid:
 def _section(kind: type, entry: Any, place: str) -> Any:
     """One of the dataclasses above, from a mapping of its fields."""
     if not isinstance(entry, dict):
-        raise StudyError(f"{place} must be a mapping, not {entry!r}")
+        raise StudyError(f"{place} must be a mapping, not {_shown(entry)}")
     types = {item.name: item.type for item in fields(kind)}
     _require_known(entry, set(types), place)
     for name, value in entry.items():
         if not _is_of(value, types[name]):
-            raise StudyError(f"{place}: `{name}` has the wrong type: {value!r}; see configs/ for examples")
+            raise StudyError(f"{place}: `{name}` has the wrong type: {_shown(value)}; see configs/ for examples")
     try:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
     except TypeError as error:

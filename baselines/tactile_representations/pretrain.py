@@ -19,9 +19,9 @@ import torch
 import torch.nn as nn
 import torch.nn.functional as F  # noqa: N812
 import tyro
-from safetensors.torch import save_file
 from tyro.conf import arg
 
+from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.command_line import run
@@ -121,7 +121,7 @@ def _pretrain(args: Args) -> list[float]:
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)
     with atomic_write(args.out) as partial:
-        save_file({name: t.contiguous() for name, t in representation.state_dict().items()}, partial)
+        write_tensors(partial, representation.state_dict())
     return losses
 
 

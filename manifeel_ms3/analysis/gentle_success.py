@@ -9,6 +9,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.evaluation.gentle import success_under_force
 
 from .condition import Condition
+from .figures import save_figure
 from .matching import Found
 from .paper import MODALITIES, MODES
 from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, table_one
@@ -61,8 +62,7 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
         ax.set_title(f"{task}: Diffusion Policy, {setup.preset}")
     for ax in panels[len(tasks) :]:
         ax.set_axis_off()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out, dpi=DPI)
+    save_figure(fig, out, DPI)
     return True
 
 

@@ -29,6 +29,7 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
 
 from .estimates import TAILS
+from .figures import save_figure
 from .markdown import markdown_table
 from .probes import Episode, Probe
 
@@ -301,7 +302,7 @@ def draw_figure(results: list[ProbeResult], path: Path) -> None:
         if not group[0].unit:
             ax.set_ylim(0, 100 * HEADROOM)
         ax.set_title(f"{short_name(group[0].env_id)}\n{textwrap.fill(group[0].question, TITLE_WIDTH)}", fontsize=FONT_SIZE)
-    fig.savefig(path, dpi=DPI)
+    save_figure(fig, path, DPI)
 
 
 @dataclass
@@ -333,7 +334,6 @@ def main(args: Args) -> list[ProbeResult]:
     with progress_bar() as bar:
         for probe, env_id, path in bar.track(asked, description="asking"):
             results += run_probe(probe, env_id, path)
-    args.out.mkdir(parents=True, exist_ok=True)
     write_json(args.out / "audit.json", [asdict(result) for result in results])
     write_text(args.out / "audit.md", audit_table(results))
     draw_figure(results, args.out / "audit.png")

@@ -1,12 +1,11 @@
 """Training times, and distances to real touch, beside the paper's: parts of the page of results."""
 
-import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from manifeel_ms3.evaluation.result import ResultError
+from manifeel_ms3.files import read_json
 
 from .condition import condition_of
 from .markdown import markdown_table
@@ -30,6 +29,23 @@ more alike. The paper used a ResNet that it does not name. Our distances need im
 does not have: `manifeel similarity --sim peg.h5 --real IMAGES --object ball` measures them, and this page shows them if it
 is given the folder of the measurement.
 """
+_ESTIMATE = {
+    "type": "object",
+    "required": ["value", "low", "high"],
+    "additionalProperties": {"type": "number"},
+}
+SIMILARITY_FORM = {
+    "type": "object",
+    "required": ["modality", "object", "features", "fid", "kid"],
+    "properties": {
+        "modality": {"type": "string"},
+        "object": {"type": "string"},
+        "features": {"type": "string"},
+        "fid": _ESTIMATE,
+        "kid": _ESTIMATE,
+    },
+}
+"""Json schema of the files of `manifeel similarity`."""
 
 
 def runtime_table(results: Sequence[dict[str, Any]]) -> str:
@@ -78,11 +94,7 @@ def similarity_table(files: Sequence[Path]) -> str:
 
 
 def _similarity(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        return {name: content[name] for name in ("modality", "object", "features", "fid", "kid")}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ResultError(f"{path} is no file of `manifeel similarity` ({error}); measure again with --object") from error
+    return read_json(path, SIMILARITY_FORM, "a file of `manifeel similarity --object`")
 
 
 def _interval(estimate: dict[str, float]) -> str:

@@ -10,6 +10,7 @@ from manifeel_ms3.tasks.registry import task_spec
 
 from .condition import Condition
 from .estimates import Estimate, mean_success
+from .figures import save_figure
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import DP, ENCODERS, MODALITIES, MODES, POLICIES, Rate, paper_condition, tasks_in_table
@@ -180,8 +181,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {setup.preset}")
     ax.set_xticks(range(len(tasks)), tasks, rotation=LABEL_ANGLE, ha="right")
     ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out, dpi=DPI)
+    save_figure(fig, out, DPI)
     return True
 
 

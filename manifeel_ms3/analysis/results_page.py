@@ -26,6 +26,7 @@ from .census import census_table
 from .claims import claims_page
 from .condition import Condition, condition_of
 from .estimates import difference, mean_success
+from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
 from .paper_beside import runtime_table, similarity_table
@@ -170,8 +171,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
             ax.plot([entry["step"] for entry in entries], [entry[TRAINING_LOSS] for entry in entries], label=name, lw=1)
         ax.set(title=task, xlabel="gradient step", ylabel="loss", yscale="log")
         ax.legend(fontsize=LEGEND_SIZE)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(out, dpi=DPI)
+    save_figure(fig, out, DPI)
     return True
 
 

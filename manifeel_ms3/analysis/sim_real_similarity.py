@@ -25,7 +25,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import import_name
-from manifeel_ms3.files import write_json
+from manifeel_ms3.files import NOT_NPZ, atomic_write, write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.visualisation import force_field_images
 
@@ -120,9 +120,10 @@ def main(args: Args) -> Similarity:
         len(sim),
         len(real),
     )
-    args.out.mkdir(parents=True, exist_ok=True)
     write_json(args.out / "similarity.json", asdict(result))
-    cv2.imwrite(str(args.out / "nearest.png"), nearest_pairs(sim_images, real_images, sim, real)[..., ::-1])
+    with atomic_write(args.out / "nearest.png") as partial:
+        pairs = nearest_pairs(sim_images, real_images, sim, real)[..., ::-1]
+        partial.write_bytes(cv2.imencode(".png", pairs)[1].tobytes())
     for name, found in (("FID", result.fid), ("KID", result.kid)):
         log.info("%s %.4g [%.4g, %.4g]", name, found.value, found.low, found.high)
     log.info("features %s (%d), %d simulated, %d real", args.features, result.dimensions, len(sim), len(real))
@@ -221,8 +222,11 @@ def _image(path: Path) -> np.ndarray:
         if image is None:
             raise SimilarityError(f"{path} cannot be read as an image; repair or remove it")
         return image[..., ::-1]
-    loaded = np.load(path)
-    field = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
+    try:
+        loaded = np.load(path)
+        field = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
+    except NOT_NPZ as error:
+        raise SimilarityError(f"{path} cannot be read as a force field ({error}); repair or remove it") from error
     if field.ndim != 3 or field.shape[-1] != 3:
         raise SimilarityError(f"{path} holds an array {field.shape}; a force field is (rows, columns, 3), in N")
     return _drawn(field)

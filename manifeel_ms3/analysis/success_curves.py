@@ -17,6 +17,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition, condition_of
 from .estimates import Estimate, mean_success
+from .figures import save_figure
 from .presets import training_settings_of
 from .protocol import collect
 
@@ -129,8 +130,7 @@ def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -
         ax.set(title=task, xlabel="environment steps trained on", ylabel="success", ylim=(-HEADROOM, 1 + HEADROOM))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 400k
         ax.legend(fontsize=LEGEND_SIZE)
-    figure.parent.mkdir(parents=True, exist_ok=True)
-    fig.savefig(figure, dpi=DPI)
+    save_figure(fig, figure, DPI)
     write_text(table, curve_table({condition: curves[condition] for here in tasks.values() for condition in here}))
     return True
 

@@ -5,12 +5,12 @@ such as `00007000.json`, and its checkpoint, `checkpoints/00007000`. The submiss
 leaderboard/cpu) names the hash of every checkpoint.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError, UnknownNameError
+from manifeel_ms3.files import read_json
 from manifeel_ms3.paths import CHECKPOINTS, leaderboard_dir
 
 from .agreement import differences
@@ -20,6 +20,12 @@ from .rollout import EpisodeOutcome
 
 ABOUT = "submission.json"
 """File that names the checkpoints' hashes."""
+
+CHECKPOINT_HASHES = {
+    "type": "object",
+    "properties": {"checkpoints": {"type": "object", "additionalProperties": {"type": "string"}}},
+}
+"""Json schema of what an entry needs of its submission: the hashes of its checkpoints by result."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,4 @@ def find_entry(name: str) -> Entry:
 
 
 def _checkpoints_of(path: Path) -> dict[str, str]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8")).get("checkpoints", {})
-    except (OSError, ValueError, AttributeError) as error:
-        raise InvalidFileError(f"{path} cannot be read ({error}); get it anew from the repository") from error
+    return read_json(path, CHECKPOINT_HASHES, "a submission").get("checkpoints", {})

@@ -233,6 +233,12 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
         ("grids: {tasks: table I}", "`grids` has the wrong type"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seed: 1}]", "'seed'.* are not known"),
         ("grids: [{seeds: [0]}]", "tasks"),
+        (
+            "include: [&a0 [x], " + ", ".join(f"&a{k} [*a{k - 1}, *a{k - 1}]" for k in range(1, 60)) + "]",
+            "aliases and values expand to",
+        ),
+        ("grids: &a [*a]", "aliases and values expand to"),
+        (f"grids: {'x' * 9000}", "`grids` has the wrong type: 'xxx"),
         ("grids: [{tasks: table III, pretrain: {unit: ManiFeel-Knitting-v1}}]", "'ManiFeel-Knitting-v1' is not registered"),
         (
             "grids: [{tasks: table III, pretrain: {resnet18: ManiFeel-PegInsertion-v1}}]",
@@ -247,6 +253,7 @@ def test_what_is_wrong_with_a_study_is_said(study, content, word):
         read_study(study)
     if "cannot be read" not in word:  # yaml's own message has several lines
         assert len(str(error.value).splitlines()) == 1
+    assert len(str(error.value)) < 1000
 
 
 def test_training_is_as_long_as_the_samples_of_its_demonstrations_make_it():

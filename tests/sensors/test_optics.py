@@ -256,7 +256,7 @@ def test_circles_that_were_drawn_by_hand_are_shifted_to_where_the_ball_was(tmp_p
     assert (fitted[..., 1:] == 0).all()  # the same all over the image
     assert (fitted[:, 0] == 0).all()  # and nothing that is the same in all directions
     np.savez(tmp_path / "other.npz", f0=pack["f0"])
-    with pytest.raises(ValueError, match=r"no dataPack\.npz in Taxim's format.*imgs"):
+    with pytest.raises(ValueError, match=r"not a dataPack\.npz in Taxim's format.*imgs"):
         main(Pack(pack=tmp_path / "other.npz", **known))
 
 

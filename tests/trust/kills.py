@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -54,12 +55,15 @@ def recorded(path: Path, num: int, moment: list | None = None, **kwargs) -> tupl
     return process.returncode, out.count("episode"), errors
 
 
-def forked(work: Callable[[Callable[[str], None]], None], kill_before: int | None = None) -> tuple[int, int, list[str]]:
-    """Do something in a forked child, which is killed before a file event.
+def forked(
+    work: Callable[[Callable[[str], None]], None], kill_before: int | None = None, kill_after: float | None = None
+) -> tuple[int, int, list[str]]:
+    """Do something in a forked child, which is killed before a file event, or after a time.
 
     Args:
         work: What to do; it is called with a function that reports a word.
         kill_before: Number of the event; the child lives if it is None or beyond the last event.
+        kill_after: Time in seconds after which the child is killed, wherever it is; it lives if it has ended by then.
 
     Returns:
         The exit status as of `os.waitstatus_to_exitcode`, the number of events of a child that lived, and the words.
@@ -69,6 +73,9 @@ def forked(work: Callable[[Callable[[str], None]], None], kill_before: int | Non
     if child == 0:
         _work_in_child(work, kill_before, writing)
     os.close(writing)
+    if kill_after is not None:
+        time.sleep(kill_after)
+        os.kill(child, signal.SIGKILL)  # it has not been waited for, so its number is still its own
     with os.fdopen(reading) as file:
         words = file.read().split()
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])

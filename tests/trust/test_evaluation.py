@@ -43,7 +43,7 @@ def args_of(policy: str, out: Path, **changes) -> Args:
 
 def command_of(args: Args) -> list[str]:
     command = [sys.executable, "-m", "manifeel_ms3.evaluation.evaluate", "--policy", str(args.policy), "--cameras"]
-    for name in ("env_id", "obs_mode", "episodes", "env_kwargs", "out"):
+    for name in ("env_id", "obs_mode", "episodes", "env_kwargs", "out", "workers"):
         command += [f"--{name.replace('_', '-')}", str(getattr(args, name))]
     return command
 
@@ -59,9 +59,11 @@ def journal_of(out: Path) -> Path:
 # ------------------------------------------------------------------------------- interruptions
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(how, tmp_path, monkeypatch, figure):
-    args = args_of("SticksInSecondEpisode", tmp_path / "evaluation.json", episodes=3)
+@pytest.mark.parametrize(("how", "workers", "finished"), [(signal.SIGINT, 1, 1), (signal.SIGINT, 2, 2), (signal.SIGKILL, 1, 1)])
+def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(
+    how, workers, finished, tmp_path, monkeypatch, figure
+):
+    args = args_of("SticksInSecondEpisode", tmp_path / "evaluation.json", episodes=4, workers=workers)
     journal, errors = journal_of(args.out), tmp_path / "stderr"
     with errors.open("w") as file:
         process = subprocess.Popen(
@@ -73,8 +75,8 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a suite in the background ignores Ctrl-C
         )
     try:
-        wait_for_episodes(journal, 1)
-        time.sleep(1)  # the second episode is stuck by now
+        wait_for_episodes(journal, finished)
+        time.sleep(1)  # the second episode of each worker is stuck by now
         begin = time.monotonic()
         if how == signal.SIGINT:
             os.killpg(process.pid, how)  # as the terminal does
@@ -85,7 +87,9 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
         if how == signal.SIGINT:
             figure("seconds from Ctrl-C to the end of an evaluation", seconds, at_most=2.0)
             assert code == 130
-            assert f"1 of 3 episodes are finished and kept in {journal}; the same command goes on" in errors.read_text()
+            assert (
+                f"{finished} of 4 episodes are finished and kept in {journal}; the same command goes on" in errors.read_text()
+            )
             assert "Traceback" not in errors.read_text()
             while alive(process.pid):  # the resource tracker of multiprocessing ends a moment after its parent
                 assert time.monotonic() < begin + PATIENCE, "a process is left"
@@ -94,11 +98,12 @@ def test_a06_ctrl_c_ends_an_evaluation_at_once_and_it_goes_on_where_it_stopped(h
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
     assert not args.out.exists()
-    kept = json.loads(journal.read_text().splitlines()[1])
+    kept = [json.loads(line) for line in journal.read_text().splitlines()[1:]]
+    assert len(kept) == finished
     monkeypatch.delenv(STUCK, raising=False)
     episodes = read_result(main(args))["episodes"]
-    assert [episode["seed"] for episode in episodes] == evaluation_seeds(3)
-    assert episodes[0] == kept  # with the same times: it was not run again
+    assert [episode["seed"] for episode in episodes] == evaluation_seeds(4)
+    assert all(episode in episodes for episode in kept)  # with the same times: they were not run again
     assert not journal.exists()
 
 

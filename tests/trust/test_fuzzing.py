@@ -36,6 +36,7 @@ from manifeel_ms3.evaluation.journal import Journal
 from manifeel_ms3.evaluation.policy import load_policy
 from manifeel_ms3.evaluation.remote_policy import read_action
 from manifeel_ms3.evaluation.result import read_result
+from manifeel_ms3.sensors.optics.shader import Shader
 from tests.outcomes import made_up
 from tests.sample import KEYS
 from tests.tasks_and_marks import PEG
@@ -255,6 +256,7 @@ READERS = {
         (damage_bytes, damage_json),
     ),
     "result": Reader(copied(RESULT), read_result, (damage_bytes, damage_json)),
+    "shader": Reader(copied(REPOSITORY / "data/gelsight_r15_shader.npz"), Shader.load),
     "study": Reader(copied(REPOSITORY / "configs/smoke.yaml"), read_study),
 }
 CASES = {"lerobot, videos": 30, "checkpoint": 50}

@@ -83,7 +83,9 @@ def record_made_up(path: Path, num: int, say=lambda word: None) -> None:
 
 
 def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.Random) -> int:
-    """Kill `work` again and again at random file events, check the file after each kill, and return the number of kills.
+    """Kill `work` again and again, check the file after each kill, and return the number of kills.
+
+    Every second kill comes before a random file event, and the others at a random time, such as inside a write of HDF5.
 
     Args:
         work: Called with a function that reports seeds.
@@ -94,7 +96,8 @@ def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.
     """
     kills, limit = 0, 12
     while kills < count:
-        status, _, words = forked(work, chance.randrange(limit))
+        event, seconds = chance.randrange(limit), chance.uniform(0, limit / 1000)
+        status, _, words = forked(work, kill_before=event) if kills % 2 else forked(work, kill_after=seconds)
         if status == 0:
             break
         assert status == -signal.SIGKILL
@@ -107,7 +110,7 @@ def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.
 
 
 @ten_and_hundred
-def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
+def test_a01_recording_is_killed_at_random_moments(tmp_path, count, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 6)
     chance, kills, rounds = random.Random(0), 0, 0
     while kills < count:
@@ -122,22 +125,44 @@ def test_a01_recording_is_killed_at_random_file_events(tmp_path, count, figure):
     figure("kills of a recording without a simulator", kills, at_least=count)
 
 
+def prepare(path: Path) -> None:
+    """Ten episodes, one of them rejected, before their consolidation into one file."""
+    with open_recording(path, HEADER, range(20)) as recording:
+        recording.begin()
+        for seed in range(10):
+            write_episode(recording.drafts, made_up(seed))
+            recording.reject(seed) if seed == 1 else recording.accept(seed, made_up(seed).info)
+
+
+def consolidate(path: Path) -> None:
+    with open_recording(path, HEADER, range(20)) as recording:
+        if not recording.is_complete:
+            recording.finish()
+
+
+@ten_and_hundred
+def test_a01_consolidation_is_killed_at_random_times(tmp_path, count, figure):
+    record_made_up(tmp_path / "undisturbed/t.h5", 9)
+    prepare(tmp_path / "timed/t.h5")
+    begin = time.monotonic()
+    forked(lambda _: consolidate(tmp_path / "timed/t.h5"))
+    duration, chance, kills, rounds = time.monotonic() - begin, random.Random(2), 0, 0
+    while kills < count:
+        path = tmp_path / f"killed{rounds}/t.h5"
+        prepare(path)
+        status = forked(lambda _, path=path: consolidate(path), kill_after=chance.uniform(0, duration))[0]
+        assert status in (0, -signal.SIGKILL)
+        kills += status != 0
+        rounds += 1
+        assert seeds(path) == [0, *range(2, 10)]
+        consolidate(path)
+        assert_same(path, tmp_path / "undisturbed/t.h5")
+    figure("kills of a consolidation at random times", kills, at_least=count)
+
+
 @pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
 def test_a01_consolidation_is_killed_before_every_file_event(tmp_path, step, figure):
     record_made_up(tmp_path / "undisturbed/t.h5", 9)
-
-    def prepare(path: Path) -> None:
-        with open_recording(path, HEADER, range(20)) as recording:
-            recording.begin()
-            for seed in range(10):
-                write_episode(recording.drafts, made_up(seed))
-                recording.reject(seed) if seed == 1 else recording.accept(seed, made_up(seed).info)
-
-    def consolidate(path: Path) -> None:
-        with open_recording(path, HEADER, range(20)) as recording:
-            if not recording.is_complete:
-                recording.finish()
-
     prepare(tmp_path / "counted/t.h5")
     events = forked(lambda _: consolidate(tmp_path / "counted/t.h5"))[1]
     figure("file events of a consolidation, a process killed before each in turn", events, at_least=40)
@@ -175,7 +200,7 @@ class Silent:
 
 
 @ten_and_hundred
-def test_a01_saves_of_teleoperation_are_killed_at_random_file_events(make_env, tmp_path, count, figure):
+def test_a01_saves_of_teleoperation_are_killed_at_random_moments(make_env, tmp_path, count, figure):
     env = make_env(**KWARGS)
 
     def save(path: Path, say=lambda word: None) -> None:

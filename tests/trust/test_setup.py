@@ -179,6 +179,9 @@ def test_b10_every_package_is_installed_by_its_hash():
         installs = [line for line in file.read_text().splitlines() if "-r requirements.lock" in line]
         assert installs
         assert all("--no-deps --require-hashes" in line for line in installs)
+        (package,) = [line for line in file.read_text().splitlines() if line.endswith(" -e .")]
+        assert "--no-deps --no-build-isolation" in package  # it is built with what the lock pins
+    assert {"hatchling", "editables"} <= {pin.partition("==")[0] for pin in pins}
 
 
 def test_b02_an_older_torch_is_replaced_by_the_pinned_one(tmp_path):

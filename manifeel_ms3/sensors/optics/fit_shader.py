@@ -17,6 +17,7 @@ import tyro
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
+from manifeel_ms3.files import read_npz
 
 from .shader import FOURIER_TERMS, KNOTS, PLACE_TERMS, Shader, fourier_terms, place_terms, slope_terms
 from .taxim_table import fit_table, read_table
@@ -194,14 +195,12 @@ def read_pack(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         InvalidFileError: The file is missing or does not have Taxim's format.
     """
+    kind = "a dataPack.npz in Taxim's format, with f0, imgs, touch_center and touch_radius"
+    background, images, centres, radii = read_npz(path, kind, ("f0", "imgs", "touch_center", "touch_radius")).values()
     try:
-        with np.load(path) as stored:
-            background, images, centres, radii = (stored[k] for k in ("f0", "imgs", "touch_center", "touch_radius"))
-            circles = np.column_stack([centres[:, ::-1], radii]).astype(float)
-    except (OSError, KeyError, ValueError, IndexError) as error:
-        raise InvalidFileError(
-            f"{path} is no dataPack.npz in Taxim's format ({error}); it must hold f0, imgs, touch_center and touch_radius"
-        ) from error
+        circles = np.column_stack([centres[:, ::-1], radii]).astype(float)
+    except (ValueError, IndexError) as error:
+        raise InvalidFileError(f"{path} is not {kind} ({error})") from error
     return background[..., ::-1], images[..., ::-1], circles
 
 
@@ -222,7 +221,6 @@ def main(args: Table | Presses | Pack) -> None:
         if args.refine:
             circles = refined_circles(background, images, circles, *scale)
         shader = fit_presses(background, images, circles, *scale)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     shader.save(args.out)
 
 

@@ -12,10 +12,12 @@ that a flat gel has exactly the background's colour; Q = (1, r, c, r^2, r c, c^2
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import atomic_write, read_npz
 
 # Surface gradients |grad h|, m/m, at slopes in rad (chosen: dense where the R1.5's table bends); constant beyond the last
 KNOTS = np.tan([0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.7, 1.0])
@@ -43,21 +45,23 @@ class Shader:
         remedy = "give a file written by `python -m manifeel_ms3.sensors.optics.fit_shader`"
         if not Path(path).is_file():
             raise InvalidFileError(f"optics.calibration={path} does not exist; {remedy}")
-        try:
-            with np.load(path) as stored:
-                arrays = {name: stored[name].astype(np.float32) for name in wanted}
-        except (KeyError, OSError, ValueError) as error:
-            raise InvalidFileError(f"optics.calibration={path} is not a shader file ({error}); {remedy}") from error
+        arrays = read_npz(path, "a shader file", list(wanted))
         for name, shape in wanted.items():
             if arrays[name].shape != shape:
                 raise InvalidFileError(
                     f"optics.calibration={path}: {name} has shape {arrays[name].shape}, not {shape}; {remedy}"
                 )
-        return cls(**arrays)
+        return cls(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
     def save(self, path: Path) -> None:
-        """Write the coefficients in float32, compressed."""
-        np.savez_compressed(path, weights=self.weights.astype(np.float32), background=self.background.astype(np.float32))
+        """Write the coefficients in float32, compressed.
+
+        Raises:
+            FileWriteError: The file cannot be written.
+        """
+        arrays: dict[str, Any] = dict(weights=self.weights.astype(np.float32), background=self.background.astype(np.float32))
+        with atomic_write(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, **arrays)
 
 
 def fourier_terms(phi: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.files import read_npz
 
 from .shader import KNOTS, Shader, fourier_terms, place_terms, slope_terms
 
@@ -29,13 +30,11 @@ def read_table(path: Path) -> np.ndarray:
     """
     if not Path(path).is_file():
         raise InvalidFileError(f"calibration table {path} does not exist; give a polycalib.npz in Taxim's format")
-    with np.load(path) as stored:
-        missing = [name for name in TABLE_CHANNELS if name not in stored]
-        if missing:
-            raise InvalidFileError(
-                f"calibration table {path} lacks {missing}; it must hold {TABLE_CHANNELS}, each (bins, bins, 6)"
-            )
-        arrays = [stored[name] for name in TABLE_CHANNELS]
+    stored = read_npz(path, "a calibration table")
+    missing = [name for name in TABLE_CHANNELS if name not in stored]
+    if missing:
+        raise InvalidFileError(f"calibration table {path} lacks {missing}; it must hold {TABLE_CHANNELS}, each (bins, bins, 6)")
+    arrays = [stored[name] for name in TABLE_CHANNELS]
     shape = arrays[0].shape
     if len(shape) != 3 or shape[0] != shape[1] or shape[2] != 6 or any(a.shape != shape for a in arrays):
         raise InvalidFileError(
