@@ -32,7 +32,7 @@ def for_cpu(
         action_horizon=4,  # ball sorting succeeds more often with 8, and insertion, which must react to contact, with 2
         obs_horizon=1,  # with 2, a policy infers the next action from its own motion and ignores the images
         encoder=encoder,
-        action_network="mlp",  # a step costs a fifteenth of the U-Net's
+        action_network="mlp",  # a U-Net would take most of a step's time
         diffusion_step_embed_dim=64,  # features
         pose_noise=0.1,  # standard deviation, where the pose has the range [-1, 1]; one of 0.03 did worse
         noise_draws=8,  # for each sample: the MLP costs little beside the encoders

@@ -44,12 +44,12 @@ class BulbRandomization(ScrewingRandomization):
 @register_task(
     "ManiFeel-BulbInstallation-v1",
     instruction="Screw the light bulb into its holder.",
-    max_episode_steps=890,
+    max_episode_steps=930,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
-    demo_steps=444,
+    demo_steps=464,
     revision=3,
     force_limit=29.0,
 )
