@@ -189,13 +189,34 @@ def read_npz(path: Path, kind: str, names: Sequence[str] | None = None) -> dict[
     Raises:
         InvalidFileError: The file cannot be read, is no npz file, lacks an array, or unpacks to more than `MOST_UNPACKED`.
     """
+    with _opened_npz(path, kind) as stored:
+        return {name: stored[name] for name in (stored.files if names is None else names)}
+
+
+def names_in_npz(path: Path, kind: str) -> list[str]:
+    """Names of the arrays of an npz file, none of which is read.
+
+    Args:
+        path: Path of the file.
+        kind: As for `read_npz`.
+
+    Raises:
+        InvalidFileError: The file cannot be read, is no npz file, or unpacks to more than `MOST_UNPACKED`.
+    """
+    with _opened_npz(path, kind) as stored:
+        return stored.files
+
+
+@contextmanager
+def _opened_npz(path: Path, kind: str) -> Iterator[Any]:
+    """A file as numpy opens it; whatever is wrong with it is an error that names it."""
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > MOST_UNPACKED:
             raise ValueError(f"it unpacks to {size:,} bytes, more than {MOST_UNPACKED:,}")
         with np.load(path) as stored:
-            return {name: stored[name] for name in (stored.files if names is None else names)}
+            yield stored
     except NOT_NPZ as error:
         raise InvalidFileError(_not(path, kind, str(error))) from error
 

@@ -49,7 +49,8 @@ def is_running(job: Job, root: Path) -> bool:
     started = read_status(folder / STARTED)
     if not started or is_done(job, root) or (folder / FAILED).is_file():
         return False
-    return started.get("host") != socket.gethostname() or psutil.pid_exists(int(started.get("pid", 0)))
+    host, process = started.get("host"), started.get("pid")
+    return isinstance(process, int) and (host != socket.gethostname() or psutil.pid_exists(process))
 
 
 def perform_in(working_folder: Path, job: Job, root: Path, workers: int, *needed: None) -> None:

@@ -42,7 +42,7 @@ class Comparison:
 
 def comparisons() -> Iterator[Comparison]:
     """All comparisons of the paper's claims. Both sides have the paper's number of demonstrations."""
-    groups = (_touch_claims, _picture_claims, _policy_claims, _encoder_claims, _demo_claims, _camera_claims, _real_claims)
+    groups = (_touch_claims, _tacrgb_claims, _policy_claims, _encoder_claims, _demo_claims, _camera_claims, _real_claims)
     return chain.from_iterable(group() for group in groups)
 
 
@@ -58,7 +58,7 @@ def _touch_claims() -> Iterator[Comparison]:
         yield Comparison("2. TacFF is no gain over vision in exploration", touched, seen, gain=False)
 
 
-def _picture_claims() -> Iterator[Comparison]:
+def _tacrgb_claims() -> Iterator[Comparison]:
     """The claims about TacRGB in tasks that its images do not help."""
     for task in tasks_in_table("I", "insertion", "screwing"):
         if task != "PegInsertion":  # there, the paper found a gain of seven points

@@ -56,7 +56,7 @@ def test_a_person_records_an_episode(address, tmp_path):
         wait_until(lambda: "you watch" in second.text and "discard" in second.text)
         first.press(*SPACE)
         wait_until(lambda: "recording" in second.text, page=second)
-        first.press(*DOWN, times=10)
+        first.press(*DOWN, times=20)  # held for a second, which is few steps on a slow machine
         second.press(*AHEAD, times=5)  # ignored
         second.press(*SPACE)
         wait_until(lambda: "recording" in second.text, page=second)
@@ -68,7 +68,7 @@ def test_a_person_records_an_episode(address, tmp_path):
         assert "paused" in second.text
         second.press(*SPACE)
         wait_until(lambda: "recording" in second.text, page=second)
-        second.press(*DOWN, times=5)
+        second.press(*DOWN, times=10)
         second.press(*ENTER)
         wait_until(lambda: "1 saved" in second.text, page=second)
 
@@ -76,7 +76,7 @@ def test_a_person_records_an_episode(address, tmp_path):
         actions = np.asarray(file["traj_0/actions"])
         height = np.asarray(file["traj_0/obs/extra/tcp_pose"])[:, 2]
         assert file["traj_0/obs/sensor_data/tactile_right/rgb"].shape[0] == len(actions) + 1
-    assert (actions[:, 2] < 0).sum() >= 2  # by each of the two; a slow machine makes one step of several key presses
+    assert (actions[:, 2] < 0).sum() >= 5
     assert np.all(actions[:, :2] == 0)
     assert height[-1] < height[0] - 0.005  # the arm went where the key said
     assert [one.deviation for one in replay(path)] == [0.0]

@@ -14,7 +14,7 @@ import torch.nn.functional as F  # noqa: N812 (torch's own usage)
 import warp as wp
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.files import read_npz
+from manifeel_ms3.files import names_in_npz
 from manifeel_ms3.sensors.config import LightsConfig, TactileSensorConfig
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.warp_device import launch_split, warp_device
@@ -311,7 +311,7 @@ def _shader(
     """The shader that the lamps give; without lamps, the one in a file, or the one that fits the Taxim table in it."""
     if lights is not None:
         return lamp_shader(lights, curvature, image_shape, pixel_size)
-    if calibration.is_file() and TABLE_CHANNELS[0] in read_npz(calibration, "a shader file or a Taxim table"):
+    if calibration.is_file() and set(TABLE_CHANNELS) & set(names_in_npz(calibration, "a shader file or a Taxim table")):
         return fit_table(read_table(calibration), image_shape)
     return Shader.load(calibration)
 
