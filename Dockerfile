@@ -18,7 +18,7 @@ RUN mkdir -p /usr/share/vulkan/icd.d /usr/share/glvnd/egl_vendor.d \
 
 WORKDIR /manifeel
 COPY . .
-# torch for CUDA of the version in scripts/setup.sh, then every other package by its hash
-RUN pip install --no-cache-dir --no-compile "$(sed -n 's/^TORCH_VERSION=/torch==/p' scripts/setup.sh)" \
- && pip install --no-cache-dir --no-compile --no-deps --require-hashes -r requirements.lock \
+# every package by its hash, then torch for CUDA of the version in scripts/setup.sh
+RUN pip install --no-cache-dir --no-compile --no-deps --require-hashes -r requirements.lock \
+ && pip install --no-cache-dir --no-compile "$(sed -n 's/^TORCH_VERSION=/torch==/p' scripts/setup.sh)" \
  && pip install --no-cache-dir --no-compile --no-deps --no-build-isolation -e .

@@ -64,8 +64,9 @@ docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
 
 # for Python 3.10 to 3.12; only this target needs uv. --upgrade takes newer versions than those that were pinned.
+# sympy: torch needs it, and torch itself is left out (pyproject.toml says why).
 # `similarity` is left out: torch-fidelity needs torchvision, of which there is no build for the pinned torch without CUDA
 EXTRAS := train report lerobot zarr audit study teleop spacemouse gamepad view docs dev
 lock:
-	uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-emit-index-url --no-annotate \
-		--custom-compile-command "make lock" $(EXTRAS:%=--extra %) --quiet --output-file requirements.lock pyproject.toml
+	echo sympy | uv pip compile --universal --python-version 3.10 --upgrade --generate-hashes --no-emit-index-url --no-annotate \
+		--custom-compile-command "make lock" $(EXTRAS:%=--extra %) --quiet --output-file requirements.lock pyproject.toml -

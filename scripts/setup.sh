@@ -13,6 +13,7 @@ WITHOUT_PICTURES="only what needs no rendered image works: obs_mode='state' or '
 DEBIAN_MIRROR=http://deb.debian.org/debian/ # used if the machine's sources name no mirror
 DEBIAN_KEYRING=/usr/share/keyrings/debian-archive-keyring.gpg
 BACKPORTS=/etc/apt/sources.list.d/manifeel-backports.list
+INSTALLED=/var/lib/manifeel_ms3/packages # names of the Debian or Ubuntu packages that this script has installed
 
 OS_RELEASE=/etc/os-release
 LAVAPIPE=/usr/local/lib/mesa-lavapipe
@@ -33,6 +34,7 @@ has_library() {
   [[ $LIBRARIES == *"$1"* ]]
 }
 
+has_package() { dpkg-query -W "$1" >/dev/null 2>&1; }
 has_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null
 
 as_root() {
@@ -97,6 +99,11 @@ install_debians_lavapipe() { # Ubuntu 22.04 has no Mesa that is new enough; Debi
   new_enough_mesa
 }
 
+remember() { # that this script has installed these packages
+  as_root mkdir -p "$(dirname "$INSTALLED")"
+  printf '%s\n' "$@" | as_root tee -a "$INSTALLED" >/dev/null
+}
+
 install_system_packages() {
   local missing=() MESA_RELEASE=() pair
   for pair in libvulkan.so.1:libvulkan1 libEGL.so.1:libegl1 libGL.so.1:libgl1 libglib-2.0.so.0:libglib2.0-0; do
@@ -115,22 +122,31 @@ install_system_packages() {
   fi
   export DEBIAN_FRONTEND=noninteractive
   as_root apt-get update -q
-  [ ${#missing[@]} = 0 ] || as_root apt-get install -y -q --no-install-recommends "${missing[@]}"
+  if [ ${#missing[@]} != 0 ]; then
+    as_root apt-get install -y -q --no-install-recommends "${missing[@]}"
+    remember "${missing[@]}"
+  fi
   if ! $mesa; then
+    local had_mesa=false
+    ! has_package mesa-vulkan-drivers || had_mesa=true
     as_root apt-get install -y -q --no-install-recommends mesa-vulkan-drivers || true
     if ! new_enough_mesa && ! install_debians_lavapipe; then
       { add_mesa_source && as_root apt-get install -y -q --no-install-recommends "${MESA_RELEASE[@]}" mesa-vulkan-drivers; } || true
     fi
+    $had_mesa || ! has_package mesa-vulkan-drivers || remember mesa-vulkan-drivers
     new_enough_mesa || say "No mesa-vulkan-drivers >= $MIN_MESA could be installed: $WITHOUT_PICTURES"
   fi
 }
 
-# Every package but torch has the version and the hash of requirements.lock. torch is installed before: its builds for the
-# CPU and for CUDA are different files, so that one lock with hashes cannot name both.
+# Every package but torch, those that torch needs included, has the version and the hash of requirements.lock. torch's builds for
+# the CPU and for CUDA are different files, so that one lock with hashes cannot name both; the latter itself names the exact
+# versions of NVIDIA's packages that it needs.
 install_python_packages() {
   [ -x .venv/bin/python ] || python3 -m venv .venv
   # nothing is compiled in advance: a module is compiled at its first import, and most modules are never imported
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
+  say "Installing the packages of requirements.lock"
+  "${pip[@]}" --no-deps --require-hashes -r requirements.lock
   if [ "$(.venv/bin/python -c 'import torch; print(torch.__version__.partition("+")[0])' 2>/dev/null)" != "$TORCH_VERSION" ]; then
     say "Installing torch"
     if has_gpu; then
@@ -140,8 +156,6 @@ install_python_packages() {
         { say "$TORCH_CPU_INDEX cannot be reached; installing the larger torch for GPUs from PyPI instead" && "${pip[@]}" "torch==$TORCH_VERSION"; }
     fi
   fi
-  say "Installing the packages of requirements.lock"
-  "${pip[@]}" --no-deps --require-hashes -r requirements.lock
   "${pip[@]}" --no-deps --no-build-isolation -e .
   # without libGL the opencv that mani-skill brings does not import; the headless one does
   .venv/bin/python -c 'import cv2' 2>/dev/null ||
@@ -163,9 +177,15 @@ undo() {
     as_root rm -rf "$LAVAPIPE" "$LAVAPIPE_ICD" || { say "No root: $LAVAPIPE cannot be removed" && return 1; }
     removed+=("$LAVAPIPE" "$LAVAPIPE_ICD")
   fi
+  if [ -e "$INSTALLED" ]; then
+    local packages
+    mapfile -t packages < <(sort -u "$INSTALLED")
+    # what other packages need by now stays: only apt knows, and it removes no package that is marked as wanted
+    { as_root apt-mark auto "${packages[@]}" && as_root rm "$INSTALLED"; } || { say "${packages[*]} cannot be given up" && return 1; }
+    say "Given up: ${packages[*]}. \`apt-get autoremove\` removes those that no other package needs."
+  fi
   say "Removed: ${removed[*]:-nothing; no source of packages and no copy of lavapipe had been added}"
-  say "Left: the Debian or Ubuntu packages (libvulkan1, libegl1, libgl1, libglib2.0-0, python3-venv, chromium, mesa-vulkan-drivers)," \
-    "which other programs may need; \`apt-get remove\` removes them. Left, too: .venv in this folder, and ~/.cache/manifeel_ms3."
+  say "Left: .venv in this folder, and ~/.cache/manifeel_ms3."
 }
 
 main() {

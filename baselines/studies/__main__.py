@@ -46,6 +46,8 @@ POLL_SECONDS = 2
 RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
+    "RAY_get_check_signal_interval_milliseconds": "100",  # else Ctrl-C is noticed up to 1 s later
+    "RAY_enable_autoscaler_v2": "true",  # the first version's process waits 1 s for a server that has ended before it ends
 }
 """Environment variables of a Ray that is started here, unless they are set."""
 FILE_WIDTH = 160

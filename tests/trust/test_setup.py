@@ -5,9 +5,12 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 SETUP = Path(__file__).parents[2] / "scripts/setup.sh"
 RELEASE = """Origin: {origin}
@@ -24,6 +27,7 @@ def run(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """Bash that has sourced the script, with all places of the system under a folder; `as_root` needs no root there."""
     places = {
         "BACKPORTS": folder / "sources.list.d/manifeel-backports.list",
+        "INSTALLED": folder / "manifeel_ms3/packages",
         "LAVAPIPE": folder / "lavapipe",
         "LAVAPIPE_ICD": folder / "icd.d/lvp_icd.json",
     }
@@ -132,6 +136,16 @@ def test_a26_undo_takes_back_what_was_added_and_nothing_else(apt):
     assert "Removed: nothing" in run("undo", apt).stdout
 
 
+def test_a26_undo_gives_up_the_packages_that_were_installed(apt):
+    """apt then removes those that no other package needs; packages that were there before are not named."""
+    marks = 'apt-mark() { echo apt-mark "$@"; }'
+    done = run(f"remember libegl1 chromium; remember libegl1; {marks}; undo", apt)
+    assert done.returncode == 0, done.stderr
+    assert "apt-mark auto chromium libegl1\n" in done.stdout
+    assert "apt-get autoremove" in done.stdout
+    assert "apt-mark" not in run(f"{marks}; undo", apt).stdout
+
+
 def test_a26_without_root_undo_says_what_it_cannot_remove(apt):
     (apt / "sources.list.d/manifeel-backports.list").write_text("")
     done = run("as_root() { return 1; }; undo", apt)
@@ -181,7 +195,11 @@ def test_b10_every_package_is_installed_by_its_hash():
         assert all("--no-deps --require-hashes" in line for line in installs)
         (package,) = [line for line in file.read_text().splitlines() if line.endswith(" -e .")]
         assert "--no-deps --no-build-isolation" in package  # it is built with what the lock pins
-    assert {"hatchling", "editables"} <= {pin.partition("==")[0] for pin in pins}
+    pinned = {canonicalize_name(pin.partition("==")[0]) for pin in pins}
+    assert {"hatchling", "editables"} <= pinned
+    needed = [Requirement(need) for need in requires("torch") or []]
+    needed = {canonicalize_name(need.name) for need in needed if not need.marker or need.marker.evaluate(dict(extra=""))}
+    assert {name for name in needed if not name.startswith(("nvidia-", "cuda-", "triton"))} <= pinned  # torch pins these itself
 
 
 def test_b02_an_older_torch_is_replaced_by_the_pinned_one(tmp_path):
