@@ -2,7 +2,7 @@
 
 What the code knows is read from it: the task's class and its entry in the registry. The demonstrators' figures are those of
 docs/tasks.md, the audit's those of docs/audit.md, results those of docs/results.md. A test fails where a page is not what this
-makes. The films of docs/films, which the pages show, are made by `python -m docs.make_task_films`.
+makes. The videos of docs/videos, which the pages show, are made by `python -m docs.make_task_videos`.
 """
 
 import ast
@@ -26,7 +26,7 @@ from manifeel_ms3.tasks.scenery import LIGHTING
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, VisuotactileEnv
 
 DOCS = Path(__file__).parent
-CARDS, FILMS, PICTURES = DOCS / "tasks", DOCS / "films", DOCS / "images" / "tasks"
+CARDS, VIDEOS, PICTURES = DOCS / "tasks", DOCS / "videos", DOCS / "images" / "tasks"
 RESULT_COLUMNS = 15
 """Number of columns of the table of docs/results.md that says what was run."""
 CAPTION = "The scene, the front, side and wrist cameras, and the left and right pads, after four fifths of a demonstration."
@@ -64,8 +64,8 @@ def card(spec: TaskSpec) -> str:
 def _head(spec: TaskSpec) -> str:
     made = "*Made by `python -m docs.make_task_cards` from the class of the task, the registry and what was measured.*"
     shown = f"![{spec.name} from all cameras and on both pads](../images/tasks/{spec.name}.jpg)\n\n*{CAPTION}*\n"
-    if (FILMS / f"{spec.name}.mp4").is_file():
-        video = f"../../films/{spec.name}.mp4"  # the site has each page in a folder of its own
+    if (VIDEOS / f"{spec.name}.mp4").is_file():
+        video = f"../../videos/{spec.name}.mp4"  # the site has each page in a folder of its own
         shown = f'<video src="{video}" controls autoplay loop muted playsinline style="width: 100%"></video>\n\n{shown}'
     return f"# {spec.name}\n\n{made}\n\n{shown}"
 
@@ -196,7 +196,7 @@ env = gym.make("{spec.env_id}", obs_mode="rgb+tacrgb+tacff")
 
 ```bash
 manifeel record {spec.env_id} -n 2 --out {spec.name}.h5
-manifeel film {spec.name}.h5 --out {spec.name}.mp4
+manifeel video {spec.name}.h5 --out {spec.name}.mp4
 ```
 """
 

@@ -45,7 +45,7 @@ ADAM_EPS, ADVANTAGE_EPS = 1e-5, 1e-8
 
 
 FILMED = dict(render_mode="rgb_array", human_render_camera_configs=dict(width=256, height=256))
-"""Arguments of the environment that is filmed; smaller than the task's own films, which take seconds an image on a CPU."""
+"""Arguments of the environment that is filmed; smaller than the task's own videos, which take seconds an image on a CPU."""
 
 
 @dataclass

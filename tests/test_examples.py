@@ -226,15 +226,15 @@ def test_ppo_trains_on_a_task_and_evaluates_what_it_saved(tmp_path, monkeypatch)
 
 
 @needs_renderer
-def test_ppo_films_an_evaluation_and_is_tracked(tmp_path, monkeypatch):
+def test_ppo_makes_a_video_of_an_evaluation_and_is_tracked(tmp_path, monkeypatch):
     ppo = load("ppo")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_MODE", "offline")
     few = dict(num_eval_envs=1, num_envs=1, num_eval_steps=3, env_kwargs=json.dumps(dict(max_episode_steps=3)))
-    ppo.main(ppo.Args(exp_name="film", total_timesteps=0, track=True, capture_video=True, **few))
-    (video,) = Path("runs/film/videos").glob("*.mp4")
+    ppo.main(ppo.Args(exp_name="video", total_timesteps=0, track=True, capture_video=True, **few))
+    (video,) = Path("runs/video/videos").glob("*.mp4")
     assert video.stat().st_size > 0
-    assert list(Path("runs/film/wandb").glob("offline-run-*/*.wandb"))
+    assert list(Path("runs/video/wandb").glob("offline-run-*/*.wandb"))
 
 
 def test_ppo_needs_weights_to_evaluate():

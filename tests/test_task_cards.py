@@ -1,4 +1,4 @@
-"""Each task has a page that is up to date, and a film that ManiSkill's tools can find."""
+"""Each task has a page that is up to date, and a video that ManiSkill's tools can find."""
 
 import dataclasses
 import json
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from docs import make_task_cards, make_task_films
+from docs import make_task_cards, make_task_videos
 from manifeel_ms3.tasks.insertion.base import InsertionRandomization
 from tests.links import missing_targets
 
@@ -28,20 +28,20 @@ def test_all_pages_are_on_the_site():
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
-def test_each_task_has_its_film(spec):
-    assert spec.env_class._sample_video_link == f"docs/films/{spec.name}.mp4"
+def test_each_task_has_its_video(spec):
+    assert spec.env_class._sample_video_link == f"docs/videos/{spec.name}.mp4"
     assert (REPOSITORY / spec.env_class._sample_video_link).is_file()
 
 
-def test_the_films_show_the_samples_of_today():
-    shown = json.loads(make_task_films.SAMPLES.read_text())
-    assert set(shown) == {"film.webp"} | {f"{spec.name}.mp4" for spec in SPECS}
-    older = [film for film, hashes in shown.items() if hashes != make_task_films.hashes_of(tuple(hashes))]
-    assert older == [], "run `python -m docs.make_task_films`"
+def test_the_videos_show_the_samples_of_today():
+    shown = json.loads(make_task_videos.SAMPLES.read_text())
+    assert set(shown) == {"demonstrations.webp"} | {f"{spec.name}.mp4" for spec in SPECS}
+    older = [video for video, hashes in shown.items() if hashes != make_task_videos.hashes_of(tuple(hashes))]
+    assert older == [], "run `python -m docs.make_task_videos`"
 
 
-def test_the_film_of_the_readme_is_small():
-    assert (REPOSITORY / "docs/images/film.webp").stat().st_size < 3e6
+def test_the_video_of_the_readme_is_small():
+    assert (REPOSITORY / "docs/images/demonstrations.webp").stat().st_size < 3e6
 
 
 def test_a_page_follows_the_code():

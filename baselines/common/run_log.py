@@ -108,7 +108,9 @@ class RunLog:
             self._lines.flush()
             self._show(entry)
         if self._wandb:
-            self._wandb.log({GLOBAL_STEP if name == "step" else name: value for name, value in entry.items()} | _film(video))
+            self._wandb.log(
+                {GLOBAL_STEP if name == "step" else name: value for name, value in entry.items()} | _video_entry(video)
+            )
 
     def sync(self) -> None:
         """Let all entries reach the disk; a checkpoint of their step may follow.
@@ -147,7 +149,7 @@ def _line(entry: Mapping[str, float]) -> str:
     return json.dumps(entry) + "\n"
 
 
-def _film(video: Path | None) -> dict[str, Any]:
+def _video_entry(video: Path | None) -> dict[str, Any]:
     if video is None:
         return {}
     import wandb

@@ -41,15 +41,15 @@ def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
 
 def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
     """A paragraph for each set-up in which a task was run with vision alone and with touch."""
-    by_setup: dict[TrainingSettings, dict[str, Condition]] = {}
+    by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
     for mode in MODES:
-        for setup, condition in answering(paper_condition(task, mode), found).items():
-            by_setup.setdefault(setup, {})[mode] = condition
-    for setup, conditions in by_setup.items():
+        for settings, condition in answering(paper_condition(task, mode), found).items():
+            by_settings.setdefault(settings, {})[mode] = condition
+    for settings, conditions in by_settings.items():
         if VISION in conditions and len(conditions) > 1:
             gains = "; ".join(_gain(task, mode, conditions, found) for mode in conditions if mode != VISION)
             ends = " ".join(_endings(mode, condition, results) for mode, condition in conditions.items())
-            yield f"**{task}** ({setup}): {gains}. {ends}\n"
+            yield f"**{task}** ({settings}): {gains}. {ends}\n"
 
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:

@@ -40,7 +40,7 @@ class ClaimResult:
     p_value: float
     """Probability of so large a difference if both conditions succeed equally often."""
     verdict: Verdict
-    setup: TrainingSettings
+    settings: TrainingSettings
     """Settings that both conditions were run with."""
 
 
@@ -58,9 +58,9 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
 
 def _results_of(comparison: Comparison, found: Found) -> list[ClaimResult]:
     outcomes = []
-    for setup, (first, second) in answering_all([comparison.first, comparison.second], found).items():
+    for settings, (first, second) in answering_all([comparison.first, comparison.second], found).items():
         gap, p_value = difference(found[first], found[second])
-        outcomes.append(ClaimResult(gap, p_value, _verdict(comparison, gap), setup))
+        outcomes.append(ClaimResult(gap, p_value, _verdict(comparison, gap), settings))
     return outcomes
 
 
@@ -79,7 +79,7 @@ def claims_page(found: Found) -> str:
     rows = []
     for comparison, outcomes in results_of_claims(found).items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
-        ran = [(one.difference.signed, f"{one.p_value:.3f}", one.verdict, one.setup) for one in outcomes]
+        ran = [(one.difference.signed, f"{one.p_value:.3f}", one.verdict, one.settings) for one in outcomes]
         rows += [(*what, *cells) for cells in ran or [(None, None, "not run", None)]]
     table = markdown_table(("claim", "task", "compared", "difference", "p", "verdict", "settings"), rows)
     return f"{table}\n{''.join(ranking_tables(found))}"

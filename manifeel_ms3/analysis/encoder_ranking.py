@@ -43,9 +43,9 @@ def rankings(found: Found) -> dict[TrainingSettings, list[EncoderRanking]]:
     for task in tasks_in_table("III"):
         names = tuple(ENCODERS[task])
         wanted = [paper_condition(task, TACRGB, encoder=name) for name in names]
-        for setup, conditions in answering_all(wanted, found).items():
+        for settings, conditions in answering_all(wanted, found).items():
             results = dict(zip(names, (found[condition] for condition in conditions), strict=True))
-            ranked.setdefault(setup, []).append(_ranking(task, results))
+            ranked.setdefault(settings, []).append(_ranking(task, results))
     return ranked
 
 
@@ -82,10 +82,10 @@ def ranking_tables(found: Found) -> Iterator[str]:
     ranked = rankings(found)
     if not ranked:
         yield f"not run. It needs {', '.join(ENCODERS['GearAssembly'])} on a task of Table III.\n"
-    for setup, of_setup in ranked.items():
-        yield f"{verdict_on(of_setup)} (settings: {setup}).\n\n"
+    for settings, with_settings in ranked.items():
+        yield f"{verdict_on(with_settings)} (settings: {settings}).\n\n"
         names = ("task", "best", "success", "second", "success", "best over second", "p")
-        yield markdown_table(names, (_row(ranking) for ranking in of_setup))
+        yield markdown_table(names, (_row(ranking) for ranking in with_settings))
         yield "\n"
 
 

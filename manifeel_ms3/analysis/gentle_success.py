@@ -51,7 +51,7 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    setup, conditions = most
+    settings, conditions = most
     tasks = [task for task in MODALITIES if any((task, mode) in conditions for mode in MODES)]
     columns = min(len(tasks), COLUMNS)
     rows = -(-len(tasks) // columns)
@@ -59,7 +59,7 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
     for ax, task in zip(panels, tasks, strict=False):
         _draw_task(ax, found, {mode: conditions[task, mode] for mode in MODES if (task, mode) in conditions})
-        ax.set_title(f"{task}: Diffusion Policy, {setup.preset}")
+        ax.set_title(f"{task}: Diffusion Policy, {settings.preset}")
     for ax in panels[len(tasks) :]:
         ax.set_axis_off()
     save_figure(fig, out, DPI)

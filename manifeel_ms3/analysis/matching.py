@@ -44,8 +44,8 @@ def answering_all(wanted: Sequence[Condition], found: Found) -> dict[TrainingSet
     """The conditions that correspond to several of the paper, for each set-up that has them all, the paper's preset first."""
     answers = [answering(condition, found) for condition in wanted]
     common = set.intersection(*(set(one) for one in answers))
-    in_order = sorted(common, key=lambda setup: setup.sort_key)
-    return {setup: [one[setup] for one in answers] for setup in in_order}
+    in_order = sorted(common, key=lambda settings: settings.sort_key)
+    return {settings: [one[settings] for one in answers] for settings in in_order}
 
 
 def as_the_paper_says(condition: Condition) -> Condition:

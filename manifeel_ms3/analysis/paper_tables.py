@@ -55,22 +55,22 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
         files: Links to the result files of conditions.
     """
     yield TEXT
-    setups = _setups(found)
-    for setup in setups:
-        if rows := list(_rows_by_sensing(found, files, setup, {(task, DP): rates for task, rates in MODALITIES.items()})):
-            yield f"\n### Table I, what touch adds: Diffusion Policy, {setup}\n\n"
+    all_settings = _all_settings(found)
+    for settings in all_settings:
+        if rows := list(_rows_by_sensing(found, files, settings, {(task, DP): rates for task, rates in MODALITIES.items()})):
+            yield f"\n### Table I, what touch adds: Diffusion Policy, {settings}\n\n"
             yield _with_floors(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
         by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
-        rows = list(_rows_by_sensing(found, files, setup, by_policy))
+        rows = list(_rows_by_sensing(found, files, settings, by_policy))
         if {policy for (_, policy), _ in rows} - {DP}:
-            yield f"\n### Table II, three policies: {setup}\n\n"
+            yield f"\n### Table II, three policies: {settings}\n\n"
             yield _with_floors(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
-        if rows := list(_rows_by_encoder(found, files, setup)):
-            yield f"\n### Table III, encoders of TacRGB: {setup}\n\n"
+        if rows := list(_rows_by_encoder(found, files, settings)):
+            yield f"\n### Table III, encoders of TacRGB: {settings}\n\n"
             names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
             yield _with_floors(("task", *names), rows)
-    missing = [] if any(setup.preset == PAPER for setup in setups) else ["the networks of the paper (ResNet-18)"]
-    if not any(True for setup in setups for _ in _rows_by_encoder(found, files, setup)):
+    missing = [] if any(settings.preset == PAPER for settings in all_settings) else ["the networks of the paper (ResNet-18)"]
+    if not any(True for settings in all_settings for _ in _rows_by_encoder(found, files, settings)):
         missing.append("Table III, the encoders with published weights")
     if missing:
         yield NEEDS_GPU.format(what=", and ".join(missing))
@@ -85,32 +85,32 @@ def _with_floors(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return markdown_table((*names, "floor"), [(*row, floor) for row, floor in zip(rows, floors, strict=True)])
 
 
-def _setups(found: Found) -> list[TrainingSettings]:
+def _all_settings(found: Found) -> list[TrainingSettings]:
     """The set-ups of conditions of Tables I to III, the paper's preset first."""
     wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
     wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
-    setups = {setup for condition in wanted for setup in answering(condition, found)}
-    return sorted(setups, key=lambda setup: setup.sort_key)
+    all_settings = {settings for condition in wanted for settings in answering(condition, found)}
+    return sorted(all_settings, key=lambda settings: settings.sort_key)
 
 
 Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
 
 
 def _rows_by_sensing(
-    found: Found, files: Mapping[Condition, str], setup: TrainingSettings, rows: Rows
+    found: Found, files: Mapping[Condition, str], settings: TrainingSettings, rows: Rows
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
     """Task and policy, and a cell for each observation mode; only rows of which some condition was run."""
     for (task, policy), rates in rows.items():
-        answers = [answering(paper_condition(task, mode, policy), found).get(setup) for mode in MODES]
+        answers = [answering(paper_condition(task, mode, policy), found).get(settings) for mode in MODES]
         if any(answers):
             cells = [_cell(found, files, answer, rate) for answer, rate in zip(answers, rates, strict=True)]
             yield (task, policy), cells
 
 
-def _rows_by_encoder(found: Found, files: Mapping[Condition, str], setup: TrainingSettings) -> Iterator[list[str]]:
+def _rows_by_encoder(found: Found, files: Mapping[Condition, str], settings: TrainingSettings) -> Iterator[list[str]]:
     for task in tasks_in_table("III"):
         wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
-        answers = {name: answering(condition, found).get(setup) for name, condition in wanted.items()}
+        answers = {name: answering(condition, found).get(settings) for name, condition in wanted.items()}
         if sum(answer is not None for answer in answers.values()) > 1:  # a single encoder compares nothing
             yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
 
@@ -137,12 +137,12 @@ def table_one(found: Found) -> tuple[TrainingSettings, dict[tuple[str, str], Con
     Args:
         found: The results that enter comparisons.
     """
-    by_setup: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
+    by_settings: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
     for task in MODALITIES:
         for mode in MODES:
-            for setup, condition in answering(paper_condition(task, mode), found).items():
-                by_setup.setdefault(setup, {})[task, mode] = condition
-    return max(by_setup.items(), key=lambda item: len(item[1]), default=None)
+            for settings, condition in answering(paper_condition(task, mode), found).items():
+                by_settings.setdefault(settings, {})[task, mode] = condition
+    return max(by_settings.items(), key=lambda item: len(item[1]), default=None)
 
 
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
@@ -166,7 +166,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    setup, conditions = most
+    settings, conditions = most
     drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
     tasks = list(MODALITIES)
     fig = Figure(figsize=PANEL, layout="constrained")
@@ -178,7 +178,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
             ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=PAPER_LINE, label=label)
-    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {setup.preset}")
+    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {settings.preset}")
     ax.set_xticks(range(len(tasks)), tasks, rotation=LABEL_ANGLE, ha="right")
     ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
     save_figure(fig, out, DPI)

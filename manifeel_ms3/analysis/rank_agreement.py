@@ -62,8 +62,8 @@ def rank_table(found: Found) -> str:
         found: The results that enter comparisons.
     """
     rows = [
-        (table, setup, scope, len(ranked), *agreement_of(ranked, groups))
-        for table, setup, conditions in _ranked_by_table(found)
+        (table, settings, scope, len(ranked), *agreement_of(ranked, groups))
+        for table, settings, conditions in _ranked_by_table(found)
         for scope, ranked, groups in _scopes(conditions)
         if len(ranked) >= FEWEST
     ]
@@ -124,11 +124,11 @@ def _ranked_by_table(found: Found) -> Iterator[tuple[str, TrainingSettings, list
     """The conditions of each table that were run, by their set-up; the paper's preset is first."""
     by_table: dict[str, dict[TrainingSettings, list[Ranked]]] = {}
     for table, wanted, rate in reported():
-        for setup, condition in answering(wanted, found).items():
-            by_table.setdefault(table, {}).setdefault(setup, []).append(Ranked(condition, rate.mean, found[condition]))
-    for table, setups in by_table.items():
-        for setup in sorted(setups, key=lambda one: one.sort_key):
-            yield table, setup, setups[setup]
+        for settings, condition in answering(wanted, found).items():
+            by_table.setdefault(table, {}).setdefault(settings, []).append(Ranked(condition, rate.mean, found[condition]))
+    for table, all_settings in by_table.items():
+        for settings in sorted(all_settings, key=lambda one: one.sort_key):
+            yield table, settings, all_settings[settings]
 
 
 def _scopes(conditions: list[Ranked]) -> Iterator[tuple[str, list[Ranked], list[list[int]]]]:

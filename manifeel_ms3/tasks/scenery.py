@@ -29,10 +29,10 @@ LIGHTING = {"normal": 1.0, "dim": 0.05}
 """Share of the normal light; the paper gives no figure for its dim light."""
 QUALITIES = tuple(SHADOWS)
 """Qualities of the policy's images."""
-FILM_CAMERA_AT, FILM_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
-"""Position of the films' camera, and the point that it looks at, base frame, in m. Chosen by eye."""
-FILM_FIELD_OF_VIEW = np.deg2rad(45)
-"""Field of view of the films' camera, in rad. Chosen by eye."""
+VIDEO_CAMERA_AT, VIDEO_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
+"""Position of the videos' camera, and the point that it looks at, base frame, in m. Chosen by eye."""
+VIDEO_FIELD_OF_VIEW = np.deg2rad(45)
+"""Field of view of the videos' camera, in rad. Chosen by eye."""
 NEAREST = 0.01
 """Smallest distance that the cameras draw, in m. Set once; not tuned."""
 TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
@@ -81,14 +81,14 @@ class SceneryEnv(SensingEnv):
 
     @property
     def _default_human_render_camera_configs(self):
-        pose = looking_at(np.array(FILM_CAMERA_AT), np.array(FILM_CAMERA_LOOKS_AT))
+        pose = looking_at(np.array(VIDEO_CAMERA_AT), np.array(VIDEO_CAMERA_LOOKS_AT))
         drawn = SIZE * SUPERSAMPLING
         return CameraConfig(
             "render_camera",
             pose,
             drawn,
             drawn,
-            FILM_FIELD_OF_VIEW,
+            VIDEO_FIELD_OF_VIEW,
             near=NEAREST,
             far=FARTHEST,
             shader_config=presentation_shader(),

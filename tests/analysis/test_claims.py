@@ -151,7 +151,7 @@ def test_each_set_up_has_an_answer_of_its_own(tmp_path):
         write_run(tmp_path, VISION, 0.2, preset=preset, task="ObjectSearch")
         write_run(tmp_path, TACRGB, rate, preset=preset, task="ObjectSearch")
     first, second = (outcome for claim, _, outcome in answered(tmp_path) if claim.startswith("2."))
-    assert [str(first.setup), str(second.setup)] == ["paper", "cpu"]
+    assert [str(first.settings), str(second.settings)] == ["paper", "cpu"]
     assert first.difference.value > second.difference.value
 
 
@@ -183,8 +183,8 @@ def write_encoders(folder, rates: dict[str, dict[str, float]]) -> None:
 def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
     rates = {task: {name: 0.9 if name == best[task] else 0.3 for name in ENCODERS[task]} for task in best}
     write_encoders(tmp_path, rates)
-    ((setup, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
-    assert str(setup) == "paper"
+    ((settings, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
+    assert str(settings) == "paper"
     assert {ranking.task: ranking.encoders[0] for ranking in ranked} == best
     assert all(ranking.best_over_second.low > 0.4 for ranking in ranked)
     assert verdict_on(ranked) == verdict

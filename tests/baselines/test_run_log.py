@@ -35,15 +35,15 @@ PATIENCE = 60  # s
 def run_dir(tmp_path_factory):
     """The folder of a run whose log was sent to Weights & Biases in its offline mode."""
     folder = tmp_path_factory.mktemp("run")
-    film = folder / "film.mp4"
-    film.write_bytes(encode_video([Frame(dict(wrist=np.full((64, 64, 3), 40 * k, np.uint8))) for k in range(5)]))
+    video = folder / "video.mp4"
+    video.write_bytes(encode_video([Frame(dict(wrist=np.full((64, 64, 3), 40 * k, np.uint8))) for k in range(5)]))
     args = replace(ARGS, eval_env_kwargs='{"fit": "tight"}', num_eval_envs=3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")
         patch.setenv("WANDB_SILENT", "true")
         log = RunLog(folder, dict(seed=7, obs_mode="rgb+tacff"), 0, wandb_run_of(args, "diffusion_policy"))
         log.write(TRAINED)
-        log.write(EVALUATED, film)
+        log.write(EVALUATED, video)
         log.close()
     return folder
 
@@ -110,7 +110,7 @@ def test_entries_keep_the_step_that_they_are_about_even_an_earlier_one(records):
 def test_the_video_of_an_evaluation_goes_with_its_entry(records, run_dir):
     _, evaluated = (values(record.history.item) for record in records if record.HasField("history"))
     (copy,) = run_dir.glob(f"wandb/offline-run-*/files/{evaluated['eval/video/path']}")
-    assert copy.read_bytes() == (run_dir / "film.mp4").read_bytes()
+    assert copy.read_bytes() == (run_dir / "video.mp4").read_bytes()
 
 
 def test_tensorboard_has_the_success_at_the_step_of_the_checkpoint(run_dir):

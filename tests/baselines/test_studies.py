@@ -116,6 +116,14 @@ def test_every_policy_is_tried_out(policy, obs_mode):
     assert 0 < cost.inference(policy, *flags, "--inference-steps", "1") < 60
 
 
+def test_a_large_batch_is_estimated_from_a_small_one(monkeypatch):
+    """A whole batch of the paper takes more memory than a laptop has."""
+    monkeypatch.setattr(cost, "_seconds", lambda do, repeats: 1.0)
+    flags = ["cpu", "--obs-mode", "tacff", "--batch-size"]
+    seconds = {batch: cost.gradient_step("diffusion_policy", *flags, str(batch)) for batch in (8, 1000)}
+    assert seconds == {8: 1.0, 1000: 1000 / cost.TRIAL_BATCH}
+
+
 def test_trials_do_not_repeat_for_what_costs_the_same():
     jobs = jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))
     steps = {trial.key for job in jobs if job.kind == "train" for trial in cost.trials_of(job)}

@@ -1,6 +1,7 @@
 """Fixtures of the tests of trust: a submission, a trajectory file and a secret that nothing may read."""
 
 import shutil
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,9 @@ import pytest
 from tests.leaderboard.made_up import made_up
 
 from .files_of_strangers import SAMPLE, SECRET
+
+MAX_MEMORY = 300e6
+"""Bytes by which the process may grow at its peak while it reads a damaged file; the files have less than a megabyte."""
 
 
 @pytest.fixture
@@ -29,3 +33,21 @@ def secret(tmp_path) -> Path:
     path.parent.mkdir()
     path.write_bytes(SECRET)
     return path
+
+
+@pytest.fixture
+def bounded_memory(figure):
+    """A context that compares the growth of this process's resident memory at its peak with `MAX_MEMORY`."""
+
+    def peak_memory() -> int:
+        with Path("/proc/self/status").open() as file:
+            return 1024 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
+
+    @contextmanager
+    def measured(what: str):
+        Path("/proc/self/clear_refs").write_text("5")  # the peak of memory is measured from here
+        start = peak_memory()
+        yield
+        figure(f"peak of memory over {what}, MB", (peak_memory() - start) / 1e6, at_most=MAX_MEMORY / 1e6)
+
+    return measured

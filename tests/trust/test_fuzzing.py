@@ -47,8 +47,6 @@ from .tiny_checkpoint import save_tiny_checkpoint
 RESULT = Path(__file__).with_name("result.json")
 STEPS = 12
 """Number of steps of the valid demonstration."""
-MAX_MEMORY = 300e6
-"""Bytes by which the process may grow at its peak while it reads a damaged file; the files have less than a megabyte."""
 
 # ------------------------------------------------------------------ damage
 
@@ -273,19 +271,9 @@ def refused_or_read(read: Callable[[], Any], path: Path | None = None) -> None:
             raise AssertionError("the error does not name the file") from error
 
 
-def peak_memory() -> int:
-    """Largest resident memory of this process since the last reset, bytes."""
-    with Path("/proc/self/status").open() as file:
-        return 1024 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
-
-
-def reset_peak_memory() -> None:
-    Path("/proc/self/clear_refs").write_text("5")
-
-
 @pytest.mark.parametrize("name", READERS)
 @pytest.mark.parametrize("times", [1, pytest.param(10, marks=pytest.mark.slow)])
-def test_damaged_files_are_read_or_refused(name, times, tmp_path, monkeypatch, figure):
+def test_damaged_files_are_read_or_refused(name, times, tmp_path, monkeypatch, bounded_memory):
     reader = READERS[name]
     valid = tmp_path / "valid"
     valid.mkdir()
@@ -311,8 +299,6 @@ def test_damaged_files_are_read_or_refused(name, times, tmp_path, monkeypatch, f
         finally:
             shutil.rmtree(folder)
 
-    reset_peak_memory()
-    start = peak_memory()
-    case()
-    figure("peak of memory over a damaged file, MB", (peak_memory() - start) / 1e6, at_most=MAX_MEMORY / 1e6)
+    with bounded_memory("a damaged file"):
+        case()
     assert sorted(path for path in tmp_path.rglob("*")) == before  # nothing was written, nothing outside was touched

@@ -188,7 +188,7 @@ counts = pytest.mark.parametrize("examples", [300, pytest.param(10_000, marks=py
 
 
 @counts
-def test_fuzz_what_is_accepted_can_be_shown(small, tmp_path, examples):
+def test_fuzz_what_is_accepted_can_be_shown(small, tmp_path, examples, bounded_memory):
     outcomes = {True: 0, False: 0}
 
     @fuzz(examples)
@@ -200,12 +200,13 @@ def test_fuzz_what_is_accepted_can_be_shown(small, tmp_path, examples):
         folder = written({name: json.dumps(content).encode() for name, content in files.items()}, tmp_path / "theirs")
         outcomes[accepted_and_shown(folder, tmp_path / "board")] += 1
 
-    tried()
+    with bounded_memory("a damaged submission"):
+        tried()
     assert min(outcomes.values()) > examples // 30, "both outcomes must be tried"
 
 
 @counts
-def test_fuzz_damaged_files_are_refused_or_shown(small, tmp_path, examples):
+def test_fuzz_damaged_files_are_refused_or_shown(small, tmp_path, examples, bounded_memory):
     @fuzz(examples)
     @given(st.sampled_from(sorted(small)), st.data())
     def tried(name, data):
@@ -215,11 +216,12 @@ def test_fuzz_damaged_files_are_refused_or_shown(small, tmp_path, examples):
             content[start : start + data.draw(st.integers(0, 40))] = data.draw(st.binary(max_size=20))
         accepted_and_shown(written(small | {name: bytes(content)}, tmp_path / "theirs"), tmp_path / "board")
 
-    tried()
+    with bounded_memory("a damaged submission"):
+        tried()
 
 
 @counts
-def test_fuzz_any_folder_is_refused_in_one_way(tmp_path, examples):
+def test_fuzz_any_folder_is_refused_in_one_way(tmp_path, examples, bounded_memory):
     @fuzz(examples)
     @given(
         st.dictionaries(
@@ -232,4 +234,5 @@ def test_fuzz_any_folder_is_refused_in_one_way(tmp_path, examples):
         with pytest.raises(InvalidFileError):
             read_submission(written(files, tmp_path / "theirs"))
 
-    tried()
+    with bounded_memory("a damaged submission"):
+        tried()

@@ -58,10 +58,10 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
         place = dict(chunk_index=e // FILES_PER_CHUNK, file_index=e % FILES_PER_CHUNK)
         file = folder / DATA.format(**place)
         file.parent.mkdir(parents=True, exist_ok=True)
-        pq.write_table(pa.table({name: _column(v) for name, v in values.items() if name not in writer.filmed}), file)
-        for name in writer.filmed:
+        pq.write_table(pa.table({name: _column(v) for name, v in values.items() if name not in writer.as_video}), file)
+        for name in writer.as_video:
             _write_video(folder / VIDEO.format(video_key=name, **place), values[name])
-        entries.append(_entry(e, task, start, values, place, writer.filmed))
+        entries.append(_entry(e, task, start, values, place, writer.as_video))
         start = entries[-1]["dataset_to_index"]
     (folder / "meta/episodes/chunk-000").mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(entries), folder / "meta/episodes/chunk-000/file-000.parquet")
@@ -108,7 +108,7 @@ class _Features:
         self._action_axes = ACTION_AXES.get(str(modes.pop())) if len(modes) == 1 else None
         self._videos = videos
         self.features: dict[str, dict[str, Any]] = {}
-        self.filmed: list[str] = []
+        self.as_video: list[str] = []
         """Features that are stored as videos."""
 
     def describe(self, values: dict[str, np.ndarray]) -> None:
@@ -121,14 +121,14 @@ class _Features:
             return
         if self._videos:
             images = [name for name, v in values.items() if v.dtype == np.uint8]
-            self.filmed = [name for name in images if not name.startswith(f"observation.images.{PAD}")]
-        if odd := [name for name in self.filmed if any(size % 2 for size in values[name].shape[1:3])]:
+            self.as_video = [name for name in images if not name.startswith(f"observation.images.{PAD}")]
+        if odd := [name for name in self.as_video if any(size % 2 for size in values[name].shape[1:3])]:
             raise DemonstrationError(f"{odd} have an odd width or height, which H.264 does not take; leave --videos out")
         self.features = {name: self._described(name, array) for name, array in values.items()}
 
     def _described(self, name: str, values: np.ndarray) -> dict[str, Any]:
         shape: list[int] = list(values.shape[1:]) or [1]
-        if name in self.filmed:
+        if name in self.as_video:
             return dict(dtype="video", shape=shape, names=IMAGE_AXES, info=_video_info(shape))
         if values.dtype == np.uint8:
             return dict(dtype="image", shape=shape, names=IMAGE_AXES)
@@ -162,7 +162,7 @@ def _features_of(episode: dict[str, np.ndarray], keys: list[str], number: int, s
 
 
 def _entry(
-    number: int, task: str, start: int, values: dict[str, np.ndarray], place: dict[str, int], filmed: list[str]
+    number: int, task: str, start: int, values: dict[str, np.ndarray], place: dict[str, int], as_video: list[str]
 ) -> dict[str, Any]:
     """An episode's entry in meta/episodes."""
     length = len(values["action"])
@@ -170,7 +170,7 @@ def _entry(
     return (
         dict(episode_index=number, tasks=[task], length=length)
         | {f"data/{name}": value for name, value in place.items()}
-        | {f"videos/{video}/{name}": value for video in filmed for name, value in (place | times).items()}
+        | {f"videos/{video}/{name}": value for video in as_video for name, value in (place | times).items()}
         | dict(dataset_from_index=start, dataset_to_index=start + length)
         | {f"stats/{name}/{what}": value for name, v in values.items() for what, value in episode_statistics(v).items()}
         | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
@@ -191,7 +191,7 @@ def _info(described: _Features, num_episodes: int, num_frames: int) -> dict[str,
         fps=CONTROL_FREQ,
         splits=dict(train=f"0:{num_episodes}"),
         data_path=DATA,
-        video_path=VIDEO if described.filmed else None,
+        video_path=VIDEO if described.as_video else None,
         features=described.features,
     )
 

@@ -94,7 +94,7 @@ class BallSortingEnv(VisuotactileEnv):
     `goal="bowls"` is the paper's task on the real robot: the golf ball goes into an orange bowl and the other into a blue one.
     """
 
-    _sample_video_link = "docs/films/BallSorting.mp4"
+    _sample_video_link = "docs/videos/BallSorting.mp4"
     Randomization = BallSortingRandomization
     reward_config = BallSortingRewardConfig()
     policy_cameras = ("front",)
@@ -202,7 +202,7 @@ class BallSortingEnv(VisuotactileEnv):
 class BallSortingDimEnv(BallSortingEnv):
     """BallSorting at 5 % of the light."""
 
-    _sample_video_link = "docs/films/BallSortingDim.mp4"
+    _sample_video_link = "docs/videos/BallSortingDim.mp4"
 
     def __init__(self, *args, lighting: str = "dim", **kwargs):
         super().__init__(*args, lighting=lighting, **kwargs)

@@ -88,7 +88,7 @@ class ObjectSearchEnv(VisuotactileEnv):
     `occlusion=False` leaves the container's front undrawn.
     """
 
-    _sample_video_link = "docs/films/ObjectSearch.mp4"
+    _sample_video_link = "docs/videos/ObjectSearch.mp4"
     Randomization = ObjectSearchRandomization
     reward_config = ObjectSearchRewardConfig()
     policy_cameras = ("front",)

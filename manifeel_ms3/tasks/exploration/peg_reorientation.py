@@ -71,7 +71,7 @@ class PegReorientationEnv(InsertionEnv):
     `occlusion=False` leaves the box's front undrawn.
     """
 
-    _sample_video_link = "docs/films/PegReorientation.mp4"
+    _sample_video_link = "docs/videos/PegReorientation.mp4"
     Randomization = PegReorientationRandomization
     policy_cameras = ("front",)
     has_occluder = True

@@ -62,7 +62,7 @@ class GearAssemblyEnv(InsertionEnv):
     **Fail Conditions:** the gear has left the grip (30 mm).
     """
 
-    _sample_video_link = "docs/films/GearAssembly.mp4"
+    _sample_video_link = "docs/videos/GearAssembly.mp4"
     Randomization = GearRandomization
     contacts = CONTACTS | dict(enable_pcm=False)  # with persistent manifolds, teeth that only touch count as millimetres deep
     make_fit = staticmethod(gear_fit)

@@ -37,6 +37,6 @@ class PegInsertionEnv(InsertionEnv):
     **Fail Conditions:** the peg has left the grip (30 mm).
     """
 
-    _sample_video_link = "docs/films/PegInsertion.mp4"
+    _sample_video_link = "docs/videos/PegInsertion.mp4"
     make_fit = staticmethod(peg_fit)
     paper_threshold = 0.009

@@ -38,7 +38,7 @@ class PowerPlugInsertionEnv(InsertionEnv):
     **Fail Conditions:** the plug has left the grip (30 mm).
     """
 
-    _sample_video_link = "docs/films/PowerPlugInsertion.mp4"
+    _sample_video_link = "docs/videos/PowerPlugInsertion.mp4"
     make_fit = staticmethod(power_fit)
     paper_threshold = 0.007
     lift = 0.03

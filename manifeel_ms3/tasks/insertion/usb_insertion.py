@@ -38,7 +38,7 @@ class USBInsertionEnv(InsertionEnv):
     **Fail Conditions:** the plug has left the grip (30 mm).
     """
 
-    _sample_video_link = "docs/films/USBInsertion.mp4"
+    _sample_video_link = "docs/videos/USBInsertion.mp4"
     make_fit = staticmethod(usb_fit)
     paper_threshold = 0.008
     lift = 0.03

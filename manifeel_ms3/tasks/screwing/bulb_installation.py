@@ -75,7 +75,7 @@ class BulbInstallationEnv(ScrewingEnv):
     the open gripper, over it, moves and turns about the vertical alone (5-D actions).
     """
 
-    _sample_video_link = "docs/films/BulbInstallation.mp4"
+    _sample_video_link = "docs/videos/BulbInstallation.mp4"
     Randomization = BulbRandomization
     screw = bulb_and_holder()
     grips_round_parts = True

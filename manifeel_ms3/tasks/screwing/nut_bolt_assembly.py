@@ -44,7 +44,7 @@ class NutBoltAssemblyEnv(ScrewingEnv):
     **Fail Conditions:** the nut is out of the hand (50 mm) and off the bolt.
     """
 
-    _sample_video_link = "docs/films/NutBoltAssembly.mp4"
+    _sample_video_link = "docs/videos/NutBoltAssembly.mp4"
     screw = nut_and_bolt()
     grip_indentation = 8e-4  # m: four contact points of 8 kN/m
 

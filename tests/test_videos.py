@@ -1,4 +1,4 @@
-"""Films of recorded and evaluated episodes show every moment that they should, or say why there is none."""
+"""Videos of recorded and evaluated episodes show every moment that they should, or say why there is none."""
 
 import json
 import shutil
@@ -9,10 +9,10 @@ from PIL import Image
 
 from manifeel_ms3 import cli
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.films import layout
-from manifeel_ms3.films.__main__ import read_source
-from manifeel_ms3.films.film_file import END_SECONDS, write_film
-from manifeel_ms3.films.shots import Shot, Take, shown_steps
+from manifeel_ms3.videos import layout
+from manifeel_ms3.videos.__main__ import read_source
+from manifeel_ms3.videos.shots import Shot, Take, shown_steps
+from manifeel_ms3.videos.video_file import END_SECONDS, write_video
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
 
@@ -35,7 +35,7 @@ def test_the_first_and_the_last_step_are_shown():
 
 def test_a_frame_shows_each_image_at_its_place_and_the_force_so_far():
     take = a_take()
-    frames = [np.asarray(frame) for frame in layout.film_frames(take)]
+    frames = [np.asarray(frame) for frame in layout.video_frames(take)]
     assert all(frame.shape == (layout.SIZE[1], layout.SIZE[0], 3) for frame in frames)
     np.testing.assert_array_equal(frames[1][layout.BAR :, :480][:480], take.shots[1].images["scene"])
     touch = frames[1][layout.BAR + 40 : layout.BAR + 240, -layout.WIDE :]
@@ -48,35 +48,35 @@ def test_a_frame_shows_each_image_at_its_place_and_the_force_so_far():
 
 @pytest.mark.parametrize("suffix", ["webp", "gif"])
 def test_an_animation_has_every_frame_and_stops_at_the_end(tmp_path, suffix):
-    frames = list(layout.film_frames(a_take()))
-    write_film([frames], tmp_path / f"film.{suffix}", fps=10, width=400)
-    with Image.open(tmp_path / f"film.{suffix}") as film:
-        assert film.n_frames >= len(frames)
-        assert film.size == (400, 198)
+    frames = list(layout.video_frames(a_take()))
+    write_video([frames], tmp_path / f"video.{suffix}", fps=10, width=400)
+    with Image.open(tmp_path / f"video.{suffix}") as video:
+        assert video.n_frames >= len(frames)
+        assert video.size == (400, 198)
         lasted = 0
-        for k in range(film.n_frames):
-            film.seek(k)
-            film.load()
-            lasted += film.info["duration"]
+        for k in range(video.n_frames):
+            video.seek(k)
+            video.load()
+            lasted += video.info["duration"]
     assert lasted == pytest.approx(1000 * (0.1 * len(frames) + END_SECONDS), abs=100)
 
 
 def test_an_mp4_has_every_frame(tmp_path):
     imageio = pytest.importorskip("imageio.v2")
-    frames = list(layout.film_frames(a_take()))
-    write_film([frames, frames], tmp_path / "film.mp4", fps=4)
-    with imageio.get_reader(tmp_path / "film.mp4") as film:
-        assert film.count_frames() == 2 * (len(frames) + round(4 * END_SECONDS))
+    frames = list(layout.video_frames(a_take()))
+    write_video([frames, frames], tmp_path / "video.mp4", fps=4)
+    with imageio.get_reader(tmp_path / "video.mp4") as video:
+        assert video.count_frames() == 2 * (len(frames) + round(4 * END_SECONDS))
 
 
 @needs_renderer
 def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
     out = tmp_path / "peg.webp"
-    assert cli.main(["film", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
-    with Image.open(out) as film:
-        assert film.size == (524, 260)
-        film.seek(film.n_frames - 1)
-        last = np.asarray(film.convert("RGB")).astype(int)
+    assert cli.main(["video", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
+    with Image.open(out) as video:
+        assert video.size == (524, 260)
+        video.seek(video.n_frames - 1)
+        last = np.asarray(video.convert("RGB")).astype(int)
     touch = last[20:130, -150:]
     assert touch.std() > 10  # TacRGB of a held peg is not one colour
 
@@ -84,7 +84,7 @@ def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--out", "peg.avi"], "peg.avi is not a path of a film; give a file that ends in .mp4, .webp, .gif"),
+        (["--out", "peg.avi"], "peg.avi is not a path of a video; give a file that ends in .mp4, .webp, .gif"),
         (["--episode", "7"], "has the episodes 0 to 1"),
         (["--camera", "top"], "--camera='top' is unknown; choose from"),
         (["--pad", "both"], "--pad='both' is unknown; choose from"),
@@ -92,20 +92,20 @@ def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_filmed_is_refused_in_one_line(arguments, said, capsys):
-    assert cli.main(["film", str(FILE), *arguments]) == 1
+    assert cli.main(["video", str(FILE), *arguments]) == 1
     error = capsys.readouterr().err
     assert said in error
     assert len(error.splitlines()) == 2  # the error, and where there is more
 
 
 def test_a_file_that_is_not_there(tmp_path, capsys):
-    assert cli.main(["film", str(tmp_path / "x.h5")]) == 1
+    assert cli.main(["video", str(tmp_path / "x.h5")]) == 1
     assert "x.h5 does not exist" in capsys.readouterr().err
 
 
 def test_a_result_without_its_policy_says_what_to_give(tmp_path, capsys):
     shutil.copy("tests/trust/result.json", tmp_path / "evaluation.json")
-    assert cli.main(["film", str(tmp_path / "evaluation.json")]) == 1
+    assert cli.main(["video", str(tmp_path / "evaluation.json")]) == 1
     assert "give its --checkpoint or --policy" in capsys.readouterr().err
 
 

@@ -1,4 +1,4 @@
-"""Shots of a film: images, forces and success of an episode, taken while it runs."""
+"""Shots of a video: images, forces and success of an episode, taken while it runs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ SCENE_SIZE = 480
 
 @dataclass(frozen=True)
 class View:
-    """The camera and the pad that a film shows beside the scene and the contact force."""
+    """The camera and the pad that a video shows beside the scene and the contact force."""
 
     camera: str
     """Name of the camera: front, side or wrist."""
@@ -28,7 +28,7 @@ class View:
 
 @dataclass
 class Shot:
-    """One moment of a film."""
+    """One moment of a video."""
 
     step: int
     """Number of control steps since the start of the episode."""
@@ -38,7 +38,7 @@ class Shot:
 
 @dataclass
 class Take:
-    """Everything that a film needs of one episode."""
+    """Everything that a video needs of one episode."""
 
     title: str
     """Task, origin and seed of the episode."""
@@ -52,11 +52,11 @@ class Take:
     """Whether the task has succeeded, for the start and every control step."""
 
 
-class FilmingWrapper(gym.Wrapper):
+class VideoWrapper(gym.Wrapper):
     """Wrapper that takes shots of an episode, at chosen steps, while the episode runs.
 
     Args:
-        env: Environment of `filming_env`.
+        env: Environment of `video_env`.
         take: Take to which the shots, forces and successes are added.
         view: Camera and pad to show.
         steps: Numbers of the control steps that are shown.
@@ -92,13 +92,13 @@ class FilmingWrapper(gym.Wrapper):
         return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors))
 
 
-def filming_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env:
-    """The environment of an episode, with the scene, the camera and the pad of a film added to what it renders.
+def video_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env:
+    """The environment of an episode, with the scene, the camera and the pad of a video added to what it renders.
 
     Args:
         env_id: Id of the task.
         env_kwargs: Arguments of `gym.make` with which the episode was recorded or evaluated.
-        view: Camera and pad of the film.
+        view: Camera and pad of the video.
 
     Raises:
         MachineError: This machine has no renderer.

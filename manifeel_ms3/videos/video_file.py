@@ -1,4 +1,4 @@
-"""Writing of films: H.264 in mp4, animated WebP, and GIF."""
+"""Writing of videos: H.264 in mp4, animated WebP, and GIF."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,7 +12,7 @@ from manifeel_ms3.evaluation.video import encode_mp4
 from manifeel_ms3.files import atomic_write
 
 SUFFIXES = (".mp4", ".webp", ".gif")
-"""Suffixes of the formats in which films are written."""
+"""Suffixes of the formats in which videos are written."""
 BLOCK = 2
 """Widths and heights are cut to multiples of this number of pixels, which H.264 needs."""
 WEBP_QUALITY = 70
@@ -23,27 +23,27 @@ END_SECONDS = 1.5
 """Time for which the last frame of each episode is shown, in s (chosen)."""
 
 
-def check_film_path(path: Path) -> None:
+def check_video_path(path: Path) -> None:
     """Check that a path ends in a known suffix and is not a folder.
 
     Raises:
         InvalidArgumentError: The path has another suffix, or is a folder.
     """
     if path.suffix.lower() not in SUFFIXES or path.is_dir():
-        raise InvalidArgumentError(f"--out {path} is not a path of a film; give a file that ends in {', '.join(SUFFIXES)}")
+        raise InvalidArgumentError(f"--out {path} is not a path of a video; give a file that ends in {', '.join(SUFFIXES)}")
 
 
-def write_film(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:
-    """Write the frames of some episodes, one after the other, as one film that stops for a moment after each episode.
+def write_video(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:
+    """Write the frames of some episodes, one after the other, as one video that stops for a moment after each episode.
 
     Args:
         episodes: Frames of each episode.
-        path: Path of the film; its suffix decides the format.
+        path: Path of the video; its suffix decides the format.
         fps: Frames per second.
-        width: Width of the film in pixels; that of the frames if not given.
+        width: Width of the video in pixels; that of the frames if not given.
 
     Raises:
-        FileWriteError: The film cannot be written.
+        FileWriteError: The video cannot be written.
     """
     frames = [_resized(frame, width) for episode in episodes for frame in episode + episode[-1:] * round(END_SECONDS * fps)]
     with atomic_write(path) as partial:

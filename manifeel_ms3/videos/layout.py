@@ -1,4 +1,4 @@
-"""The layout of a film: the title on top, the scene at the left, and camera, touch and the force curve at the right.
+"""The layout of a video: the title on top, the scene at the left, and camera, touch and the force curve at the right.
 
 Sizes and colours are chosen by eye.
 """
@@ -21,13 +21,13 @@ GAP = 4
 NARROW, WIDE = TILE, TILE * 4 // 3
 """Widths of the two columns at the right, in pixels: square for the camera, and 4 : 3 as the tactile images are."""
 SIZE = (SCENE_SIZE + NARROW + WIDE + 2 * GAP, BAR + 2 * TILE + GAP)
-"""Width and height of a film, in pixels."""
+"""Width and height of a video, in pixels."""
 MARGINS = (14, 34, 14, 14)
 """Left, upper, right and lower margin of the curve in its tile, in pixels."""
 TITLE_SIZE, TIME_SIZE, CAPTION_SIZE, LIMIT_SIZE = 19, 17, 14, 12
 """Sizes of the text, in points."""
 TITLE_INSET, SUCCESS_INSET = 12, 90
-"""Distance of the title and the time from the film's sides, and of the word "success" from the right side, in pixels."""
+"""Distance of the title and the time from the video's sides, and of the word "success" from the right side, in pixels."""
 CAPTION_AT = (8, 6)
 """Place of a caption in its tile, in pixels."""
 CAPTION_PADDING = (5, 4)
@@ -45,14 +45,14 @@ CURVE, SUCCESS, LIMIT = (255, 170, 70), (110, 210, 130), (200, 90, 90)
 """RGB colours of the background, tiles, text and faint text and lines; of the force curve, success and force limit."""
 
 
-def film_frames(take: Take) -> Iterator[Image.Image]:
-    """The frames of a film, one for each shot."""
+def video_frames(take: Take) -> Iterator[Image.Image]:
+    """The frames of a video, one for each shot."""
     for shot in take.shots:
-        yield film_frame(take, shot)
+        yield video_frame(take, shot)
 
 
-def film_frame(take: Take, shot: Shot) -> Image.Image:
-    """One frame of a film: an image of `SIZE` for a shot of a take."""
+def video_frame(take: Take, shot: Shot) -> Image.Image:
+    """One frame of a video: an image of `SIZE` for a shot of a take."""
     frame = Image.new("RGB", SIZE, GROUND)
     _draw_title(ImageDraw.Draw(frame), take, shot.step)
     images = dict(shot.images)

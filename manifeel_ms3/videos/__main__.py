@@ -1,11 +1,11 @@
-"""Make a film of recorded or evaluated episodes: `manifeel film trajectory.h5 --out peg.mp4`.
+"""Make a video of recorded or evaluated episodes: `manifeel video trajectory.h5 --out peg.mp4`.
 
-A film shows the scene, the image of a camera, TacRGB (the image of the camera in the finger pad), TacFF (the forces on the
+A video shows the scene, the image of a camera, TacRGB (the image of the camera in the finger pad), TacFF (the forces on the
 pad; arrows are shear) and the contact force over time, under the names of task, episode and seed:
 
-    manifeel film trajectory.h5 --episode 3 --out peg.mp4
-    manifeel film runs/peg/evaluation.json --out evaluated.mp4
-    manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
+    manifeel video trajectory.h5 --episode 3 --out peg.mp4
+    manifeel video runs/peg/evaluation.json --out evaluated.mp4
+    manifeel video peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
 
 The episode of a trajectory file is replayed from its actions, and every image is rendered anew, so that the file needs no
 observations. A result holds no actions: its episode is run again with the policy, from `checkpoints/last` beside the result if
@@ -33,21 +33,21 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
 
-from .shots import FilmingWrapper, Take, View, filming_env, shown_steps
+from .shots import Take, VideoWrapper, View, shown_steps, video_env
 
 log = logging.getLogger(__name__)
 SMALLEST = dict(max_frames=2, fps=1, width=64)
-"""Smallest values of the arguments: a film has a first and a last frame, and captions must be readable (chosen)."""
+"""Smallest values of the arguments: a video has a first and a last frame, and captions must be readable (chosen)."""
 
 
 @dataclass
 class Args:
-    """Make a film of recorded or evaluated episodes."""
+    """Make a video of recorded or evaluated episodes."""
 
     files: tyro.conf.Positional[tuple[Path, ...]]
-    """Paths of trajectory files (.h5), or of results of evaluations (.json); the film shows one episode of each."""
-    out: Path = Path("film.mp4")
-    """Path of the film, which ends in .mp4, .webp or .gif."""
+    """Paths of trajectory files (.h5), or of results of evaluations (.json); the video shows one episode of each."""
+    out: Path = Path("video.mp4")
+    """Path of the video, which ends in .mp4, .webp or .gif."""
     episode: int = 0
     """Number of the episode in each file, from 0."""
     camera: str | None = None
@@ -57,9 +57,9 @@ class Args:
     max_frames: int | None = None
     """Largest number of frames of each episode; every control step is a frame if not given."""
     fps: int = CONTROL_FREQ
-    """Frames per second. A film of every control step at 10 runs as fast as the episode did."""
+    """Frames per second. A video of every control step at 10 runs as fast as the episode did."""
     width: int | None = None
-    """Width of the film, in pixels; 1048 if not given."""
+    """Width of the video, in pixels; 1048 if not given."""
     checkpoint: Path | None = None
     """Checkpoint folder of the policy of a result; checkpoints/last beside the result if not given."""
     policy: str | None = None
@@ -102,7 +102,7 @@ class Source:
 
 
 def main(args: Args) -> Path:
-    """Make a film, and return its path.
+    """Make a video, and return its path.
 
     Raises:
         InvalidArgumentError: An argument is not allowed, or a file has no such episode.
@@ -110,17 +110,17 @@ def main(args: Args) -> Path:
         ResultError: A result cannot be used.
         CheckpointError: The checkpoint of a result is missing or broken.
         MachineError: This machine has no renderer.
-        MissingExtraError: The extra `report`, which encodes films, is not installed.
-        FileWriteError: The film cannot be written.
+        MissingExtraError: The extra `report`, which encodes videos, is not installed.
+        FileWriteError: The video cannot be written.
     """
     with missing_extras_named():
-        from .film_file import check_film_path, write_film
-        from .layout import film_frames
-    check_film_path(args.out)
+        from .layout import video_frames
+        from .video_file import check_video_path, write_video
+    check_video_path(args.out)
     _check(args)
     sources = [read_source(path, args.episode) for path in args.files]
-    takes = [_film(source, args) for source in sources]
-    write_film([list(film_frames(take)) for take in takes], args.out, args.fps, args.width)
+    takes = [_take(source, args) for source in sources]
+    write_video([list(video_frames(take)) for take in takes], args.out, args.fps, args.width)
     return args.out
 
 
@@ -159,8 +159,8 @@ def read_source(path: Path, episode: int) -> Source:
     return Source(path, env_id, kwargs, content["episodes"][episode], is_result, inference)
 
 
-def _film(source: Source, args: Args) -> Take:
-    """Run an episode again and film it.
+def _take(source: Source, args: Args) -> Take:
+    """Run an episode again, and take the shots of its video.
 
     Raises:
         DemonstrationError: The recorded actions now fail where they succeeded before, or the other way round.
@@ -172,8 +172,8 @@ def _film(source: Source, args: Args) -> Take:
     steps = shown_steps(source.length, args.max_frames)
     with progress_bar() as bar:
         counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
-        with closing(filming_env(source.env_id, source.env_kwargs, view)) as env:
-            filmed = FilmingWrapper(env, take, view, steps, lambda: bar.advance(counter))
+        with closing(video_env(source.env_id, source.env_kwargs, view)) as env:
+            filmed = VideoWrapper(env, take, view, steps, lambda: bar.advance(counter))
             if source.is_result:
                 evaluate_episode(filmed, _policy(source, args), source.seed, on_step=lambda _obs: None)
             else:
@@ -183,7 +183,7 @@ def _film(source: Source, args: Args) -> Take:
     return take
 
 
-def _replay(env: FilmingWrapper, source: Source) -> None:
+def _replay(env: VideoWrapper, source: Source) -> None:
     path = source.path.with_suffix(".h5")
     with open_trajectories(path) as file:
         actions = file[f"traj_{source.entry['episode_id']}/actions"][()]

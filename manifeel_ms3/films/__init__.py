@@ -1,1 +1,0 @@
-"""Films of recorded and evaluated episodes: scene, policy camera, touch and contact force side by side."""
