@@ -4,6 +4,7 @@ A `ManifeelError` is printed as one line, followed by the path of a page about c
 of the program and keeps its traceback.
 """
 
+import atexit
 import gc
 import json
 import logging
@@ -45,6 +46,9 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             the command made, and what one can do with it.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    atexit.register(
+        gc.freeze
+    )  # otherwise the interpreter searches all objects of torch for garbage as it ends, which takes 1.4 s
     try:
         import_typed_tasks(args)
         answer = main(args)
@@ -52,7 +56,6 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             log.info("%s", next_step(args, answer))
     except KeyboardInterrupt:
         sys.stderr.write("stopped\n")
-        gc.freeze()  # otherwise the interpreter searches all objects of torch for garbage as it ends, which takes 1.4 s
         return INTERRUPTED
     except ManifeelError as error:
         if os.environ.get(TRACEBACK):

@@ -18,7 +18,6 @@ from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
-from manifeel_ms3.tasks.obs_modes import announce_images_of_workers
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
@@ -120,7 +119,6 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
             log.info("%s already holds %d episodes", path, len(recording.infos))
             return path
         recording.begin()
-        announce_images_of_workers(env_kwargs)
         with (
             episode_counter(f"recording {args.env_id}", args.num, len(recording.infos), on_episode) as count,
             WorkerPool(args.workers, partial(make_recorder, args.env_id, env_kwargs, recording.drafts)) as pool,

@@ -24,7 +24,6 @@ import tyro
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import episode_counter
-from manifeel_ms3.tasks.obs_modes import announce_images_of_workers
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
@@ -91,7 +90,6 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
             log.info("%s already holds %d episodes", args.out, len(recording.infos))
             return args.out
         recording.begin()
-        announce_images_of_workers(env_kwargs)
         with (
             episode_counter(f"rendering {env_id}", len(episodes), len(recording.infos), on_episode) as count,
             WorkerPool(args.workers, partial(make_recorder, env_id, env_kwargs, recording.drafts, source_kwargs)) as pool,

@@ -11,7 +11,6 @@ from typing import Any
 import gymnasium as gym
 
 from manifeel_ms3.progress import progress_bar
-from manifeel_ms3.tasks.obs_modes import announce_images_of_workers
 from manifeel_ms3.tasks.registry import make_env
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
 
@@ -65,7 +64,6 @@ def run_episodes(
     """
     if not seeds:
         return []
-    announce_images_of_workers(evaluation.env_kwargs)
     source = evaluation.source
     shared = PolicyProcess(source, evaluation.step_timeout) if source.is_shared else nullcontext()
     outcomes: dict[int, EpisodeOutcome] = {}

@@ -3,7 +3,6 @@
 import functools
 import gc
 import logging
-import multiprocessing
 import os
 
 import sapien
@@ -65,25 +64,6 @@ def use_one_thread_after_fork() -> None:
     """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's other threads."""
     if os.getpid() != _IMPORTED_IN:
         torch.set_num_threads(1)
-
-
-@functools.cache
-def announce_first_image(backend: str) -> None:
-    """Log once, in the main process, why the first image on a CPU takes long: SAPIEN prepares its renderer in each process."""
-    if backend == "cpu" and multiprocessing.parent_process() is None:
-        log.warning("Preparing the renderer on the CPU, once in this process; this takes about 10 seconds.")
-
-
-@functools.cache
-def announce_first_images_of_workers(asked: str = "auto") -> None:
-    """Log once, in the main process, why the first images of worker processes take long, without starting a renderer here.
-
-    Args:
-        asked: The `render_backend` of their environments.
-    """
-    on_cpu = asked == "cpu" or (asked == "auto" and not torch.cuda.is_available())
-    if on_cpu and multiprocessing.parent_process() is None:
-        log.warning("Preparing the renderer on the CPU, once in each worker process; this takes about 10 seconds.")
 
 
 @functools.cache

@@ -1,11 +1,8 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
-from typing import Any
-
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.rendering.backend import announce_first_images_of_workers
 
 PAD = "tactile_"
 """Prefix of the names of tactile pads among the sensors of an observation."""
@@ -20,20 +17,6 @@ WHOLE_MODES = ("none", "sensor_data", "pointcloud", "rgbd")
 def has_images(own_mode: str) -> bool:
     """Whether ManiSkill's own part of an `obs_mode` holds images of cameras."""
     return own_mode not in ("none", *STATE_TOKENS)
-
-
-def announce_images_of_workers(env_kwargs: dict[str, Any]) -> None:
-    """Log why the first image of worker processes takes long, if it does; call it before they make their environments.
-
-    Args:
-        env_kwargs: Arguments of their environments.
-
-    Raises:
-        InvalidArgumentError: The `obs_mode` is not allowed.
-    """
-    own_mode, _ = split_obs_mode(env_kwargs.get("obs_mode") or "state")
-    if has_images(own_mode):
-        announce_first_images_of_workers(env_kwargs.get("render_backend", "auto"))
 
 
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:

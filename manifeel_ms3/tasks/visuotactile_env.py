@@ -19,7 +19,6 @@ from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import (
     FORKED,
     NO_RENDERER,
-    announce_first_image,
     available_render_backend,
     renderer_lost,
     use_one_thread_after_fork,
@@ -183,8 +182,6 @@ class VisuotactileEnv(SceneryEnv):
     def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
         if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):
             raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
-        if has_images(own_mode):
-            announce_first_image(backend)
 
     @staticmethod
     def _wanted_images(own_mode: str, render_mode: str | None) -> str:

@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 import psutil
 import pytest
-import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
@@ -23,7 +22,7 @@ from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
-from tests.tasks_and_marks import PEG, needs_renderer
+from tests.tasks_and_marks import PEG
 from tests.trajectories import bytes_of
 
 EASY = dict(fit="paper", render_backend="none")
@@ -60,27 +59,6 @@ def test_file_holds_what_maniskill_expects(recorded):
             assert episode["peak_contact_force"] < 60
     assert not episode_folder(recorded).exists()
     assert header["commit_info"] == (git_commit() and dict(commit_id=git_commit()))
-
-
-@needs_renderer
-@pytest.mark.skipif(torch.cuda.is_available(), reason="only renderers on the CPU take long to prepare")
-def test_the_main_process_says_why_the_first_images_of_its_workers_take_long(tmp_path):
-    program = (
-        "from manifeel_ms3 import cli\n"
-        "if __name__ == '__main__':\n"  # worker processes import this file
-        "    for obs_mode in ('tacff', 'rgb'):\n"
-        "        print(obs_mode, flush=True)\n"
-        f"        cli.main(['record', '{PEG}', '-n', '1', '--obs-mode', obs_mode, '--workers', '2', '--tactile-sensors',\n"
-        f"            'right', '--out', obs_mode + '.h5'])\n"
-    )
-    (tmp_path / "program.py").write_text(program)
-    command = [sys.executable, "program.py"]
-    done = subprocess.run(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=True)
-    with_touch, with_images = done.stdout.split("rgb\n", 1)
-    notice = "Preparing the renderer on the CPU, once in each worker process"
-    assert notice not in with_touch
-    assert done.stdout.count("Preparing the renderer") == 1
-    assert with_images.index(notice) < with_images.index("recording")
 
 
 def test_another_sensor_is_recorded_and_named(recorded, tmp_path):

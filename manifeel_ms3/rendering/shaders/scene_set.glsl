@@ -47,4 +47,4 @@ layout(set = SET_NUM, binding = 4) uniform sampler2D samplerSpotLightDepths[10];
 layout(set = SET_NUM, binding = 5) uniform sampler2D samplerTexturedLightDepths[1];
 layout(set = SET_NUM, binding = 6) uniform sampler2D samplerTexturedLightTextures[1];
 layout(set = SET_NUM, binding = 7) uniform samplerCube samplerEnvironment;
-layout(set = SET_NUM, binding = 8) uniform sampler2D samplerBRDFLUT;
+// Binding 8, samplerBRDFLUT, is left out: where it is declared, SAPIEN first computes its table, for 10 s on a CPU.
