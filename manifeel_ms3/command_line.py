@@ -46,9 +46,7 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             the command made, and what one can do with it.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    atexit.register(
-        gc.freeze
-    )  # otherwise the interpreter searches all objects of torch for garbage as it ends, which takes 1.4 s
+    atexit.register(gc.freeze)  # else the interpreter searches all objects of torch for garbage as it ends, for about 1 s
     try:
         import_typed_tasks(args)
         answer = main(args)

@@ -1,5 +1,7 @@
 """What the cameras show: the room, the light, the surfaces, and the same depth and ids as with ManiSkill's shaders."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ import trimesh
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.presentation import drawn_sizes
+from manifeel_ms3.rendering.shader_pack import SHADER_PACK
 from manifeel_ms3.rendering.table import PIXELS, boards, table_mesh
 from manifeel_ms3.sensors.depth.surfaces import scene_surfaces
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
@@ -122,3 +125,8 @@ def test_the_tables_mesh_is_the_box_that_collides():
     mesh = trimesh.load(table_mesh((1.6, 1.6, 0.04)), force="mesh")
     assert mesh.extents == pytest.approx([1.6, 1.6, 0.04])
     assert mesh.volume == pytest.approx(1.6 * 1.6 * 0.04)  # and its triangles look outwards
+
+
+def test_the_shaders_declare_no_table_that_sapien_would_compute_before_the_first_image():
+    """On a CPU that takes 10 s in each process."""
+    assert [path.name for path in Path(SHADER_PACK).iterdir() if "sampler2D samplerBRDFLUT" in path.read_text()] == []
