@@ -196,7 +196,7 @@ env = gym.make("{spec.env_id}", obs_mode="rgb+tacrgb+tacff")
 
 ```bash
 manifeel record {spec.env_id} -n 2 --out {spec.name}.h5
-manifeel video {spec.name}.h5 --out {spec.name}.mp4
+manifeel film {spec.name}.h5 --out {spec.name}.mp4
 ```
 """
 

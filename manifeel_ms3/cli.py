@@ -39,7 +39,7 @@ COMMANDS = {
     "render-observations": Command("manifeel_ms3.demonstrations.render_observations", "Add observations to recorded states."),
     "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files."),
     "view": Command("manifeel_ms3.demonstrations.view", "Look at a recorded episode in Rerun."),
-    "video": Command("manifeel_ms3.videos.__main__", "Make a video of recorded or evaluated episodes."),
+    "film": Command("manifeel_ms3.videos.__main__", "Make a video of recorded or evaluated episodes."),
     "summary": Command("manifeel_ms3.demonstrations.summary", "Summarize the content of a recorded file."),
     "export": Command("manifeel_ms3.demonstrations.export", "Export demonstrations to LeRobot, the paper's zarr, or npz."),
     "eval": Command("manifeel_ms3.evaluation.evaluate", "Evaluate a policy on fixed seeds."),

@@ -72,7 +72,7 @@ def test_an_mp4_has_every_frame(tmp_path):
 @needs_renderer
 def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
     out = tmp_path / "peg.webp"
-    assert cli.main(["video", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
+    assert cli.main(["film", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
     with Image.open(out) as video:
         assert video.size == (524, 260)
         video.seek(video.n_frames - 1)
@@ -92,20 +92,20 @@ def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_filmed_is_refused_in_one_line(arguments, said, capsys):
-    assert cli.main(["video", str(FILE), *arguments]) == 1
+    assert cli.main(["film", str(FILE), *arguments]) == 1
     error = capsys.readouterr().err
     assert said in error
     assert len(error.splitlines()) == 2  # the error, and where there is more
 
 
 def test_a_file_that_is_not_there(tmp_path, capsys):
-    assert cli.main(["video", str(tmp_path / "x.h5")]) == 1
+    assert cli.main(["film", str(tmp_path / "x.h5")]) == 1
     assert "x.h5 does not exist" in capsys.readouterr().err
 
 
 def test_a_result_without_its_policy_says_what_to_give(tmp_path, capsys):
     shutil.copy("tests/trust/result.json", tmp_path / "evaluation.json")
-    assert cli.main(["video", str(tmp_path / "evaluation.json")]) == 1
+    assert cli.main(["film", str(tmp_path / "evaluation.json")]) == 1
     assert "give its --checkpoint or --policy" in capsys.readouterr().err
 
 

@@ -118,7 +118,7 @@ def next_step(args: Args, failed: int) -> str:
     """What the command found, and what one can do next."""
     if failed:
         return f"{args.path} does not repeat on this machine; `manifeel validate {args.path}` checks whether the file is sound"
-    return f"{args.path} repeats on this machine; `manifeel video {args.path} --out FILE.mp4` shows an episode"
+    return f"{args.path} repeats on this machine; `manifeel film {args.path} --out FILE.mp4` shows an episode"
 
 
 if __name__ == "__main__":

@@ -135,7 +135,7 @@ def _size_table(sizes: dict[str, int], episodes: int) -> Table:
 
 def next_step(args: Args, _answer: None) -> str:
     """What one can do with the file."""
-    return f"`manifeel validate {args.file}` checks the file, `manifeel video {args.file} --out FILE.mp4` shows an episode"
+    return f"`manifeel validate {args.file}` checks the file, `manifeel film {args.file} --out FILE.mp4` shows an episode"
 
 
 if __name__ == "__main__":

@@ -287,9 +287,7 @@ def next_step(_args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     episodes = read_result(made)["episodes"]
     outcome = f"{made}: {sum(episode['success_once'] for episode in episodes)} of {len(episodes)} episodes succeed"
-    return (
-        f"{outcome}; `manifeel video {made} --out FILE.mp4` shows one, `manifeel results` sets all results beside the paper's"
-    )
+    return f"{outcome}; `manifeel film {made} --out FILE.mp4` shows one, `manifeel results` sets all results beside the paper's"
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""Make a video of recorded or evaluated episodes: `manifeel video trajectory.h5 --out peg.mp4`.
+"""Make a video of recorded or evaluated episodes: `manifeel film trajectory.h5 --out peg.mp4`.
 
 A video shows the scene, the image of a camera, TacRGB (the image of the camera in the finger pad), TacFF (the forces on the
 pad; arrows are shear) and the contact force over time, under the names of task, episode and seed:
 
-    manifeel video trajectory.h5 --episode 3 --out peg.mp4
-    manifeel video runs/peg/evaluation.json --out evaluated.mp4
-    manifeel video peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
+    manifeel film trajectory.h5 --episode 3 --out peg.mp4
+    manifeel film runs/peg/evaluation.json --out evaluated.mp4
+    manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
 
 The episode of a trajectory file is replayed from its actions, and every image is rendered anew, so that the file needs no
 observations. A result holds no actions: its episode is run again with the policy, from `checkpoints/last` beside the result if
