@@ -9,4 +9,7 @@ try:
     from . import tasks as tasks
 finally:
     if _collects:
+        if not gc.get_freeze_count():
+            gc.freeze()  # these two calls hand what was imported to the oldest generation, without a search of it
+            gc.unfreeze()
         gc.enable()

@@ -1,15 +1,14 @@
 """The package that docs/extending.md shows, installed as a third party's, works in real processes with nothing stubbed."""
 
 import json
-import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.command_process import run_module
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.third_party import entry_points_of, install
 
@@ -26,9 +25,7 @@ grids:
 
 def manifeel(site: Path, *arguments: object) -> subprocess.CompletedProcess:
     """Run a command in a process that finds what is installed at `site`."""
-    environment = os.environ | dict(PYTHONPATH=f"{site}:{REPOSITORY}", OMP_NUM_THREADS="1", COLUMNS="200")
-    command = [sys.executable, "-m", "manifeel_ms3.cli", *map(str, arguments)]
-    return subprocess.run(command, cwd=site, env=environment, capture_output=True, text=True, check=False)
+    return run_module("manifeel_ms3.cli", *arguments, folder=site, OMP_NUM_THREADS="1", COLUMNS="200")
 
 
 def done(site: Path, *arguments: object) -> str:

@@ -1,14 +1,12 @@
-"""The renderer that this process can use, and messages for users where it has none or starts slowly."""
+"""The renderer that this process can use, and messages for users where it has none."""
 
 import functools
 import gc
-import logging
 import os
 
 import sapien
 import torch
 
-log = logging.getLogger(__name__)
 NO_RENDERER = (
     "no Vulkan renderer was found, and {wanted} needs one. Without a GPU, install Mesa 24.3 or newer (Debian 12: "
     "`apt install -t bookworm-backports mesa-vulkan-drivers` and `apt install libvulkan1 libegl1 libgl1`; Ubuntu 24.04: "

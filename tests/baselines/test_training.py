@@ -177,9 +177,10 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_pat
 
 
 @pytest.mark.parametrize("run", QUICK, indirect=True)
-def test_bf16_agrees_with_fp32(run, checkpoint, tmp_path):
-    run.again(run_dir=tmp_path, precision="bf16")
-    for half, full in zip(log_of(tmp_path), log_of(run.args.run_dir), strict=True):
+def test_bf16_agrees_with_fp32(run, tmp_path):
+    for precision in ("bf16", "fp32"):
+        run.again(run_dir=tmp_path / precision, precision=precision, steps=30, log_freq=10)
+    for half, full in zip(log_of(tmp_path / "bf16"), log_of(tmp_path / "fp32"), strict=True):
         assert half["losses/total_loss"] == pytest.approx(full["losses/total_loss"], rel=0.1, abs=1e-3)
 
 
