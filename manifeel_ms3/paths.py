@@ -8,7 +8,7 @@ from pathlib import Path
 import platformdirs
 
 from .errors import MachineError
-from .files import write_text
+from .files import atomic_write
 
 CACHE_DIR = "MANIFEEL_CACHE_DIR"
 """Environment variable that names the folder of derived assets."""
@@ -65,18 +65,19 @@ def writable_cache() -> Iterator[Path]:
         ) from error
 
 
-def derived_file(name: str, make: Callable[[], str]) -> Path:
-    """Path of a text file among the derived assets, which is made where it is missing.
+def derived_file(name: str, make: Callable[[], str | bytes]) -> Path:
+    """Path of a file among the derived assets, which is made where it is missing.
 
     Args:
         name: Path of the file in the folder of derived assets.
-        make: Function that returns the text.
+        make: Function that returns the content, as a text or as bytes.
 
     Raises:
         MachineError: The file cannot be written.
     """
     path = cache_dir() / name
     if not path.is_file():
-        with writable_cache():
-            write_text(path, make())
+        with writable_cache(), atomic_write(path) as partial:
+            content = make()
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
     return path

@@ -1,14 +1,13 @@
 """A task in a module of the working folder is found where its id is typed on a command line, and nowhere else."""
 
 import json
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-REPOSITORY = Path(__file__).parents[1]
+from tests.command_process import run_module
+
 MODULE = '''
 from manifeel_ms3.experts.object_search import ObjectSearchExpert
 from manifeel_ms3.tasks.exploration.object_search import ObjectSearchEnv
@@ -30,18 +29,15 @@ def folder(tmp_path) -> Path:
     return tmp_path
 
 
-def manifeel(folder: Path, *arguments: str, python=("-P", "-m", "manifeel_ms3.cli")) -> subprocess.CompletedProcess:
+def manifeel(folder: Path, *arguments: str, module: str = "manifeel_ms3.cli") -> subprocess.CompletedProcess:
     """The installed command, which has no working folder on its path."""
-    environment = os.environ | dict(PYTHONPATH=str(REPOSITORY))
-    command = [sys.executable, *python, *arguments]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    return run_module(module, *arguments, folder=folder, on_path=False)
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
 def test_a_task_is_shown_where_its_module_is_typed_with_it(folder):
     shown = manifeel(folder, "tasks", "my_task:MyLab-Press-v1")
     assert "Press the button of my laboratory" in shown.stdout, shown.stderr
-    by_module = manifeel(folder, "my_task:MyLab-Press-v1", python=("-P", "-m", "manifeel_ms3.tasks"))
+    by_module = manifeel(folder, "my_task:MyLab-Press-v1", module="manifeel_ms3.tasks")
     assert "Press the button of my laboratory" in by_module.stdout, by_module.stderr
     without = manifeel(folder, "tasks", "MyLab-Press-v1")
     assert "'MyLab-Press-v1' is not registered" in without.stderr
@@ -49,7 +45,6 @@ def test_a_task_is_shown_where_its_module_is_typed_with_it(folder):
     assert "the module 'no_task' of the task 'no_task:MyLab-Press-v1' is neither installed nor in the" in missing.stderr
 
 
-@pytest.mark.skipif(sys.version_info < (3, 11), reason="the option -P is of Python 3.11")
 def test_it_is_recorded_by_worker_processes_and_its_file_imports_nothing(folder):
     bare = ("--obs-mode", "none", "--env-kwargs", json.dumps(dict(render_backend="none")))
     recorded = manifeel(folder, "record", "my_task:MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)

@@ -1,9 +1,11 @@
 """The table top of wooden boards: its texture, which is painted here, and its mesh with the texture's coordinates."""
 
 import functools
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
 from sapien.render import RenderMaterial, RenderTexture2D
@@ -62,9 +64,15 @@ def wood() -> RenderMaterial:
 
 @functools.cache
 def wood_texture(seed: int) -> RenderTexture2D:
-    """Texture of the table, painted once in a process; seed 0 is the usual one."""
-    pixels = np.dstack([boards(seed), np.full((PIXELS, PIXELS), 255, np.uint8)])
+    """Texture of the table, painted once and kept among the derived assets; seed 0 is the usual one."""
+    pixels = cv2.cvtColor(cv2.imread(str(_painted(seed))), cv2.COLOR_BGR2RGBA)
     return RenderTexture2D(pixels, "R8G8B8A8Unorm", mipmap_levels=int(np.log2(PIXELS)) + 1, srgb=True)
+
+
+def _painted(seed: int) -> Path:
+    """Path of a picture of the boards; its name is a hash of how they are painted."""
+    how = hashlib.sha256(repr((BOARDS, WOOD, ROWS, PIXELS, seed)).encode()).hexdigest()[:16]
+    return derived_file(f"parts/boards-{how}.png", lambda: cv2.imencode(".png", boards(seed)[..., ::-1])[1].tobytes())
 
 
 def boards(seed: int) -> np.ndarray:

@@ -60,11 +60,11 @@ def run(request, demos, tmp_path_factory):
         policy=dataclasses.replace(paper.policy, **small),
         inference_steps=20,
         batch_size=32,
-        steps=120,
+        steps=60,
         lr=1e-3,
         warmup_steps=5,
-        save_freq=60,
-        log_freq=30,
+        save_freq=30,
+        log_freq=15,
         device="cpu",
         precision="fp32",
         compile=False,
@@ -108,7 +108,7 @@ def test_diffusion_policy_has_the_public_codes_learning_rate_for_each_encoder(mo
 
 def test_loss_falls(run, checkpoint):
     log = log_of(run.args.run_dir)
-    assert [entry["step"] for entry in log] == [30, 60, 90, 120]
+    assert [entry["step"] for entry in log] == [15, 30, 45, 60]
     assert {"losses/total_loss", "charts/learning_rate"} <= set(log[0])
     consistency = getattr(run.args.policy, "consistency", False)  # its loss is a small disagreement, and noisy
     assert min(entry["losses/total_loss"] for entry in log) < (0.9 if consistency else 0.8) * log[0]["losses/total_loss"]
@@ -122,8 +122,8 @@ def test_checkpoints_hold_the_arguments_of_the_recorded_task(run, checkpoint):
 
 def test_checkpoints_are_json_and_safetensors(run, checkpoint):
     assert {file.name for file in checkpoint.iterdir()} == {"config.json", "model.safetensors", "training.safetensors"}
-    assert checkpoint_config(checkpoint)["step"] == 120
-    older = run.args.run_dir / "checkpoints/00000060"
+    assert checkpoint_config(checkpoint)["step"] == 60
+    older = run.args.run_dir / "checkpoints/00000030"
     assert {file.name for file in older.iterdir()} == {"config.json", "model.safetensors"}  # only the last can be resumed
 
 
@@ -142,9 +142,9 @@ def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkey
         patch.setattr(training, "prune", stop)  # it is called after the first checkpoint
         with pytest.raises(KeyboardInterrupt):
             run.again(run_dir=tmp_path)
-    assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60
+    assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 30
     resumed = run.again(run_dir=tmp_path, resume=True)
-    assert checkpoint_config(resumed)["step"] == 120
+    assert checkpoint_config(resumed)["step"] == 60
     whole, second = read_tensors(checkpoint / "model.safetensors"), read_tensors(resumed / "model.safetensors")
     assert all(torch.equal(whole[name], second[name]) for name in whole)
     assert log_of(tmp_path) == log_of(run.args.run_dir)

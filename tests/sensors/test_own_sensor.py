@@ -1,15 +1,13 @@
 """The package with one sensor that docs/sensor.md shows, installed as a third party's."""
 
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.command_process import run_code
 from tests.third_party import install, own_sensor
 
-REPOSITORY = Path(__file__).parents[2]
 TOUCH = """
 import gymnasium, manifeel_ms3
 from manifeel_ms3.sensors import sensor_names
@@ -24,8 +22,7 @@ print(levels.min().item(), levels.max().item(), env.unwrapped.agent.finger.size)
 
 
 def python(site: Path, code: str) -> subprocess.CompletedProcess:
-    environment = os.environ | dict(PYTHONPATH=f"{site}:{REPOSITORY}", OMP_NUM_THREADS="1")
-    return subprocess.run([sys.executable, "-c", code], cwd=site, env=environment, capture_output=True, text=True, check=False)
+    return run_code(code, folder=site, OMP_NUM_THREADS="1")
 
 
 @pytest.fixture

@@ -1,9 +1,7 @@
 """A file that names code has none of it imported or run."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -18,10 +16,11 @@ from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.policy import PolicySource, load_policy
+from tests.command_process import run_module
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
 
-from .files_of_strangers import EXECUTED, REPOSITORY, SAMPLE, rewrite_json
+from .files_of_strangers import EXECUTED, SAMPLE, rewrite_json
 
 # ------------------------------------------------------------------ checkpoints name policies, never code
 
@@ -82,10 +81,7 @@ def naming(env_id: str, name: str, folder: Path) -> Path:
 
 def test_a12_replay_from_the_command_line_imports_no_module_of_the_file(gadget):
     path = naming("gadget:ManiFeel-PegInsertion-v1", "states", gadget)
-    command = [sys.executable, "-m", "manifeel_ms3.demonstrations.replay", str(path), "--num", "1"]
-    done = subprocess.run(
-        command, env=os.environ | {"PYTHONPATH": str(REPOSITORY)}, capture_output=True, text=True, check=False
-    )
+    done = run_module("manifeel_ms3.demonstrations.replay", path, "--num", 1, folder=gadget)
     assert "of 1 episodes succeed again" in done.stdout + done.stderr
     assert not (gadget / "executed").exists()
 
