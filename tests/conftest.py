@@ -13,18 +13,13 @@ from tests.tasks_and_marks import PEG
 from tests.tiny_study import TINY
 
 torch.set_num_threads(1)
-LONG = (
-    "test_studies",
-    "test_extending",
-    "test_end_to_end",
-    "test_doctor",
-    "test_page",
-)  # files with a few tests of minutes each
+LONG = ("test_studies", "test_training", "test_end_to_end", "test_recordings", "test_experts", "test_engine", "test_record")
+"""Names of files whose tests take minutes; they come in this order, so that none is left for the end."""
 
 
 def pytest_collection_modifyitems(items):
     """Run long files first, so that no process waits for one at the end; skip tests marked `gpu` where there is none."""
-    items.sort(key=lambda item: item.path.stem not in LONG)
+    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu"):
