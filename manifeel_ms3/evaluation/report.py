@@ -46,6 +46,7 @@ RATES = {
     "success_once": "success at any step",
     "success_at_end": "success at the end",
     "gentle_success": "gentle success",
+    "success_paper": "success by the threshold of the paper's public code",
     "fail_once": "failure at any step",
     "fail_at_end": "failure at the end",
 }

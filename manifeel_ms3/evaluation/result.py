@@ -97,6 +97,8 @@ def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dic
     summary: dict[str, Any] = dict(stop_at_success=not to_the_end)
     for name in ("success_once", "fail_once", *(ONLY_TO_THE_END if to_the_end else ())):
         summary[name] = _rate([episode[name] for episode in episodes])
+    if any("success_paper" in episode for episode in episodes):  # of which nothing could be measured have none
+        summary["success_paper"] = _rate([episode.get("success_paper", False) for episode in episodes])
     if force_limit is not None:
         gentle = [is_gentle(episode, force_limit) for episode in episodes]
         summary |= dict(force_limit=force_limit, gentle_success=_rate(gentle))

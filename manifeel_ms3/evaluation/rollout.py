@@ -42,6 +42,9 @@ class EpisodeOutcome:
     """Whether the task failed at any step, that is, could not be solved any more."""
     fail_at_end: bool | None = None
     """Whether the task had failed at the last step; None if the episode was stopped at success or failure."""
+    success_paper: bool | None = None
+    """Whether the threshold of the paper's public code was met at any step (`info["success_paper"]`); None for a task without
+    one, and if the episode was stopped at success or failure."""
     first_success: int | None = None
     """Number of control steps until the first success; None without success."""
     return_: float = 0.0
@@ -65,8 +68,8 @@ class EpisodeOutcome:
 
 ONLY_TO_THE_END = ("success_at_end", "fail_at_end")
 """Fields of an outcome that exist only where episodes run to the time limit."""
-NOT_ALWAYS = (*ONLY_TO_THE_END, "ending")
-"""Fields of an outcome that result files may lack; those of earlier versions lack the ending."""
+NOT_ALWAYS = (*ONLY_TO_THE_END, "success_paper", "ending")
+"""Fields of an outcome that result files may lack; earlier files lack the last two."""
 
 
 def failed_outcome(seed: int, error: str | None, stop_at_success: bool) -> EpisodeOutcome:
@@ -189,6 +192,7 @@ class _Metrics:
             shortcoming: What is missing if the episode neither succeeded nor was lost.
         """
         won = error is None and self.first_success is not None
+        by_paper = self.last.get("success_paper") if to_the_end else None
         ending = "error" if error else "success" if won else "lost" if self.fail_once else shortcoming
         return EpisodeOutcome(
             seed=self.seed,
@@ -196,6 +200,7 @@ class _Metrics:
             success_at_end=won and self.success if to_the_end else None,
             fail_once=self.fail_once,
             fail_at_end=self.fail if to_the_end else None,
+            success_paper=None if by_paper is None else error is None and bool(by_paper),
             first_success=self.first_success if won else None,
             return_=round(self.returned, MEAN_DECIMALS),
             reward=round(self.returned / max(self.steps, 1), MEAN_DECIMALS),

@@ -130,12 +130,13 @@ def _faults_of_the_numbers(result: dict[str, Any]) -> list[str]:
     faults = ["its episodes end at success; evaluate without --stop-at-success"] if result["stop_at_success"] else []
     if len(lengths := {episode["episode_len"] for episode in episodes if not episode["error"]}) > 1:
         faults.append(f"its episodes without an error have from {min(lengths)} to {max(lengths)} steps, but one time limit")
-    for name, expected in summary_of(episodes, spec.force_limit).items():
-        given = result.get(name)
+    summary = summary_of(episodes, spec.force_limit)
+    for name in [*summary, *(name for name in ("success_paper", "gentle_success") if name in result and name not in summary)]:
+        expected, given = summary.get(name), result.get(name)
         if isinstance(expected, dict):
             agrees = isinstance(given, dict) and all(abs(given[part] - expected[part]) <= RATE_TOLERANCE for part in expected)
         else:
-            agrees = given is not None and abs(given - expected) <= RATE_TOLERANCE
+            agrees = expected is not None and given is not None and abs(given - expected) <= RATE_TOLERANCE
         if not agrees:
             faults.append(f"{name} says {given}, its episodes come to {expected}")
     return faults + [fault for episode in episodes for fault in _faults_of_an_episode(episode, spec)]
@@ -149,7 +150,7 @@ def _faults_of_an_episode(episode: dict[str, Any], spec: TaskSpec) -> list[str]:
     for what in ("success", "fail"):
         if episode.get(f"{what}_at_end") and not episode[f"{what}_once"]:
             faults.append(f"{place}: {what} at the end, but never")
-    if episode["success_once"] and (episode["error"] or length == 0):
+    if (episode["success_once"] or episode.get("success_paper")) and (episode["error"] or length == 0):
         faults.append(f"{place}: succeeds after {length} steps, with the error {episode['error']}")
     if (first is not None, force is not None) != (episode["success_once"],) * 2 or (first or 0) > length:
         faults.append(f"{place}: its first success is at step {first} of {length}, with {force} N until then")

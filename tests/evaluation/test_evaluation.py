@@ -16,7 +16,7 @@ from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
 from manifeel_ms3.evaluation.policy import PolicySource, load_policy
 from manifeel_ms3.evaluation.result import summary_of
-from manifeel_ms3.evaluation.rollout import outcome_as_json, outcome_from_json
+from manifeel_ms3.evaluation.rollout import failed_outcome, outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
@@ -62,6 +62,7 @@ def test_an_episode_runs_to_the_time_limit_and_its_end_is_not_its_success(pulled
     assert outcome.episode_len == LIMIT
     assert 20 < outcome.first_success < LIMIT
     assert 5 < outcome.force_until_success <= outcome.peak_contact_force < 60
+    assert outcome.success_paper  # a plug in its socket meets the paper's threshold, too
 
 
 def test_the_metrics_are_those_of_maniskill(make_env, pulled_out):
@@ -86,8 +87,7 @@ def test_an_episode_that_stops_at_success_does_not_know_its_end(make_env, pulled
     assert stopped.episode_len == stopped.first_success == pulled_out[0].first_success
     assert stopped.force_until_success == pulled_out[0].force_until_success
     entries = outcome_as_json(stopped)
-    assert "success_at_end" not in entries
-    assert "fail_at_end" not in entries
+    assert not {"success_at_end", "fail_at_end", "success_paper"} & set(entries)
     assert outcome_from_json(entries) == stopped
     summary = summary_of([entries], force_limit=1.0)
     assert summary["stop_at_success"]
@@ -100,6 +100,14 @@ def test_a_policy_that_stands_still_never_succeeds(make_env):
     assert (lost.success_once, lost.success_at_end, lost.first_success, lost.force_until_success) == (False, False, None, None)
     assert lost.episode_len == LIMIT
     assert lost.ending == "beside or above the hole"
+    assert lost.success_paper is False
+
+
+def test_an_episode_without_an_outcome_is_no_success_by_the_papers_threshold():
+    reached = replace(made_up(1, True), success_paper=True)
+    episodes = list(map(outcome_as_json, (reached, failed_outcome(2, "the process crashed", stop_at_success=False))))
+    assert summary_of(episodes, None)["success_paper"]["rate"] == 0.5
+    assert "success_paper" not in summary_of(episodes[1:], None)  # as of a task without a threshold
 
 
 def test_an_episode_is_said_to_have_succeeded_whatever_came_after(pulled_out):
