@@ -27,7 +27,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, Visuotact
 
 DOCS = Path(__file__).parent
 CARDS, VIDEOS, PICTURES = DOCS / "tasks", DOCS / "videos", DOCS / "images" / "tasks"
-RESULT_COLUMNS = 15
+RESULT_COLUMNS = 16
 """Number of columns of the table of docs/results.md that says what was run."""
 CAPTION = "The scene, the front, side and wrist cameras, and the left and right pads, after four fifths of a demonstration."
 

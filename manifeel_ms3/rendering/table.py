@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from sapien.render import RenderMaterial, RenderTexture2D
 
+from manifeel_ms3.errors import MachineError
 from manifeel_ms3.paths import derived_file
 
 from .looks import SPECULAR
@@ -64,8 +65,15 @@ def wood() -> RenderMaterial:
 
 @functools.cache
 def wood_texture(seed: int) -> RenderTexture2D:
-    """Texture of the table, painted once and kept among the derived assets; seed 0 is the usual one."""
-    pixels = cv2.cvtColor(cv2.imread(str(_painted(seed))), cv2.COLOR_BGR2RGBA)
+    """Texture of the table, painted once and kept among the derived assets; seed 0 is the usual one.
+
+    Raises:
+        MachineError: The picture that was kept is damaged, or there is no place to keep it.
+    """
+    picture = cv2.imread(str(_painted(seed)))
+    if picture is None:
+        raise MachineError(f"{_painted(seed)} is damaged; delete it, and it is made anew")
+    pixels = cv2.cvtColor(picture, cv2.COLOR_BGR2RGBA)
     return RenderTexture2D(pixels, "R8G8B8A8Unorm", mipmap_levels=int(np.log2(PIXELS)) + 1, srgb=True)
 
 
