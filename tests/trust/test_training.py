@@ -63,7 +63,7 @@ def require_equal(run_dir: Path, other: Path) -> None:
 # -------------------------------------------------------------------- killed
 
 
-@pytest.mark.parametrize("kills", [3, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [5, pytest.param(100, marks=pytest.mark.slow)])
 def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path, figure):
     whole, seconds = undisturbed
     moments = random.Random(kills)
