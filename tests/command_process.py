@@ -8,10 +8,14 @@ Tests of the beginning of a process itself (its folder, `-P`, a missing renderer
 import multiprocessing
 import os
 import runpy
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from functools import partial
+from contextlib import suppress
+from functools import cache, partial
+from importlib import import_module
+from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -45,16 +49,36 @@ def run_code(code: str, *, folder: Path, **environment: str) -> CompletedProcess
 def _forked(
     do: Callable[[], Any], arguments: tuple[object, ...], folder: Path, on_path: bool, environment: dict[str, str]
 ) -> CompletedProcess[str]:
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(LIBRARIES)
     path = [str(folder), str(REPOSITORY)] if on_path else [str(REPOSITORY)]
     with tempfile.TemporaryDirectory() as outputs:
-        given = (do, list(map(str, arguments)), folder, path, os.environ | environment, outputs)
-        process = context.Process(target=_run, args=given)
-        process.start()
-        process.join()
+        connection = _server()
+        connection.send((do, list(map(str, arguments)), folder, path, os.environ | environment, outputs))
+        code = connection.recv()
         out, err = (Path(outputs, name).read_text() for name in ("stdout", "stderr"))
-        return CompletedProcess(arguments, process.exitcode or 0, out, err)
+        return CompletedProcess(arguments, code, out, err)
+
+
+@cache
+def _server() -> Connection:
+    """Connection to the process that has imported the libraries; not the forkserver, of which a process has only one."""
+    ours, theirs = multiprocessing.Pipe()
+    program = f"from tests.command_process import serve; serve({theirs.fileno()})"
+    subprocess.Popen([sys.executable, "-c", program], cwd=REPOSITORY, pass_fds=[theirs.fileno()])
+    theirs.close()
+    return ours
+
+
+def serve(connection: int) -> None:
+    """Run each command that comes in a forked process, until the other end of the connection is closed."""
+    for library in LIBRARIES:
+        import_module(library)
+    requests = Connection(connection)
+    with suppress(EOFError):
+        while True:
+            process = multiprocessing.get_context("fork").Process(target=_run, args=requests.recv())
+            process.start()
+            process.join()
+            requests.send(process.exitcode)
 
 
 def _run(
