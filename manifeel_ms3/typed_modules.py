@@ -13,7 +13,7 @@ from .errors import UnknownNameError
 FIELDS = ("env_id", "task", "tasks")
 """Arguments of commands that hold ids of tasks."""
 _imported: list[str] = []
-"""Names of the modules that were imported. Worker processes, which are spawned, import them again."""
+"""Names of the modules that were imported. Worker processes import them again."""
 
 
 def import_typed_tasks(args: Any) -> None:

@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
-from multiprocessing import active_children, resource_tracker
-from multiprocessing.context import SpawnContext, SpawnProcess
+from multiprocessing import active_children, forkserver, resource_tracker
+from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -51,26 +51,56 @@ def _safe_path() -> Iterator[None]:
             os.environ[SAFE_PATH] = before
 
 
-class SafeProcess(SpawnProcess):
-    """A spawned process that finds modules only where this process finds them, even while it starts."""
+@contextmanager
+def without_ctrl_c() -> Iterator[None]:
+    """Context in which new processes and threads ignore Ctrl-C, which only the main thread handles."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class WorkerProcess(ForkServerProcess):
+    """A process of `WorkerContext`, with the environment variables that this process has as it starts it."""
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (the name is that of multiprocessing)
-        with _safe_path():
-            return SpawnProcess._Popen(process_obj)  # pyright: ignore[reportAttributeAccessIssue]
+        start_server()
+        return ForkServerProcess._Popen(process_obj)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _with_environment, (type(self), dict(os.environ)), self.__dict__
 
 
-class SafeSpawnContext(SpawnContext):
-    """The context "spawn" of multiprocessing, with `SafeProcess` as its class of processes."""
+def _with_environment(process_class: type[WorkerProcess], environment: dict[str, str]) -> WorkerProcess:
+    """The process in itself, without its attributes; these come next and may import modules, which read the environment."""
+    os.environ.clear()
+    os.environ.update(environment)
+    return process_class.__new__(process_class)
 
-    Process = SafeProcess
+
+class WorkerContext(ForkServerContext):
+    """Context of multiprocessing whose processes start in a fraction of a second and find no modules in the current folder.
+
+    They are forked from a server process that has imported this package and done nothing else, because neither the renderer
+    nor threads survive a fork of this process. They ignore Ctrl-C, as the server does.
+    """
+
+    Process = WorkerProcess
 
     def __init__(self) -> None:
         super().__init__()
-        mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
-        with _safe_path():
-            resource_tracker.ensure_running()  # locks would start it later; its start unblocks Ctrl-C, hence the mask
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        start_server()
+
+
+def start_server() -> None:
+    """Start the server process if it does not run, as it may have been killed. Its first process takes seconds to come."""
+    forkserver.set_forkserver_preload(["manifeel_ms3"])
+    with without_ctrl_c(), _safe_path():
+        resource_tracker.ensure_running()  # the server would start it, and its start lets Ctrl-C through again
+        with without_ctrl_c():
+            forkserver.ensure_running()
 
 
 class WorkerDiedError(WorkFailedError):
@@ -119,8 +149,8 @@ class Finished(Generic[Task]):
 class WorkerPool(Generic[State, Task]):
     """Processes that share tasks; if a process dies, its task fails and a new process takes its place.
 
-    Processes are spawned, because a forked renderer does not work, and use one thread each for torch, because they share the
-    cores and because sums then do not depend on the number of threads. They end when the process that made them is killed.
+    Processes are those of `WorkerContext`, and use one thread each for torch, because they share the cores and because sums
+    then do not depend on the number of threads. They end when the process that made them is killed.
     If an exception leaves the context, such as the KeyboardInterrupt of Ctrl-C, waiting tasks are cancelled and the processes
     are killed at once. Ctrl-C reaches only the main process.
 
@@ -137,7 +167,7 @@ class WorkerPool(Generic[State, Task]):
         if workers < 1:
             raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
         worker = _Worker(make_state)
-        self._pool = ProcessPool(workers, context=SafeSpawnContext(), initializer=_start, initargs=(worker, imported()))
+        self._pool = ProcessPool(workers, context=WorkerContext(), initializer=_start, initargs=(worker, imported()))
         self._running: dict[Future[Any], Task] = {}
 
     def __enter__(self) -> "WorkerPool[State, Task]":
@@ -160,11 +190,8 @@ class WorkerPool(Generic[State, Task]):
 
     def submit(self, function: Callable[[State, Task], Any], task: Task) -> None:
         """Call `function(state, task)` in the next process that is free; both must be picklable."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes and threads that start now inherit it
-        try:
+        with without_ctrl_c():  # for the pool's threads, which start with the first task
             self._running[self._pool.schedule(_run, args=(function, task))] = task
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def as_finished(self) -> Iterator[Finished[Task]]:
         """Tasks in the order in which they finish, until none is left; more may be submitted meanwhile.

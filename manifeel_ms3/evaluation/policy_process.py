@@ -12,12 +12,11 @@ its episode.
 import contextlib
 import multiprocessing
 import pickle
-import signal
 import socket
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -27,7 +26,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.errors import WorkFailedError
-from manifeel_ms3.workers import SafeSpawnContext, end_with_parent
+from manifeel_ms3.workers import WorkerContext, end_with_parent, without_ctrl_c
 
 from .policy import Policy, PolicyRequest, PolicySource, PolicyUnavailableError
 from .rollout import PolicyFault, begin_episode
@@ -100,7 +99,7 @@ class PolicyProcess:
         self._listener.listen(BACKLOG)
         self._start()
         self._thread = threading.Thread(target=self._serve, daemon=True)
-        with _without_ctrl_c():
+        with without_ctrl_c():
             self._thread.start()
         return self
 
@@ -114,11 +113,10 @@ class PolicyProcess:
 
     def _start(self) -> None:
         self._ready, self._answered = None, 0
-        context = SafeSpawnContext()
+        context = WorkerContext()
         self._policy, theirs = context.Pipe()
         self._process = context.Process(target=answer_batches, args=(self._source, theirs), daemon=True)
-        with _without_ctrl_c():
-            self._process.start()
+        self._process.start()
         theirs.close()
 
     def _stop(self) -> int | None:
@@ -238,16 +236,6 @@ class PolicyProcess:
 def _send(connection: Connection, message: Any) -> None:
     with contextlib.suppress(OSError):  # whoever has ended is noticed where messages are received
         connection.send(message)
-
-
-@contextlib.contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Context in which new processes and threads ignore Ctrl-C, which only the main thread handles."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # -------------------------------------------------------------------- in a simulating process

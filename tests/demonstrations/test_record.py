@@ -24,6 +24,7 @@ from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
 from tests.tasks_and_marks import PEG
 from tests.trajectories import bytes_of
+from tests.trust.kills import worker_processes
 
 EASY = dict(fit="paper", render_backend="none")
 KEYS = ["sensor_data/tactile_right/force_field", "extra/tcp_pose"]
@@ -231,10 +232,9 @@ def test_a_worker_that_is_killed_loses_no_finished_episode(recorded, tmp_path):
     path = tmp_path / "trajectory.h5"
 
     def kill_workers() -> None:
-        for process in psutil.Process().children():
+        for process in worker_processes(os.getpid()):
             with suppress(psutil.NoSuchProcess):  # an earlier test's process that has ended, but was not waited for
-                if "spawn_main" in " ".join(process.cmdline()):
-                    process.kill()
+                process.kill()
 
     args = record.Args(PEG, 3, 1, 0, path, "tacff", cameras=(), tactile_sensors=("right",), env_kwargs=json.dumps(EASY))
     with pytest.raises(WorkFailedError, match="ended with exit code -9"):

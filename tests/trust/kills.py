@@ -10,6 +10,8 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
+
 from tests.tasks_and_marks import PEG
 
 FILE_EVENTS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir")
@@ -46,6 +48,12 @@ def start_recording(path: Path, num: int, moment: list | None = None, fit: str =
     arguments = dict(env_id=PEG, num=num, out=str(path), obs_mode="none", env_kwargs=env_kwargs) | kwargs
     command = [sys.executable, "-c", RECORD, json.dumps(moment), json.dumps(arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def worker_processes(main: int) -> list[psutil.Process]:
+    """The worker processes of a main process, of which the number is given: all that its server has forked."""
+    started = psutil.Process(main).children()
+    return [worker for server in started if "forkserver" in " ".join(server.cmdline()) for worker in server.children()]
 
 
 def recorded(path: Path, num: int, moment: list | None = None, **kwargs) -> tuple[int, int, str]:

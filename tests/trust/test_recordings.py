@@ -26,7 +26,7 @@ from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
 from tests.tasks_and_marks import PEG
 from tests.trajectories import bytes_of
-from tests.trust.kills import PATIENCE, forked, recorded, start_recording
+from tests.trust.kills import PATIENCE, forked, recorded, start_recording, worker_processes
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
 KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="paper")
@@ -270,7 +270,7 @@ def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
     process = start_recording(path, 3, workers=2)
     assert process.stdout.readline() == "begin\n"
     assert process.stdout.readline() == "episode\n"
-    workers = [child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())]
+    workers = worker_processes(process.pid)
     assert len(workers) == 2
     process.kill()
     begin = time.monotonic()
