@@ -96,7 +96,7 @@ class WorkerContext(ForkServerContext):
 
 def start_server() -> None:
     """Start the server process if it does not run, as it may have been killed. Its first process takes seconds to come."""
-    forkserver.set_forkserver_preload(["manifeel_ms3"])
+    forkserver.set_forkserver_preload(["manifeel_ms3.worker_server"])
     with without_ctrl_c(), _safe_path():
         resource_tracker.ensure_running()  # the server would start it, and its start lets Ctrl-C through again
         with without_ctrl_c():

@@ -51,9 +51,8 @@ def start_recording(path: Path, num: int, moment: list | None = None, fit: str =
 
 
 def worker_processes(main: int) -> list[psutil.Process]:
-    """The worker processes of a main process, of which the number is given: all that its server has forked."""
-    started = psutil.Process(main).children()
-    return [worker for server in started if "forkserver" in " ".join(server.cmdline()) for worker in server.children()]
+    """The worker processes of a main process, of which the number is given: those that its server has forked."""
+    return [process for process in psutil.Process(main).children(recursive=True) if process.ppid() != main]
 
 
 def recorded(path: Path, num: int, moment: list | None = None, **kwargs) -> tuple[int, int, str]:
