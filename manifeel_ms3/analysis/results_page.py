@@ -18,7 +18,7 @@ import tyro
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
-from manifeel_ms3.evaluation.result import results_by_file
+from manifeel_ms3.evaluation.result import results_by_file, successes_by_the_paper
 from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import all_tasks
 
@@ -248,9 +248,8 @@ def _table_of_conditions(
 
 def _by_the_paper(results: ConditionResults) -> str | None:
     """Share of the episodes that met the threshold of the paper's public code; None where it was not measured."""
-    if not any("success_paper" in episode for episode in results.episodes):
-        return None
-    return f"{np.mean([episode.get('success_paper', False) for episode in results.episodes]):.0%}"
+    successes = successes_by_the_paper(results.episodes)
+    return None if successes is None else f"{np.mean(successes):.0%}"
 
 
 def _floor(condition: Condition) -> str | None:

@@ -97,12 +97,22 @@ def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dic
     summary: dict[str, Any] = dict(stop_at_success=not to_the_end)
     for name in ("success_once", "fail_once", *(ONLY_TO_THE_END if to_the_end else ())):
         summary[name] = _rate([episode[name] for episode in episodes])
-    if any("success_paper" in episode for episode in episodes):  # of which nothing could be measured have none
-        summary["success_paper"] = _rate([episode.get("success_paper", False) for episode in episodes])
+    if (by_the_paper := successes_by_the_paper(episodes)) is not None:
+        summary["success_paper"] = _rate(by_the_paper)
     if force_limit is not None:
         gentle = [is_gentle(episode, force_limit) for episode in episodes]
         summary |= dict(force_limit=force_limit, gentle_success=_rate(gentle))
     return summary | {name: round(float(np.mean([episode[name] for episode in episodes])), MEAN_DECIMALS) for name in MEANS}
+
+
+def successes_by_the_paper(episodes: list[dict[str, Any]]) -> list[bool] | None:
+    """Whether each episode met the threshold of the paper's public code; None where that is not known.
+
+    Episodes of which nothing could be measured, such as those of a policy that crashed, have no such entry: they did not.
+    """
+    if not any("success_paper" in episode for episode in episodes):
+        return None
+    return [episode.get("success_paper", False) for episode in episodes]
 
 
 def _rate(happened: list[bool]) -> dict[str, float]:
