@@ -64,12 +64,16 @@ class ScrewingExpertConfig:
     """Torque, in N m, at which the hand stops turning and holds: above the 0.1 N m that BulbInstallation asks for. Tuned."""
     turn_force: float = 1.5
     """Downward force while the hand turns, in N. Tuned."""
+    release_force: float = np.inf
+    """Upward force, in N, above which the hand may rise while it turns. The hand never rises where it is infinite."""
     compliance: float = 1.0e-4
     """Motion of the hand per step and per newton of unwanted force, in m/N. Tuned."""
     sideways_force: float = 1.0
     """Sideways force that the hand does not comply with, in N. Tuned."""
     force_step: float = 8e-4
     """Largest step under force, along each axis, in m. Tuned."""
+    follow: float = 0.0
+    """Share of the part's distance from the tool by which the hand follows it in one step while it turns."""
     straighten: float = 0.2
     """Share of its lean by which the part is straightened in one step. Tuned."""
 
@@ -151,12 +155,13 @@ class ScrewingExpert:
             command, _ = skills.commanded
             load = skills.load
             load[:2] -= np.clip(load[:2], -config.sideways_force, config.sideways_force)
-            move = config.compliance * (load - [0, 0, config.turn_force]) + self._straighten()
+            move = config.compliance * (load - [0, 0, config.turn_force]) + self._straighten() + self._follow()
             move = np.clip(move, -config.force_step, config.force_step)
             turn = self._turn_rate()
             self.yaw -= turn
             move[2] -= self.screw.pitch * turn / (2 * np.pi)
-            move[2] = min(move[2], 0.0)  # the part must not rise
+            if load[2] < config.release_force:
+                move[2] = min(move[2], 0.0)  # the part must not rise
             yield skills.command(command + move, self._facing())
 
     def _turn_rate(self) -> float:
@@ -175,6 +180,10 @@ class ScrewingExpert:
         leaning = position_rotation(self.env.held.pose.raw_pose)[1].apply([0.0, 0.0, 1.0])
         return -self.config.straighten * self.screw.reach * np.r_[leaning[:2], 0.0]
 
+    def _follow(self) -> np.ndarray:
+        """Motion of the hand in one step, (3,), m, after a part that slips between the pads."""
+        return self.config.follow * self._in_hand()
+
     def _torque(self) -> float:
         """Clockwise torque, in N m, of the hand on the part, as the pads sense it."""
         return -float(self.env.agent.torque_on_held(self.env.agent.tcp.pose.p)[0])
@@ -182,11 +191,15 @@ class ScrewingExpert:
     def _height(self) -> float:
         """Height, in m, of the held part over the underside of the fixed one.
 
-        It is taken from the tool's pose and the part's position in the hand, which is read from the simulator.
+        It is taken from the tool's pose and the part's position in the hand.
         """
+        tool, _ = self.skills.tool
+        return float((tool + self._in_hand() - self.axis)[2])
+
+    def _in_hand(self) -> np.ndarray:
+        """Vector (3,), in m, from the tool to the held part. The part's position in the hand is read from the simulator."""
         in_hand = (self.env.agent.tcp.pose.inv() * self.env.held.pose).raw_pose[0, :3].cpu().numpy()
-        tool, facing = self.skills.tool
-        return float((tool + facing.apply(in_hand) - self.axis)[2])
+        return self.skills.tool[1].apply(in_hand)
 
     def _regrasp(self) -> Actions:
         """Let go, turn back as far as is needed or as the wrist allows, and close the fingers again."""
@@ -208,6 +221,10 @@ class ScrewingExpert:
 class BulbExpert(ScrewingExpert):
     """Screws in a bulb that it holds, or one that already sits in the holder's thread (`start="holder"`)."""
 
+    config = ScrewingExpertConfig(
+        release_force=4.0,  # tuned: when the bulb meets the contact, the holder's thread must take the load, not the hand
+        follow=0.2,  # tuned: a round part that slips between the pads would slip out of them
+    )
     env: BulbInstallationEnv
 
     def _begin(self) -> Actions:

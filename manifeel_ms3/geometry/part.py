@@ -140,6 +140,8 @@ class Part:
     """Looks of single pieces, by index in `pieces`."""
     other_densities: dict[int, float] = field(default_factory=dict)
     """Densities of single pieces, by index in `pieces`."""
+    other_frictions: dict[int, float] = field(default_factory=dict)
+    """Friction coefficients of single pieces, by index in `pieces`."""
     undrawn: frozenset[int] = frozenset()
     """Indices in `pieces` of those that collide, but are neither drawn nor touched."""
     springs: dict[int, float] = field(default_factory=dict)
@@ -161,7 +163,8 @@ class Part:
             if scene.can_render() and k not in self.undrawn:  # a render material cannot even be made without a renderer
                 look = self.other_looks.get(k, self.look).material()
             # the engine takes negative restitution as a spring, and averages it with the other body's
-            material = PhysxMaterial(self.friction, self.friction, -2 * self.springs.get(k, 0.0))
+            friction = self.other_frictions.get(k, self.friction)
+            material = PhysxMaterial(friction, friction, -2 * self.springs.get(k, 0.0))
             piece.add_to(builder, material, self.other_densities.get(k, self.density), look)
         builder.initial_pose = initial_pose  # pyright: ignore[reportAttributeAccessIssue]  (ManiSkill annotates its own poses alone)
         builder.set_physx_body_type(body_type)

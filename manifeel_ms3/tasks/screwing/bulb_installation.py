@@ -50,7 +50,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
     demo_steps=464,
-    revision=3,
+    revision=4,
     force_limit=29.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
