@@ -202,11 +202,11 @@ class ScrewingExpert:
         return self.skills.tool[1].apply(in_hand)
 
     def _regrasp(self) -> Actions:
-        """Let go, turn back as far as is needed or as the wrist allows, and close the fingers again."""
+        """Let go, turn back as far as is needed or as the wrist allows, around the part, and close the fingers again."""
         skills, config = self.skills, self.config
         height = self._height()
         yield from skills.move_fingers(self._open, config.open_steps)
-        here, _ = skills.tool
+        here = skills.tool[0] + self._in_hand()
         left = (height - self.screw.seated) / self.screw.pitch * 2 * np.pi + self.screw.tightening
         period = self.screw.symmetry
         back = self.yaw + period * np.clip(np.ceil(left / period), 1, np.floor(config.sweep / period))

@@ -44,14 +44,14 @@ class BulbRandomization(ScrewingRandomization):
 @register_task(
     "ManiFeel-BulbInstallation-v1",
     instruction="Screw the light bulb into its holder.",
-    max_episode_steps=930,
+    max_episode_steps=840,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
-    demo_steps=464,
+    demo_steps=419,
     revision=4,
-    force_limit=29.0,
+    force_limit=36.0,
 )
 class BulbInstallationEnv(ScrewingEnv):
     """Screw a light bulb into its holder.

@@ -16,13 +16,13 @@ MAX_TILT = np.deg2rad(2.0)
 @register_task(
     "ManiFeel-NutBoltAssembly-v1",
     instruction="Screw the nut onto the bolt.",
-    max_episode_steps=810,
+    max_episode_steps=1080,
     category="screwing",
     paper_demos=30,
     paper_tables=("I",),
     demo_megabytes=70.0,
     demo_steps=396,
-    revision=3,
+    revision=4,
     force_limit=24.0,
 )
 class NutBoltAssemblyEnv(ScrewingEnv):
