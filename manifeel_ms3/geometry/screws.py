@@ -175,9 +175,9 @@ CONTACT_SPRING = 5e4
 DRY_FRICTION = 0.35
 """Coulomb's friction coefficient of brass on brass, neither greased nor polished."""
 GLASS_FRICTION = 1.0
-"""Coulomb's friction coefficient of the glass. PhysX averages it with the gel's 0.5, so that a pad holds the bulb with 0.75: the
-lower end of what is measured of silicone gels (0.75 to 1). Where a round part touches a pad, PhysX does not add the torque
-that lets flat parts do with less (docs/sensor.md)."""
+"""Coulomb's friction coefficient of the glass. PhysX averages it with the gel's 0.5, so that a pad holds the bulb with 0.75,
+the lower end of what is measured of silicone gels (0.75 to 1). Flat parts do with less, because PhysX gives a face twice the
+torque of an even pressure, and a round part none of it (docs/sensor.md)."""
 LEAD_IN = 0.25
 """Number of turns over which the cap's ridge rises. Set once; not tuned."""
 BULB_TIGHTENING, BULB_SYMMETRY = np.deg2rad(120), np.deg2rad(15)
