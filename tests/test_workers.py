@@ -35,6 +35,11 @@ def sleep(state: list[int], number: int) -> None:
     time.sleep(number)
 
 
+def environment(state: list[int], name: str) -> tuple[int, str | None]:
+    """The server that started this process, and an environment variable."""
+    return os.getppid(), os.environ.get(name)
+
+
 def broken_state() -> None:
     raise InvalidArgumentError("no such environment")
 
@@ -102,3 +107,16 @@ def test_processes_that_end_as_they_start_are_one_error():
 def test_no_workers_are_refused():
     with pytest.raises(InvalidArgumentError, match="at least 1"):
         WorkerPool(0, partial(counter, 0))
+
+
+def test_processes_have_the_environment_of_their_pool_even_after_their_server_was_killed(monkeypatch):
+    servers = []
+    for number in "12":
+        monkeypatch.setenv("MANIFEEL_TEST", number)
+        with WorkerPool(1, partial(counter, 0)) as pool:
+            pool.submit(environment, "MANIFEEL_TEST")
+            ((server, value),) = (finished.result() for finished in pool.as_finished())
+        assert value == number
+        servers.append(server)
+        os.kill(server, signal.SIGKILL)
+    assert servers[0] != servers[1]
