@@ -119,4 +119,5 @@ def test_processes_have_the_environment_of_their_pool_even_after_their_server_wa
         assert value == number
         servers.append(server)
         os.kill(server, signal.SIGKILL)
+        os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT)
     assert servers[0] != servers[1]
