@@ -44,12 +44,12 @@ class BulbRandomization(ScrewingRandomization):
 @register_task(
     "ManiFeel-BulbInstallation-v1",
     instruction="Screw the light bulb into its holder.",
-    max_episode_steps=840,
+    max_episode_steps=890,
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
-    demo_steps=419,
+    demo_steps=424,
     revision=4,
     force_limit=36.0,
 )
