@@ -98,7 +98,7 @@ def start_server() -> None:
     """Start the server process if it does not run, as it may have been killed. Its first process takes seconds to come."""
     forkserver.set_forkserver_preload(["manifeel_ms3.worker_server"])
     with without_ctrl_c(), _safe_path():
-        resource_tracker.ensure_running()  # the server would start it, and its start lets Ctrl-C through again
+        resource_tracker.ensure_running()  # before the server would start it, because its start lets Ctrl-C through again
         with without_ctrl_c():
             forkserver.ensure_running()
 

@@ -9,6 +9,7 @@ import pytest
 
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.workers import WorkerDiedError, WorkerPool
+from tests.command_process import run_code
 
 
 def counter(start: int) -> list[int]:
@@ -121,3 +122,23 @@ def test_processes_have_the_environment_of_their_pool_even_after_their_server_wa
         os.kill(server, signal.SIGKILL)
         os.waitid(os.P_PID, server, os.WEXITED | os.WNOWAIT)
     assert servers[0] != servers[1]
+
+
+NO_GPU = """
+import torch
+
+def used(*_, **__):
+    raise AssertionError("a GPU is used as the package is imported")
+
+torch.cuda.is_available = torch.cuda.device_count = torch.cuda.init = used
+import manifeel_ms3.worker_server
+from warp._src import context
+assert context.runtime is None
+print("imported")
+"""
+
+
+def test_the_server_uses_no_gpu(tmp_path):
+    """CUDA does not work in processes that are forked from one that has used it."""
+    done = run_code(NO_GPU, folder=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "imported\n"), done.stderr

@@ -92,7 +92,7 @@ class ScrewingExpert:
     """Knows the parts, sees roughly where the axis is, and acts on the loads that the pads sense.
 
     Three things are read from the simulator instead of from images: the position of the fixed part, with an error of up to
-    `SkillConfig.sight_error`, and the held part's height and lean.
+    `SkillConfig.sight_error`, and the held part's lean and its position in the hand, which give its height.
 
     Args:
         env: Environment that has just been reset.
