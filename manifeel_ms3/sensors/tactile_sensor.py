@@ -18,8 +18,8 @@ from .touch_model import OUTPUTS, TouchModel
 from .visualisation import force_field_images
 
 log = logging.getLogger(__name__)
-LARGEST_PULL = 1.0
-"""Pull on a gel, in N, from which the pose is taken to be wrong: more than the inertia of a pad, less than a grip (chosen)."""
+CLEAR_FORCE = 1.0
+"""Pull or push on a gel, in N, that shows which way it faces: more than the inertia of a pad, less than a grip (chosen)."""
 
 
 class TactileSensor(BaseSensor):
@@ -67,7 +67,7 @@ class TactileSensor(BaseSensor):
         self._gauge = WrenchGauge(articulation, self.pad, config.pad_pose)
         self._depth = self._make_depth()
         self._obs: dict[str, torch.Tensor] = {}
-        self._warned = False
+        self._side_is_known = False
         self.reset(torch.arange(scene.num_envs, device=scene.device))
 
     def _make_depth(self) -> RaycastDepth | CameraDepth:
@@ -121,10 +121,16 @@ class TactileSensor(BaseSensor):
         self._obs = self.model.observe(self._depth, wrench)
 
     def _warn_of_wrong_side(self, wrench: torch.Tensor) -> None:
-        """Warn once if the gel is pulled, which nothing that it touches can do; only on the CPU, where the check is cheap."""
-        if self._warned or wrench.device.type != "cpu" or (pull := wrench[:, 2].max().item()) < LARGEST_PULL:
+        """Warn once if the gel is pulled, which nothing that it touches can do; only on the CPU, where the check is cheap.
+
+        A gel that was pressed before faces the right way: what pulls it then has caught its edge from behind.
+        """
+        if self._side_is_known or wrench.device.type != "cpu":
             return
-        self._warned = True
+        pull, push = wrench[:, 2].max().item(), -wrench[:, 2].min().item()
+        self._side_is_known = max(pull, push) >= CLEAR_FORCE
+        if pull < CLEAR_FORCE:
+            return
         log.warning(
             "the tactile sensor %r is pulled by %.1f N and feels nothing: its pad_pose faces away from what it touches; its "
             "z axis must point out of the gel (see manifeel_ms3.sensors.pad_pose)",

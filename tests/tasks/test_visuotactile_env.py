@@ -274,3 +274,14 @@ def test_a_flat_state_holds_the_targets_of_arm_and_gripper(make_env, mode):
     assert ends[0] == pytest.approx(ends[1], abs=1e-3)
     with pytest.raises(ValueError, match=r"get_state returns \(N, "):
         first.unwrapped.set_state(state[:, :-1])
+
+
+def test_a_gel_that_is_caught_from_behind_is_not_taken_for_one_on_the_wrong_side(make_env, monkeypatch, caplog):
+    """The peg presses both gels at the start, so that they face the right way, whatever pulls them later."""
+    env = make_env(obs_mode="tacff", render_backend="none")
+    env.reset(seed=0)
+    sensor = env.unwrapped._tactile_sensors["tactile_right"]
+    pulled = torch.tensor([[0.0, 0.0, 2.0, 0.0, 0.0, 0.0]], dtype=sensor.wrench().dtype)
+    monkeypatch.setattr(sensor, "wrench", lambda: pulled)
+    sensor.capture()
+    assert "faces away" not in caplog.text
