@@ -66,7 +66,7 @@ class WorkerProcess(ForkServerProcess):
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (the name is that of multiprocessing)
-        start_server()
+        _start_server()
         return ForkServerProcess._Popen(process_obj)  # pyright: ignore[reportAttributeAccessIssue]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -91,10 +91,10 @@ class WorkerContext(ForkServerContext):
 
     def __init__(self) -> None:
         super().__init__()
-        start_server()
+        _start_server()
 
 
-def start_server() -> None:
+def _start_server() -> None:
     """Start the server process if it does not run, as it may have been killed. Its first process takes seconds to come."""
     forkserver.set_forkserver_preload(["manifeel_ms3.worker_server"])
     with without_ctrl_c(), _safe_path():

@@ -1,6 +1,5 @@
 """Run episodes in worker processes, with one process that holds the policy."""
 
-import gc
 import json
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -103,7 +102,6 @@ def _reason(error: WorkerDiedError, evaluation: Evaluation) -> str:
 
 def _make_env_and_policy(evaluation: Evaluation, address: str | None) -> tuple[gym.Env, Policy]:
     """The environment and the policy, which a worker keeps from one episode to the next."""
-    gc.freeze()  # ManiSkill collects garbage at each reset, and then skips all that was imported
     env = make_env(evaluation.env_id, **evaluation.env_kwargs)
     make = evaluation.source.make
     return env, make() if address is None else SharedPolicy(address, make)

@@ -155,7 +155,8 @@ class ScrewingExpert:
             command, _ = skills.commanded
             load = skills.load
             load[:2] -= np.clip(load[:2], -config.sideways_force, config.sideways_force)
-            move = config.compliance * (load - [0, 0, config.turn_force]) + self._straighten() + self._follow()
+            move = config.compliance * (load - [0, 0, config.turn_force]) + self._straighten()
+            move += config.follow * self._in_hand()
             move = np.clip(move, -config.force_step, config.force_step)
             turn = self._turn_rate()
             self.yaw -= turn
@@ -179,10 +180,6 @@ class ScrewingExpert:
         """
         leaning = position_rotation(self.env.held.pose.raw_pose)[1].apply([0.0, 0.0, 1.0])
         return -self.config.straighten * self.screw.reach * np.r_[leaning[:2], 0.0]
-
-    def _follow(self) -> np.ndarray:
-        """Motion of the hand in one step, (3,), m, after a part that slips between the pads."""
-        return self.config.follow * self._in_hand()
 
     def _torque(self) -> float:
         """Clockwise torque, in N m, of the hand on the part, as the pads sense it."""
