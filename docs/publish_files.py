@@ -1,17 +1,27 @@
-"""A hook of mkdocs: the site gets files from outside of docs, to which its pages link: the leaderboard and the notebook."""
+"""A hook of mkdocs: formulas become MathML, and the site gets the leaderboard and the notebook, to which its pages link."""
 
+import re
 import shutil
+from html import unescape
 from pathlib import Path
 from typing import Any
+
+from latex2mathml.converter import convert
 
 REPOSITORY = Path(__file__).parents[1]
 PUBLISHED = (".html", ".json")
 NOTEBOOK = "examples/quickstart.ipynb"
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """The first page lies one folder deeper in the repository than on the site; its link to the notebook fits both."""
     return markdown.replace(f"](../{NOTEBOOK})", f"]({NOTEBOOK})") if page.is_homepage else markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Formulas as MathML, which browsers draw without a script."""
+    return FORMULA.sub(lambda found: convert(unescape(found[2]), display="inline" if found[1] == "span" else "block"), html)
 
 
 def on_post_build(config: Any) -> None:

@@ -39,7 +39,7 @@ def _start_warp() -> None:
 def warp_device(device: torch.device):
     """Warp's device that corresponds to a device of torch; warp is started first."""
     _start_warp()
-    return wp.device_from_torch(device)
+    return wp.get_device(str(device))  # `wp.device_from_torch` refuses "cuda" without a number, ManiSkill's usual device
 
 
 @contextlib.contextmanager
