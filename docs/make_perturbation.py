@@ -24,12 +24,12 @@ USUAL = RUN / "00007000.json"
 """The checkpoint's result under the usual appearance."""
 COMMAND = """manifeel eval --checkpoint leaderboard/{entry}/seed0/checkpoints/00007000 --num-eval-episodes 50 \\
     --env-kwargs '{{"visual_randomization": {changed}}}' --out docs/perturbation/NAME.json"""
-HEAD = """# Changed appearance
+HEAD = """# Robustness to appearance
 
 How much success does a policy lose when the scene looks different from what it was trained on? The small policy of the
 leaderboard entry `{entry}` was trained under the usual appearance and evaluated on the same {episodes} initial states under
-changes of the [appearance](rendering.md#random-looks), which are drawn anew for each initial state. It observes the wrist
-camera and TacFF; touch itself is not changed. The first row was evaluated on another processor than the others; on theirs, it
+changes of the [appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. It observes the
+wrist camera and TacFF; touch itself is not changed. The first row was evaluated on another processor than the others; on theirs, it
 is 46%, too. Each difference has a 95 % interval from a bootstrap over initial states, and the
 p-value of no difference. One policy was tested: nothing here tells how other training seeds, sensings or tasks behave. The
 study `configs/perturbation.yaml` trains and evaluates three tasks with all sensings.

@@ -29,6 +29,9 @@ DOCS = Path(__file__).parent
 CARDS, VIDEOS, PICTURES = DOCS / "tasks", DOCS / "videos", DOCS / "images" / "tasks"
 RESULT_COLUMNS = 16
 """Number of columns of the table of docs/results.md that says what was run."""
+NOT_ON_CARDS = ("std", "of", "id", "on")
+"""Columns of that table that a card leaves out."""
+MADE = "*Made by `python -m docs.make_task_cards` from the class of the task, the registry and what was measured.*\n"
 CAPTION = "The scene, the front, side and wrist cameras, and the left and right pads, after four fifths of a demonstration."
 
 
@@ -57,17 +60,17 @@ def card_path(spec: TaskSpec) -> Path:
 
 def card(spec: TaskSpec) -> str:
     """The Markdown page of a task."""
-    parts = (_head(spec), _description(spec), _facts(spec), _randomization(spec), _arguments(spec), _measured(spec), _use(spec))
-    return "\n".join(part for part in parts if part)
+    facts = (_facts(spec), _randomization(spec), _arguments(spec), _measured(spec), _use(spec))
+    return "\n".join((_head(spec), _description(spec), *facts, MADE))
 
 
 def _head(spec: TaskSpec) -> str:
-    made = "*Made by `python -m docs.make_task_cards` from the class of the task, the registry and what was measured.*"
     shown = f"![{spec.name} from all cameras and on both pads](../images/tasks/{spec.name}.jpg)\n\n*{CAPTION}*\n"
     if (VIDEOS / f"{spec.name}.mp4").is_file():
         video = f"../../videos/{spec.name}.mp4"  # the site has each page in a folder of its own
-        shown = f'<video src="{video}" controls autoplay loop muted playsinline style="width: 100%"></video>\n\n{shown}'
-    return f"# {spec.name}\n\n{made}\n\n{shown}"
+        player = f'<video src="{video}" controls autoplay loop muted playsinline style="width: 100%"></video>'
+        shown = f"{player}\n\n[The video](../videos/{spec.name}.mp4) of a demonstration.\n\n{shown}"
+    return f"# {spec.name}\n\n{shown}"
 
 
 def _description(spec: TaskSpec) -> str:
@@ -150,18 +153,18 @@ def _measured(spec: TaskSpec) -> str:
     for page, title, columns in (("tasks.md", "The demonstrator", 4), ("audit.md", "What camera and touch reveal", 6)):
         if found := rows_of(DOCS / page, spec.name, columns):
             names, rows = found
-            source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
+            source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured, and on which revision.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
     return "\n".join([*parts, _results(spec)])
 
 
 def _results(spec: TaskSpec) -> str:
-    """What was run on this revision of the task, without the columns that are empty."""
+    """What was run on this revision of the task, without the columns that are empty and those of `NOT_ON_CARDS`."""
     found = rows_of(DOCS / "results.md", f"{spec.name} revision {spec.revision}", RESULT_COLUMNS)
     if not found:
         return f"## Results\n\nNo policy has been evaluated on revision {spec.revision} of this task yet.\n"
     names, rows = found
-    filled = [k for k in range(1, len(names)) if any(row[k] for row in rows)]
+    filled = [k for k in range(1, len(names)) if names[k] not in NOT_ON_CARDS and any(row[k] for row in rows)]
     table = markdown_table([names[k] for k in filled], ([row[k].replace("](../", "](../../") for k in filled] for row in rows))
     source = "From [results](../results.md), which says what the columns mean and how episodes fail.\n"
     return f"## Results\n\n{source}\n{table}"

@@ -235,15 +235,14 @@ def _table_of_conditions(
     rows = []
     for condition, here in _sorted(found):
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
-        what = (_task(condition), condition.sensing, condition.policy, condition.encoder, condition.num_demos)
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
         success = linked(mean_success(here), files.get(condition))
-        measured = (success, _floor(condition), _deviation(here), gentle_cell(here), _by_the_paper(here), here.size, note)
-        rows.append((*what, training_settings_of(condition), f"`{condition.key}`", *measured, cost, machines))
-    names = ("task", "sensing", "policy", "TacRGB encoder", "demonstrations", "settings", "id")
-    return markdown_table(
-        (*names, "success", "floor", "std", "gentle success", "by the paper's threshold", "of", "note", "cost", "on"), rows
-    )
+        measured = (success, _floor(condition), gentle_cell(here), _by_the_paper(here), _deviation(here), here.size, note)
+        of = (condition.policy, condition.encoder, condition.num_demos, training_settings_of(condition), f"`{condition.key}`")
+        rows.append((_task(condition), condition.sensing, *measured, *of, cost, machines))
+    measures = ("success", "floor", "gentle success", "by the paper's threshold", "std", "of", "note")
+    settings = ("policy", "TacRGB encoder", "demonstrations", "settings", "id")
+    return markdown_table(("task", "sensing", *measures, *settings, "cost", "on"), rows)
 
 
 def _by_the_paper(results: ConditionResults) -> str | None:

@@ -1,1 +1,1 @@
-"""How scenes look: the renderer at hand, shaders, lights, surfaces, the table, and their randomization."""
+"""Rendering: the renderer at hand, shaders, lights, surfaces, the table, and their randomization."""

@@ -1,4 +1,4 @@
-"""Random looks: light, colours, table and camera poses, drawn for each episode from its seed."""
+"""Visual randomization: light, colours, table and camera poses, drawn for each episode from its seed."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (SAPIEN's stubs ask for arrays of a fixed length, and know components by their base class)

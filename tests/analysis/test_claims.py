@@ -58,9 +58,8 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
         write_run(tmp_path, VISION, rate, seed, checkpoints=10)
     page = page_of(tmp_path)
     (ran,) = (line for line in page.splitlines() if "3 x 10 x 50" in line)
-    assert ran.startswith(
-        f"| PegInsertion revision {task_spec(PEG).revision} | rgb wrist | diffusion_policy |  | 50 | paper | `"
-    )
+    assert ran.startswith(f"| PegInsertion revision {task_spec(PEG).revision} | rgb wrist | [20%](")
+    assert " | 3 x 10 x 50 |  | diffusion_policy |  | 50 | paper | `" in ran
     (beside,) = (line for line in page.splitlines() if line.startswith("| PegInsertion | [20%]("))
     assert re.search(r"\.json\) \[\d+%, \d+%\] ± 10% / 14 ± 1% \| not run / 21 ± 2% \| not run / 40 ± 2% \| \d+% \[", beside)
     assert (tmp_path / re.search(r"\]\((.*?\.json)\)", beside)[1]).is_file()

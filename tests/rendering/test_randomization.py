@@ -1,4 +1,4 @@
-"""Random looks: drawn from the seed, told in `info`, and of no influence on what happens."""
+"""Visual randomization: drawn from the seed, told in `info`, and of no influence on what happens."""
 
 import numpy as np
 import pytest
