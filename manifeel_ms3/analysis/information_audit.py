@@ -8,6 +8,7 @@ The table and the figure go into the documentation, so the figure is a static im
 """
 
 import logging
+import math
 import sys
 import textwrap
 import warnings
@@ -53,9 +54,11 @@ SVM_PENALTY = 10.0
 LENGTH_SCALE, NOISE = 10.0, 0.1
 """Initial values of the Gaussian process's kernel: length in units of the principal components, and variance of the noise as a
 share of the answers'. Its fit replaces both."""
-PANEL = (2.1, 3.4)
+COLUMNS = 5
+"""Largest number of panels in a row of the figure."""
+PANEL = (2.1, 2.3)
 """Width and height of one question's panel in the figure, in inches."""
-FONT_SIZE, TITLE_WIDTH = 7, 28
+FONT_SIZE, TITLE_WIDTH = 8, 28
 """Size of the figure's letters in points, and letters in a line of a title, which then fits a panel."""
 COLOURS = ("#8a8f98", "#c7793a", "#3a74c7")
 """Colours of the bars, in the order of MODALITIES."""
@@ -286,10 +289,12 @@ def draw_figure(results: list[ProbeResult], path: Path) -> None:
         from matplotlib.figure import Figure
 
     groups = list(_by_question(results))
-    fig = Figure(figsize=(PANEL[0] * len(groups), PANEL[1]), layout="constrained")
-    axes = fig.subplots(1, len(groups))
+    columns = min(COLUMNS, len(groups))
+    rows = math.ceil(len(groups) / columns)
+    fig = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained")
     places = range(len(MODALITIES))
-    for ax, group in zip(np.atleast_1d(axes), groups, strict=True):
+    for k, group in enumerate(groups):
+        ax = fig.add_subplot(rows, columns, k + 1)
         factor = 1 if group[0].unit else 100
         score = np.array([result.score for result in group]) * factor
         ends = np.array([result.interval for result in group]).T * factor
