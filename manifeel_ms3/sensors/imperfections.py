@@ -54,13 +54,20 @@ class Imperfections:
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
         self._held = torch.zeros(num_pads, *config.taxel_shape, device=device)  # normal reading of the play operator
         self._surface: torch.Tensor | None = None  # (N, H, W), m
-        self._past: dict[str, torch.Tensor] = {}  # by output: (steps + 1, N, ...)
-        self._head = 0
+        self._past: dict[str, torch.Tensor] = {}  # by output: (N, steps + 1, ...)
+        self._head = torch.zeros(num_pads, dtype=torch.int64, device=device)  # place of the last step in `_past`
 
     @property
     def drawn(self) -> dict[str, torch.Tensor]:
         """What the present episodes drew, as `ImperfectionConfig.draw` returns it."""
         return {name: values.clone() for name, values in self._drawn.items()}
+
+    @property
+    def memory(self) -> dict[str, torch.Tensor]:
+        """What the next observation depends on besides the present state, (N, ...) each; not copies."""
+        own = dict(frame=self._frame, held=self._held, head=self._head)
+        surface = {} if self._surface is None else dict(surface=self._surface)
+        return own | surface | {f"past_{name}": values for name, values in self._past.items()}
 
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:
         """Begin an episode on these pads, with draws from the seeds (one for each pad) and no memory."""
@@ -137,8 +144,8 @@ class Imperfections:
         pads = torch.arange(len(then), device=self.device)
         for name, values in obs.items():
             if name not in self._past:
-                self._past[name] = values[None].repeat(slots, *[1] * values.ndim)
+                self._past[name] = values[:, None].repeat(1, slots, *[1] * (values.ndim - 1))
             past = self._past[name]
-            past.copy_(torch.where(first.view(1, -1, *[1] * (values.ndim - 1)), values[None], past))
-            past[self._head] = values
-        return {name: self._past[name][then, pads] for name in obs}
+            past.copy_(torch.where(first.view(-1, *[1] * values.ndim), values[:, None], past))
+            past[pads, self._head] = values
+        return {name: self._past[name][pads, then] for name in obs}

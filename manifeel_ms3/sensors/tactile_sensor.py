@@ -31,7 +31,7 @@ class TactileSensor(BaseSensor):
     - Force field: the layer's normal force, and shear by bristles with memory (`contact.solve_shear`), N per taxel.
     - RGB: the gel's surface under the compact shader (`optics.tacrgb`).
 
-    Call `capture` exactly once per control step, since shear has a history.
+    Call `capture` exactly once per control step, since shear has a history; at a reset, for the environments that are reset.
 
     Args:
         config: Configuration of the pad, gel, optics and taxels.
@@ -113,12 +113,17 @@ class TactileSensor(BaseSensor):
         """Force and moment (N, 6), N and N m, of the world on the pad, about the pad frame's origin, in the pad frame."""
         return self._gauge.read()
 
-    def capture(self) -> None:
-        """Sense the scene in its present state."""
+    def capture(self, env_idx: torch.Tensor | None = None) -> None:
+        """Sense the scene in its present state.
+
+        Args:
+            env_idx: Indices (n,) of the environments whose pads are read; all if not given. The other pads keep their last
+                observation, and everything that they remember.
+        """
         self._depth.look()
         wrench = self.wrench()
         self._warn_of_wrong_side(wrench)
-        self._obs = self.model.observe(self._depth, wrench)
+        self._obs = self.model.observe(self._depth, wrench, env_idx)
 
     def _warn_of_wrong_side(self, wrench: torch.Tensor) -> None:
         """Warn once if the gel is pulled, which nothing that it touches can do; only on the CPU, where the check is cheap.

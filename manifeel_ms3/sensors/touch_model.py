@@ -76,6 +76,7 @@ class TouchModel:
         places = (self.cells, self.pixels, self.taxels.centres.flatten(0, 1))
         self._cell_sag, self._pixel_sag, self._taxel_sag = (_sag(config.gel, points) for points in places)
         self._gel = GelProperties.nominal(config.gel, num_pads, device)
+        self._obs: dict[str, torch.Tensor] = {}  # the last observation
         self._imperfections = None if config.imperfections.is_none else Imperfections(config, num_pads, device)
 
     @property
@@ -101,15 +102,37 @@ class TouchModel:
         if self._imperfections is not None:
             self._imperfections.forget(pads)
 
-    def observe(self, depth: Depth, wrench: torch.Tensor) -> dict[str, torch.Tensor]:
+    @property
+    def _memory(self) -> dict[str, torch.Tensor]:
+        """The last observation, and what the next one depends on besides the present state, (N, ...) each; not copies."""
+        optics = {} if self.optics is None else self.optics.memory
+        imperfections = {} if self._imperfections is None else self._imperfections.memory
+        return dict(bristle=self._bristle) | self._obs | optics | imperfections
+
+    def observe(self, depth: Depth, wrench: torch.Tensor, pads: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Advance by one control step and return the observation, as described in `TactileSensor.get_obs`.
 
         Args:
             depth: Surfaces near the pads; a `MovingDepth` for units="tacsl".
             wrench: (N, 6) float64, N and N m, force and moment of the world on the pads, about the pad frames' origins.
+            pads: Indices (n,) of the pads that advance; all if not given. The others keep their memory, and their rows of the
+                observation are those of their last one.
         """
         with use_torch_threads_for_warp():
-            return self._observe(depth, wrench)
+            if pads is None:
+                self._obs = self._observe(depth, wrench)
+            else:
+                self._observe_some(pads, depth, wrench)
+        return self._obs
+
+    def _observe_some(self, pads: torch.Tensor, depth: Depth, wrench: torch.Tensor) -> None:
+        others = torch.ones(len(self._bristle), dtype=torch.bool, device=self._bristle.device)
+        others[pads] = False
+        kept = {name: values[others] for name, values in self._memory.items()}  # copies
+        self._obs = self._observe(depth, wrench)
+        memory = self._memory
+        for name, values in kept.items():
+            memory[name][others] = values
 
     def heights(self, depth: Depth) -> torch.Tensor:
         """Height (N, C), m, of what is near, over the untouched face at the cells."""

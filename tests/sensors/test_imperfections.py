@@ -32,9 +32,9 @@ class Pad:
     def reset(self, seeds):
         self.model.reset(torch.arange(len(seeds)), np.array(seeds))
 
-    def under(self, load: float, rows: float = 0.0) -> dict[str, torch.Tensor]:
+    def under(self, load: float, rows: float = 0.0, pads: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         wrench = torch.tensor([[rows, 0, -load, 0, 0, 0]], dtype=torch.float64)
-        return self.model.observe(self.rays, wrench.repeat(self.count, 1))
+        return self.model.observe(self.rays, wrench.repeat(self.count, 1), pads)
 
     def field(self, load: float, rows: float = 0.0) -> np.ndarray:
         return self.under(load, rows)["force_field"].double().numpy()
@@ -172,6 +172,24 @@ def test_reset_forgets_in_the_reset_pads_alone():
     read = pads.field(2.0)[..., 0].sum((1, 2))
     assert read == pytest.approx([8.0, 2.0], rel=1e-4)  # the first is late, and the second begins
     assert pads.field(2.0)[..., 0].sum((1, 2)) == pytest.approx([4.0, 2.0], rel=1e-4)
+
+
+EVERYTHING = dict(hysteresis=0.3, delay=(0, 3), noise=0.02, drift=0.2, crosstalk=0.1, gain=0.1, dead_taxels=0.1)
+
+
+@pytest.mark.parametrize("amounts", [{}, EVERYTHING], ids=["perfect", "imperfect"])
+def test_a_pad_that_is_not_read_keeps_its_last_reading_and_all_that_it_remembers(amounts):
+    pads, alone = (Pad(OUTPUTS, seeds=(3, 4, 5), **amounts) for _ in range(2))
+    loads = [(8.0, 3.0), (5.0, 1.0), (6.0, 2.0), (3.0, -1.0), (4.0, 1.0)]
+    for t, load in enumerate(loads):
+        seen, expected = pads.under(*load), alone.under(*load)
+        assert all(torch.equal(value[[0, 2]], expected[name][[0, 2]]) for name, value in seen.items()), t
+        if t == 1:  # the episode of one pad begins anew
+            pads.model.reset(torch.tensor([1]), np.array([7]))
+            for rows in (-2.0, 0.5):
+                kept = pads.under(9.0, rows, pads=torch.tensor([1]))
+            assert all(torch.equal(value[[0, 2]], seen[name][[0, 2]]) for name, value in kept.items())
+            assert not torch.equal(kept["force_field"][1], seen["force_field"][1])
 
 
 def test_info_says_what_an_episode_drew(make_env):

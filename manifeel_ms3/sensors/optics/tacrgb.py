@@ -209,6 +209,11 @@ class Optics:
         self.drift = torch.zeros(num_pads, 3, device=device)
         """Drift (N, 3) of the colours in the next image, grey levels."""
 
+    @property
+    def memory(self) -> dict[str, torch.Tensor]:
+        """What the next image depends on besides the gel's surface, (N, ...) each; not copies."""
+        return dict(image_frame=self._frame)
+
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:
         """Begin an episode on these pads: light and noise follow from the seeds, one for each pad."""
         gain, phase = self.config.randomization.draw_lights(seeds)
