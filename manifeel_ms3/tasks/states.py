@@ -27,6 +27,30 @@ def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
     return _filled(like, iter(state.split(widths, dim=1)))
 
 
+def rows(tree: Tree, idx: torch.Tensor) -> dict[str, Any]:
+    """Copy of the rows (n,) of a tree (N, D): a tree (n, D)."""
+    return {name: rows(value, idx) if isinstance(value, Mapping) else value[idx] for name, value in tree.items()}
+
+
+def with_rows(tree: Tree, idx: torch.Tensor | slice, given: Tree) -> dict[str, Any]:
+    """Copy of what two trees have in common, (N, D), in which the rows `idx` (n,) are those that are given.
+
+    Args:
+        tree: Tree of tensors (N, D).
+        idx: Indices (n,) of the rows.
+        given: Tree of tensors or arrays, (n, D), or (D,) for a single row.
+    """
+    return {name: _with_rows(tree[name], idx, value) for name, value in given.items() if name in tree}
+
+
+def _with_rows(value: Any, idx: torch.Tensor | slice, given: Any) -> Any:
+    if isinstance(value, Mapping):
+        return with_rows(value, idx, given)
+    changed = value.clone()
+    changed[idx] = torch.as_tensor(given).to(value).reshape(-1, value.shape[-1])
+    return changed
+
+
 def is_part_of(state: Tree, whole: Tree) -> bool:
     """Whether a tree (N, D) holds everything that another one of tensors or arrays, (N, D) or (D,), holds, bit for bit."""
     return all(_is_same(value, whole.get(name)) for name, value in state.items())

@@ -30,7 +30,7 @@ from .checks import check_num_envs, check_seed, checked_randomization, split_sen
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
-from .states import is_part_of, unflattened
+from .states import is_part_of, unflattened, with_rows
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
@@ -355,8 +355,9 @@ class VisuotactileEnv(SceneryEnv):
         if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
             return
         super().set_state_dict(state, env_idx)
-        if "controller" in state:
-            self.agent.set_controller_state(state["controller"])
+        changed = slice(None) if env_idx is None else env_idx
+        if "controller" in state:  # ManiSkill's controllers take the states of all environments
+            self.agent.set_controller_state(with_rows(self.agent.get_controller_state(), changed, state["controller"]))
         self._touch_is_fresh, self._measured = False, None
 
     def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
