@@ -19,16 +19,17 @@ from .images import same_height, same_size
 class SensingEnv(BaseEnv):
     """A ManiSkill environment whose observations and images hold those of tactile pads, too.
 
-    Subclasses set `_tactile_outputs` and `_tactile_configs` before they call the constructor, and clear `_touch_is_fresh`
-    whenever the simulation's state changes.
+    Subclasses set `_tactile_outputs` and `_tactile_configs` before they call the constructor, and set `_touch_is_stale` in each
+    environment whose state changes.
     """
 
     _tactile_outputs: tuple[str, ...]
     """Outputs of the pads that observations hold: "rgb", "force_field"."""
     _tactile_configs: dict[str, TactileSensorConfig]
     """Configurations of the observed pads by sensor name."""
-    _touch_is_fresh: bool
-    """Whether the pads have been read in the present state. They are read once per state, since shear has a history."""
+    _touch_is_stale: torch.Tensor
+    """Whether the pads of each environment, (N,) bool, are still to be read in the present state. They are read once per state,
+    since shear has a history."""
     renders_cameras = True
     """Whether observations hold the cameras' images. They are left out where a policy does not use them, to save time."""
 
@@ -39,7 +40,7 @@ class SensingEnv(BaseEnv):
             for uid, config in self._tactile_configs.items()
             if self._tactile_outputs
         }
-        self._touch_is_fresh = False
+        self._touch_is_stale = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
 
     def _drawn_imperfections(self) -> dict[str, dict[str, dict[str, torch.Tensor]]]:
         """Entry "imperfections" of `info`: what the episodes drew, by pad and name; none for perfect sensors."""
@@ -77,11 +78,17 @@ class SensingEnv(BaseEnv):
             name: camera.get_obs(**textures, apply_texture_transforms=apply_texture_transforms)
             for name, camera in cameras.items()
         }
-        if not self._touch_is_fresh:
-            for sensor in self._tactile_sensors.values():
-                sensor.capture()
-            self._touch_is_fresh = True
+        self._read_pads()
         return observed | {name: sensor.get_obs() for name, sensor in self._tactile_sensors.items()}
+
+    def _read_pads(self) -> None:
+        """Read the pads whose readings are stale, and no others."""
+        env_idx = self._touch_is_stale.nonzero()[:, 0]
+        if len(env_idx) == 0:
+            return
+        for sensor in self._tactile_sensors.values():
+            sensor.capture(None if len(env_idx) == self.num_envs else env_idx)
+        self._touch_is_stale[:] = False
 
     def get_sensor_images(self) -> dict[str, dict[str, torch.Tensor]]:
         """Images of every camera and pad in the present state, uint8 (N, H, W, 3) each."""

@@ -2,7 +2,8 @@
 
 # pyright: reportArgumentType=false
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -30,7 +31,7 @@ from .checks import check_num_envs, check_seed, checked_randomization, split_sen
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
-from .states import is_part_of, unflattened, with_rows
+from .states import is_part_of, rows, unflattened, with_rows
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
@@ -285,11 +286,13 @@ class VisuotactileEnv(SceneryEnv):
         check_seed(seed)
         if seed is not None and self.num_envs == 1:
             options["reconfigure"] = True
-        obs, info = super().reset(seed=seed, options=options)
-        if "reset_to_env_states" in options:
-            return obs, info
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
-        self._settle(env_idx)
+        with self._others_unchanged(env_idx):
+            obs, info = super().reset(seed=seed, options=options)
+            if "reset_to_env_states" in options:
+                return obs, info
+            self._settle()
+        self._touch_is_stale[env_idx] = True
         for sensor in self._tactile_sensors.values():
             sensor.forget_readings(env_idx)  # which are from before the grip had settled
         info = self.get_info() | dict(reconfigure=info["reconfigure"], language_instruction=self.get_language_instruction())
@@ -300,21 +303,26 @@ class VisuotactileEnv(SceneryEnv):
         """The task as a sentence, one for each environment; the method's name and form are those of ManiSkill's tasks."""
         return [instruction_of(type(self))] * self.num_envs
 
-    def _settle(self, env_idx: torch.Tensor) -> None:
-        """Let the grip take its load before the first observation; the other environments' states are restored afterwards."""
+    @contextmanager
+    def _others_unchanged(self, env_idx: torch.Tensor) -> Iterator[None]:
+        """Restore the other environments' states afterwards, with their controllers' targets; their pads are not read again."""
         others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         others[env_idx] = False
-        state: Any = self.get_state_dict() if others.any() else None
+        if not others.any():
+            yield
+            return
+        running = others.nonzero()[:, 0]
+        state = rows(self.get_state_dict(), running)
+        yield
+        self.set_state_dict(state, running)
+        self._touch_is_stale[running] = False
+
+    def _settle(self) -> None:
+        """Let the grip take its load before the first observation."""
         for _ in range(round(SETTLE_SECONDS * self._sim_freq)):
             self.scene.step()
         if self.gpu_sim_enabled:
             self.scene._gpu_fetch_all()
-        if state is not None:
-            running = others.nonzero()[:, 0]
-            state.pop("controller", None)
-            state = {kind: {k: v[running] for k, v in bodies.items()} for kind, bodies in state.items()}
-            self.set_state_dict(state, running)
-        self._touch_is_fresh = False
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict):
         with torch.device(self.device):
@@ -323,7 +331,7 @@ class VisuotactileEnv(SceneryEnv):
         self._steps_at_goal[env_idx] = 0
         self._success_paper[env_idx] = False
         self._contact_force[env_idx] = 0.0
-        self._touch_is_fresh, self._measured = False, None
+        self._touch_is_stale[env_idx], self._measured = True, None
         for sensor in self._tactile_sensors.values():
             sensor.reset(env_idx, self._episode_seed[env_idx.cpu().numpy()])
 
@@ -334,7 +342,7 @@ class VisuotactileEnv(SceneryEnv):
         self._joint_forces = []
         action = super()._step_action(action)
         self._contact_force = self.agent.held_object_force(torch.stack(self._joint_forces)).amax(dim=0)
-        self._touch_is_fresh = False
+        self._touch_is_stale[:] = True
         self._measured = self.measure()  # for the `evaluate` that follows
         reached = self.goal_reached(self._measured)
         self._steps_at_goal = torch.where(reached, self._steps_at_goal + 1, 0)
@@ -358,7 +366,7 @@ class VisuotactileEnv(SceneryEnv):
         changed = slice(None) if env_idx is None else env_idx
         if "controller" in state:  # ManiSkill's controllers take the states of all environments
             self.agent.set_controller_state(with_rows(self.agent.get_controller_state(), changed, state["controller"]))
-        self._touch_is_fresh, self._measured = False, None
+        self._touch_is_stale[changed], self._measured = True, None
 
     def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
         """Set the state from the vectors (N, D) of `get_state`, which hold the controller's targets, too."""

@@ -62,3 +62,32 @@ def test_partial_reset_leaves_the_other_environments_unchanged(env):
     for name, poses in before.items():
         assert torch.allclose(after["extra"][name][others], poses[others], atol=1e-5), name
         assert not torch.allclose(after["extra"][name][2], poses[2], atol=1e-3), name
+
+
+def test_partial_reset_leaves_targets_and_touch_of_the_other_environments_unchanged(make_env):
+    imperfect = dict(delay=2, noise=0.02, drift=0.1, hysteresis=0.2)
+    options = dict(num_envs=NUM_ENVS, sim_backend="physx_cuda", render_backend="none", imperfections=imperfect)
+    env = make_env(obs_mode="state_dict+tacff", **options)
+    base, others = env.unwrapped, [0, 1, 3]
+    env.reset(seed=0)
+    for _ in range(5):
+        obs, *_ = env.step(torch.full((NUM_ENVS, 6), 0.3))
+    field = obs["sensor_data"]["tactile_right"]["force_field"].clone()
+    targets = base.agent.get_controller_state()["arm"]["target_pose"].clone()
+    after, _ = env.reset(options=dict(env_idx=torch.tensor([2], device=base.device)))
+    assert torch.equal(after["sensor_data"]["tactile_right"]["force_field"][others], field[others])
+    assert torch.equal(base.agent.get_controller_state()["arm"]["target_pose"][others], targets[others])
+    assert base._tactile_sensors["tactile_right"].model._imperfections.memory["frame"].tolist() == [6, 6, 1, 6]
+
+
+def test_the_state_of_one_environment_can_be_set(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    start = base.get_state()
+    for _ in range(3):
+        env.step(torch.full((NUM_ENVS, 6), 0.3))
+    moved = base.get_state()
+    base.set_state(start[2:3], torch.tensor([2], device=base.device))
+    now = base.get_state()
+    assert torch.allclose(now[2], start[2], atol=1e-5)
+    assert torch.allclose(now[[0, 1, 3]], moved[[0, 1, 3]], atol=1e-5)

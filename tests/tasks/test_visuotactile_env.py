@@ -180,7 +180,7 @@ def test_looking_twice_changes_nothing(make_env):
 def test_touch_is_computed_once_a_step_and_only_where_asked_for(make_env, monkeypatch):
     captures = []
     capture = TactileSensor.capture
-    monkeypatch.setattr(TactileSensor, "capture", lambda self: (captures.append(self.uid), capture(self)))
+    monkeypatch.setattr(TactileSensor, "capture", lambda self, *args: (captures.append(self.uid), capture(self, *args)))
     env = make_env(obs_mode="tacff", tactile_sensors=("left",), render_backend="none")
     env.reset(seed=0)
     captures.clear()
