@@ -163,6 +163,26 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
 
 
 @needs_renderer
+@pytest.mark.parametrize("render_backend", ["cpu", "none"])
+def test_what_is_drawn_but_collides_with_nothing_is_not_felt(render_backend):
+    """ManiSkill marks goals with such bodies."""
+
+    def build(env):
+        builder = env.scene.create_actor_builder()
+        if env.scene.can_render():
+            builder.add_sphere_visual(radius=0.02, material=RenderMaterial())
+        builder.initial_pose = sapien.Pose([0, 0, 2])
+        return [builder.build_kinematic("goal_site")]
+
+    env = PadBench(build, obs_mode="tacff", render_backend=render_backend)
+    sensor = env._tactile_sensors["tactile_right"]
+    env.place(env.objects[0], sapien.Pose([0, 0, 0.02 - DEEP]))
+    sensor._depth.look()
+    assert sensor._depth.heights(sensor.model.cells).max() < 0
+    env.close()
+
+
+@needs_renderer
 def test_empty_mesh_is_named():
     points = np.eye(3, dtype=np.float32)
     shape = sapien.render.RenderShapeTriangleMesh(

@@ -1,8 +1,8 @@
 """The surfaces that a pad may touch: every body of a ManiSkill scene as one triangle mesh in its own frame.
 
 The mesh is the body's visual shape or, if nothing is drawn (`render_backend="none"`), its collision shape. Bodies need no
-registration: all bodies of the scene are found. A body whose surface is finer than its visual shape, such as a golf ball's,
-can be given a relief.
+registration: all bodies of the scene are found that something can collide with, and not the marker of a goal, for example. A
+body whose surface is not its visual shape, such as a golf ball's, which is finer, can be given a relief.
 """
 
 import functools
@@ -45,7 +45,7 @@ def give_relief(actor: Actor, mesh: trimesh.Trimesh) -> None:
 
 
 def scene_surfaces(scene: ManiSkillScene, excluded: set[str]) -> list[Surface]:
-    """Surfaces of all actors and links of the scene, except the links named in `excluded`.
+    """Surfaces of all actors and links of the scene that collide or have a relief, except the links named in `excluded`.
 
     Raises:
         InvalidFileError: A body has a mesh without triangles.
@@ -56,11 +56,16 @@ def scene_surfaces(scene: ManiSkillScene, excluded: set[str]) -> list[Surface]:
     for body in [*scene.actors.values(), *(link for link in links if link.name not in excluded)]:
         entities = [obj if isinstance(obj, sapien.Entity) else obj.entity for obj in body._objs]
         relief = getattr(body, RELIEF, None)
-        found = [entity_mesh(entity) if relief is None else relief for entity in entities]
+        found = [_felt_mesh(entity) if relief is None else relief for entity in entities]
         meshes = [mesh for mesh in found if mesh is not None]
         if len(meshes) == len(entities):
             surfaces.append(Surface(body, body._scene_idxs, meshes))
     return surfaces
+
+
+def _felt_mesh(entity: sapien.Entity) -> trimesh.Trimesh | None:
+    bodies = [component for component in entity.components if isinstance(component, physx.PhysxRigidBaseComponent)]
+    return entity_mesh(entity) if any(body.collision_shapes for body in bodies) else None
 
 
 def entity_mesh(entity: sapien.Entity) -> trimesh.Trimesh | None:
