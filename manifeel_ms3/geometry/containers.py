@@ -1,6 +1,9 @@
 """The containers of the exploration tasks, and the battery that is hidden in one."""
 
+from typing import cast
+
 import numpy as np
+import trimesh
 
 from manifeel_ms3.rendering.looks import BRASS, CARDBOARD, Look
 
@@ -28,7 +31,7 @@ def container(front_drawn: bool) -> Part:
     """Opaque container in which the battery lies.
 
     Args:
-        front_drawn: Whether the front, at +x, is drawn; it collides in any case.
+        front_drawn: Whether the front, at +x, is drawn and touched; it collides in any case.
     """
     return open_box(CONTAINER_OUTER, CONTAINER_HEIGHT, front_drawn)
 
@@ -39,7 +42,7 @@ def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Pa
     Args:
         outer: Outer size along x and y, in m.
         height: Height, in m.
-        front_drawn: Whether the front, at +x, is drawn; it collides in any case.
+        front_drawn: Whether the front, at +x, is drawn and touched; it collides in any case.
     """
     (x, y), wall = outer, CONTAINER_WALL
     pieces = (
@@ -48,7 +51,10 @@ def open_box(outer: tuple[float, float], height: float, front_drawn: bool) -> Pa
         *(Box((x - 2 * wall, wall, height), (0.0, side * (y - wall) / 2, height / 2)) for side in (-1, 1)),
         Box((x - 2 * wall, y - 2 * wall, CONTAINER_FLOOR), (0.0, 0.0, CONTAINER_FLOOR / 2)),
     )
-    return Part("container", pieces, CARDBOARD, undrawn=frozenset() if front_drawn else frozenset({0}))
+    if front_drawn:
+        return Part("container", pieces, CARDBOARD)
+    others = cast(trimesh.Trimesh, trimesh.util.concatenate([piece.mesh for piece in pieces[1:]]))
+    return Part("container", pieces, CARDBOARD, undrawn=frozenset({0}), relief=others)
 
 
 def battery() -> Part:

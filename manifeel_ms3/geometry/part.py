@@ -14,6 +14,7 @@ from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.paths import derived_file
 from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.sensors.depth.surfaces import give_relief
@@ -33,6 +34,11 @@ class Box:
 
     size: tuple[float, float, float]
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def mesh(self) -> trimesh.Trimesh:
+        """Surface of the box."""
+        return trimesh.creation.box(self.size).apply_translation(self.centre)
 
     def add_to(self, builder, material: PhysxMaterial, density: float, look: RenderMaterial | None) -> None:
         pose, half_size = sapien.Pose(self.centre), np.asarray(self.size) / 2
@@ -128,7 +134,7 @@ class Part:
     name: str
     """Name of the actor in the scene."""
     pieces: tuple[Piece, ...]
-    """Shapes that are drawn, collide and are touched."""
+    """Shapes that collide and, but for `undrawn` and `relief`, are drawn and touched."""
     look: Look
     """Look of the surface."""
     density: float = ABS
@@ -143,11 +149,18 @@ class Part:
     other_frictions: dict[int, float] = field(default_factory=dict)
     """Friction coefficients of single pieces, by index in `pieces`."""
     undrawn: frozenset[int] = frozenset()
-    """Indices in `pieces` of those that collide, but are neither drawn nor touched."""
+    """Indices in `pieces` of those that collide, but are neither drawn nor touched; they need a `relief` of the others."""
     springs: dict[int, float] = field(default_factory=dict)
     """Stiffness of compliant pieces, in N/m at each contact point, by index in `pieces`."""
     relief: trimesh.Trimesh | None = None
-    """Surface that the pads touch, where it has details too fine for cameras and contacts."""
+    """Surface that the pads touch, where it has details too fine for cameras and contacts, or not all pieces."""
+
+    def __post_init__(self):
+        if self.undrawn and self.relief is None:  # without a renderer, pads touch what collides
+            raise InvalidArgumentError(
+                f"part {self.name!r} has undrawn={sorted(self.undrawn)} and no relief; give the surface of its other pieces "
+                "as `relief`, so that the pads touch the same with and without a renderer"
+            )
 
     def build(self, scene: ManiSkillScene, body_type: str, initial_pose: sapien.Pose) -> Actor:
         """Add the part to a scene.

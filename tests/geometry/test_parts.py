@@ -9,6 +9,7 @@ import trimesh
 from sapien import physx, render
 from scipy.spatial import cKDTree
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import (
     FITS,
     bulb_and_holder,
@@ -105,3 +106,9 @@ def test_what_is_drawn_is_what_collides(bodies, k):
         drawn_meshes = [s for s in drawn.render_shapes if isinstance(s, render.RenderShapeTriangleMesh)]
         distance, _ = cKDTree(corners).query(np.concatenate([visual_points(shape) for shape in drawn_meshes]))
         assert distance.max() < TOLERANCE
+
+
+def test_a_piece_that_is_not_drawn_needs_a_relief_of_the_others():
+    part = container(front_drawn=False)
+    with pytest.raises(InvalidArgumentError, match=r"part 'container' has undrawn=\[0\] and no relief"):
+        dataclasses.replace(part, relief=None)

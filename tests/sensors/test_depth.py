@@ -9,6 +9,7 @@ import trimesh
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.errors import InvalidFileError, MachineError
+from manifeel_ms3.geometry.containers import CONTAINER_HEIGHT, CONTAINER_OUTER, container
 from manifeel_ms3.sensors import TactileSensor, sensor_config
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from manifeel_ms3.verification.press import PadBench
@@ -179,6 +180,26 @@ def test_what_is_drawn_but_collides_with_nothing_is_not_felt(render_backend):
     env.place(env.objects[0], sapien.Pose([0, 0, 0.02 - DEEP]))
     sensor._depth.look()
     assert sensor._depth.heights(sensor.model.cells).max() < 0
+    env.close()
+
+
+@needs_renderer
+@pytest.mark.parametrize("front_drawn", [True, False])
+@pytest.mark.parametrize("render_backend", ["cpu", "none"])
+def test_a_front_that_is_left_out_is_not_felt(render_backend, front_drawn):
+    env = PadBench(
+        lambda env: [container(front_drawn).build(env.scene, "kinematic", sapien.Pose([0, 0, 2]))],
+        obs_mode="tacff",
+        render_backend=render_backend,
+    )
+    sensor = env._tactile_sensors["tactile_right"]
+    front_to_pad = sapien.Pose(q=trimesh.transformations.quaternion_about_axis(np.pi / 2, [0, 1, 0]))  # its x is along -z
+    (depth, _), middle = CONTAINER_OUTER, CONTAINER_HEIGHT / 2
+    env.place(env.objects[0], sapien.Pose([0, 0, depth / 2 - DEEP]) * front_to_pad * sapien.Pose([0, 0, -middle]))
+    sensor._depth.look()
+    height = sensor._depth.heights(sensor.model.cells)
+    assert (height.min() == pytest.approx(DEEP, abs=5e-6)) is front_drawn
+    assert (height.max() < 0) is not front_drawn
     env.close()
 
 
