@@ -18,7 +18,7 @@ from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
-from mani_skill.utils.structs import Pose
+from mani_skill.utils.structs import Actor, Pose
 
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
@@ -44,6 +44,8 @@ HOLD_DAMPING, HOLD_FORCE_LIMIT = 2e2, 100.0
 """Damping, in N s/m, and largest force, in N, of a finger that holds."""
 GRIPPER_FORCE_LIMIT = 40.0
 """Largest force of a finger, in N, that a policy can command. Set once; not tuned."""
+GRASP_FORCE = 0.5
+"""Smallest force of each pad on a body, in N, with which the hand grasps it (ManiSkill's Panda)."""
 FINGER_RANGE = (-0.01, 0.04)
 """Range of a finger's commanded distance from the middle, in m. A command beyond the surface of a held object is a force:
 1 kN/m times the distance."""
@@ -305,6 +307,11 @@ class PandaGelSight(BaseAgent):
         """
         forces = joint_forces[..., self._gel_indices, :3]
         return torch.linalg.norm(torch.einsum("...kj,kij->...i", forces, self._joint_to_hand), dim=-1)
+
+    def is_grasping(self, body: Actor, min_force: float = GRASP_FORCE) -> torch.Tensor:
+        """Whether both pads press on a body, each with at least `min_force`, in N; (N,) bool."""
+        forces = [self.scene.get_pairwise_contact_forces(gel, body) for gel in self.gels.values()]
+        return torch.stack([torch.linalg.norm(force, dim=1) >= min_force for force in forces]).all(dim=0)
 
     def torque_on_held(self, point: torch.Tensor) -> torch.Tensor:
         """Torque (N,), in N m, of both pads on the held object about the vertical through `point` (N, 3).

@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 
 from manifeel_ms3.geometry.balls import SEAT_HEIGHT, SEAT_SPACING
+from manifeel_ms3.geometry.containers import BOWL_HEIGHT
 from manifeel_ms3.sensors import OpticsConfig, TactileSensor, sensor_config
-from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS, BallSortingEnv
+from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS, PAD_END, BallSortingEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .skills import DOWNWARD, Actions, Skills, above, perceived_position
@@ -37,8 +38,8 @@ class BallSortingExpertConfig:
     """Change of the smoothed tactile image, in grey levels, above which a pixel is in contact. Tuned."""
     lift_height: float = 0.12
     """Distance by which the golf ball is lifted, in m: the goal of 0.10 m with a margin."""
-    release_height: float = 0.045
-    """Height of the tool over the table, in m, at which a held ball is just over the floor of a bowl."""
+    release_height: float = BOWL_HEIGHT + PAD_END
+    """Height of the tool over the table, in m, at which a held ball is let go of: the fingertips are just over a bowl's rim."""
     open_steps: int = 5
     """Number of steps for which the gripper opens. Tuned."""
     lane: float = 0.035

@@ -193,7 +193,7 @@ def test_a_front_that_is_left_out_is_not_felt(render_backend, front_drawn):
         render_backend=render_backend,
     )
     sensor = env._tactile_sensors["tactile_right"]
-    front_to_pad = sapien.Pose(q=trimesh.transformations.quaternion_about_axis(np.pi / 2, [0, 1, 0]))  # its x is along -z
+    front_to_pad = sapien.Pose(q=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0])  # its x is along -z
     (depth, _), middle = CONTAINER_OUTER, CONTAINER_HEIGHT / 2
     env.place(env.objects[0], sapien.Pose([0, 0, depth / 2 - DEEP]) * front_to_pad * sapien.Pose([0, 0, -middle]))
     sensor._depth.look()

@@ -5,8 +5,11 @@ import pytest
 import torch
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.experts.skills import Skills
 from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
+from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_HEIGHT
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS
+from manifeel_ms3.tasks.placement import POINTING_DOWN
 from tests.tasks_and_marks import needs_renderer
 
 SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
@@ -99,6 +102,38 @@ def test_each_ball_belongs_in_its_own_bowl(make_env, golf, tennis, goal):
         base.scene.step()
     assert bool(base.goal_reached(base.measure())) is goal
     assert not base.failed(base.measure()).any()
+
+
+@pytest.mark.parametrize(
+    ("height", "aside", "goal"), [(0.0, 0.0, True), (0.0, 0.02, True), (0.043, 0.0, False), (0.01, 0.06, False)]
+)
+def test_a_ball_over_or_beside_its_bowl_is_not_in_it(make_env, height, aside, goal):
+    env = make_env(SORTING, obs_mode="none", render_backend="none", goal="bowls")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for ball in ("golf", "tennis"):
+        (x, y), _ = BOWLS[ball]
+        place = torch.tensor([[x + aside, y, BOWL_FLOOR + BALL_RADIUS + height]])
+        getattr(base, ball).set_pose(Pose.create_from_pq(place))
+    assert bool(base.goal_reached(base.measure())) is goal
+
+
+def test_a_ball_counts_when_the_hand_has_let_go_of_it(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none", goal="bowls")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for ball, (xy, _) in BOWLS.items():
+        getattr(base, ball).set_pose(Pose.create_from_pq(torch.tensor([[*xy, BOWL_FLOOR + BALL_RADIUS]])))
+    over_rim = torch.tensor([[*BOWLS["tennis"][0], BOWL_HEIGHT + 0.019]])  # the fingertips are 1 mm over it
+    width, force = 0.039, 3.0  # m between the gels' lower ends, which press on the ball over its middle; N
+    base.agent.reset_tool(Pose.create_from_pq(over_rim, torch.tensor([POINTING_DOWN])), width / 2, force)
+    base.agent.controller.reset()
+    held = Skills(base).grip_action(width, force)
+    for gripper, success in ((held, False), (1.0, True)):
+        for _ in range(10):
+            *_, info = env.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, gripper]))
+        assert bool(base.agent.is_grasping(base.tennis)) is not success
+        assert bool(info["success"]) is success
 
 
 def test_unknown_goal_is_refused(make_env):

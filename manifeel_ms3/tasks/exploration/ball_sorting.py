@@ -9,7 +9,7 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.geometry.balls import BALL_RADIUS, SEAT_HEIGHT, SEAT_SPACING, ball_stand, golf_ball, tennis_ball
-from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_RADIUS, bowl
+from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_HEIGHT, BOWL_RADIUS, bowl
 from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.tasks.placement import OUT_OF_REACH, REACH_XY, WORKSPACE_XY, height_range, start_pose, uniform_in
 from manifeel_ms3.tasks.registry import register_task
@@ -92,6 +92,7 @@ class BallSortingEnv(VisuotactileEnv):
     **Fail Conditions:** a ball lies on the table.
 
     `goal="bowls"` is the paper's task on the real robot: the golf ball goes into an orange bowl and the other into a blue one.
+    It succeeds when each ball has been in its bowl, and out of the hand, for 0.5 s.
     """
 
     _sample_video_link = "docs/videos/BallSorting.mp4"
@@ -156,9 +157,16 @@ class BallSortingEnv(VisuotactileEnv):
         middle = torch.tensor([*BOWLS[ball][0], BOWL_FLOOR + BALL_RADIUS], device=self.device)
         return torch.linalg.norm(getattr(self, ball).pose.p - middle, dim=1)
 
+    def _is_in_bowl(self, ball: str) -> torch.Tensor:
+        """Whether a ball's centre is within its bowl and below the rim, and the hand has let go of the ball; (N,) bool."""
+        body = getattr(self, ball)
+        position, middle = body.pose.p, torch.tensor(BOWLS[ball][0], device=self.device)
+        within = torch.linalg.norm(position[:, :2] - middle, dim=1) < BOWL_RADIUS
+        return within & (position[:, 2] < BOWL_HEIGHT) & ~self.agent.is_grasping(body)
+
     def goal_reached(self, measures):
         if self.goal == "bowls":
-            return (measures["golf_to_bowl"] < BOWL_RADIUS) & (measures["tennis_to_bowl"] < BOWL_RADIUS)
+            return self._is_in_bowl("golf") & self._is_in_bowl("tennis")
         return (measures["golf_height"] > LIFTED) & (measures["tennis_away"] < IN_PLACE)
 
     def failed(self, measures):
