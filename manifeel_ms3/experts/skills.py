@@ -203,6 +203,12 @@ class Skills:
         limits = self.agent.controller.controllers["gripper"].config
         return float(np.clip((position - limits.lower) / (limits.upper - limits.lower) * 2 - 1, -1, 1))
 
+    @property
+    def present_grip(self) -> float:
+        """Gripper command that keeps the fingers' present target."""
+        finger = self.agent.controller.controllers["gripper"].active_joint_indices[0]
+        return self.finger_action(float(self.agent.robot.get_drive_targets()[0, finger]))
+
     def grip_action(self, width: float, force: float) -> float:
         """Gripper command that presses each finger with `force`, in N, on an object `width` wide, in m."""
         return self.finger_action(width / 2 - force / self.agent.controller.controllers["gripper"].config.stiffness)

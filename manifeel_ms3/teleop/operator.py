@@ -12,6 +12,8 @@ from manifeel_ms3.errors import InvalidArgumentError
 
 HOLD = 0.25
 """Time in s for which one key press moves the arm; a key that is held down repeats faster, so that the arm keeps moving."""
+OPEN, CLOSED = 1.0, -1.0
+"""Gripper commands that open the hand, and that close it as firmly as it can."""
 FIRST_SPEED = 0.5
 """Share of the full speed at which the arm moves until the person sets another speed; set once, not tuned."""
 
@@ -63,7 +65,7 @@ class Operator:
         self._mode = Mode.READY
         self._command: EpisodeCommand | None = None
         self._pushed: dict[str, tuple[float, float]] = {}
-        self._closed_gripper = False
+        self._gripper, self._closing, self._is_closed = OPEN, CLOSED, False
 
     @property
     def mode(self) -> Mode:
@@ -83,14 +85,25 @@ class Operator:
     def toggle_gripper(self) -> None:
         """Open the gripper if it is closed, and close it if it is open."""
         with self._changed:
-            self._closed_gripper = not self._closed_gripper
+            self._is_closed = not self._is_closed
+            self._gripper = self._closing if self._is_closed else OPEN
+
+    def take_over_gripper(self, command: float, holds_part: bool) -> None:
+        """Go on from the gripper's command at the start of an episode.
+
+        Args:
+            command: The command, from 1 (open) to -1 (closed).
+            holds_part: Whether the hand holds a part with it; it is then also the command that closes the hand again.
+        """
+        with self._changed:
+            self._gripper, self._closing, self._is_closed = command, command if holds_part else CLOSED, holds_part
 
     def action(self) -> np.ndarray:
         """The action that is wanted now, (A,) in [-1, 1]."""
         with self._changed:
             now = self._clock()
             moving = {axis: direction * self.speed for axis, (direction, until) in self._pushed.items() if now < until}
-            moving["gripper"] = -1.0 if self._closed_gripper else 1.0
+            moving["gripper"] = self._gripper
             return np.clip([moving.get(axis, 0.0) for axis in self.axes], -1.0, 1.0).astype(np.float32)
 
     # ---------------------------------------------------------------- modes
@@ -100,7 +113,7 @@ class Operator:
         with self._changed:
             if self._mode is not Mode.CLOSED:
                 self._mode = Mode.READY
-            self._command, self._closed_gripper = None, False
+            self._command = None
             self._pushed.clear()
 
     def start(self) -> None:

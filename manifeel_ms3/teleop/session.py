@@ -5,14 +5,17 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
 
+from manifeel_ms3.agents.panda_gelsight import GRASP_FORCE
 from manifeel_ms3.demonstrations.episode import run_episode
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, write_episode
 from manifeel_ms3.demonstrations.recording import make_header, open_recording, require_demonstration_seeds
+from manifeel_ms3.experts.skills import Skills
+from manifeel_ms3.tasks import VisuotactileEnv
 
 from .operator import EpisodeCommand, Mode, Operator
 
@@ -82,7 +85,10 @@ class Session:
             self._recording.finish()
 
     def _actions(self) -> Iterator[np.ndarray]:
-        """Actions at the environment's control rate, while the operator lets the robot move."""
+        """Actions at the environment's control rate, while the operator lets the robot move; the first ones keep the grip."""
+        if "gripper" in self.operator.axes:
+            skills = Skills(cast(VisuotactileEnv, self.env.unwrapped))
+            self.operator.take_over_gripper(skills.present_grip, bool(skills.squeeze.min() >= GRASP_FORCE))
         due = time.monotonic()
         while not self.operator.is_over:
             if not self.operator.may_move(PATIENCE):

@@ -26,9 +26,10 @@ class Notes:
     """A screen that keeps what a person would have seen."""
 
     def __init__(self):
-        self.steps, self.lines = 0, []
+        self.steps, self.lines, self.info = 0, [], {}
 
     def show(self, obs, info):
+        self.info = info
         assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (1, 10, 14, 3)
         self.steps += 1
 
@@ -42,11 +43,11 @@ class Notes:
 class Desk:
     """A session that runs in a thread, and what belongs to it."""
 
-    def __init__(self, out: Path, **kwargs):
+    def __init__(self, out: Path, task: str = PEG, **kwargs):
         self.kwargs = KWARGS | kwargs
-        self.env = gym.make(PEG, **self.kwargs)
+        self.env = gym.make(task, **self.kwargs)
         self.operator, self.screen = Operator(steerable_axes(self.env.unwrapped.control_mode)), Notes()
-        self.session = Session(self.env, PEG, self.kwargs, out, 0, self.operator)
+        self.session = Session(self.env, task, self.kwargs, out, 0, self.operator)
         self.thread = threading.Thread(target=self.session.run, args=(self.screen,))
         self.thread.start()
         wait_until(lambda: self.screen.steps > 0)
@@ -145,6 +146,16 @@ def test_nothing_moves_before_start_nor_while_paused(desk):
     assert still.screen.steps == steps
 
 
+@pytest.mark.parametrize("task", ["ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"])
+def test_the_hand_keeps_the_part_that_it_starts_with_until_the_person_opens_it(desk, task):
+    idle = desk(task=task)
+    idle.operator.start()
+    wait_until(lambda: idle.screen.steps > 20)
+    assert not idle.screen.info["fail"].any()
+    idle.operator.toggle_gripper()
+    wait_until(lambda: idle.screen.info["fail"].any())
+
+
 def test_a_file_of_another_task_stays(desk, tmp_path):
     first = desk()
     first.move("z", -1.0)
@@ -173,6 +184,16 @@ def test_a_push_lasts_a_moment_and_the_gripper_stays():
     assert operator.action() == pytest.approx([0, -0.4, 0, 1.0, 0, 0, -1.0])  # no action leaves [-1, 1]
     now[0] = HOLD
     assert operator.action() == pytest.approx([0, 0, 0, 0, 0, 0, -1.0])
+
+
+def test_the_gripper_closes_again_with_the_command_that_held_the_part():
+    operator, commands = Operator(AXES), []
+    for command, holds_part in ((-0.4, True), (0.6, False)):
+        operator.take_over_gripper(command, holds_part)
+        for _ in range(3):
+            commands.append(float(operator.action()[-1]))
+            operator.toggle_gripper()
+    assert commands == pytest.approx([-0.4, 1.0, -0.4, 0.6, -1.0, 1.0])
 
 
 def test_modes_follow_each_other():
