@@ -130,4 +130,6 @@ class SceneryEnv(SensingEnv):
         """Draw the looks of an episode from its seed, if they are random."""
         if self._random_looks is not None:
             drawn = self._random_looks.draw(seed)
-            self._looks = {name: torch.as_tensor(value, dtype=torch.float32)[None] for name, value in drawn.items()}
+            self._looks = {
+                name: torch.as_tensor(value, dtype=torch.float32, device=self.device)[None] for name, value in drawn.items()
+            }
