@@ -25,6 +25,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
     """Copy the results of a study's finished evaluations into a submission's folder.
 
     Results that the folder holds of other evaluations stay, such as those of a machine that did another part of the study.
+    Results of the same set-up and training seed are replaced.
 
     Args:
         jobs: Jobs of the study; of those that are evaluations, those in half precision are published.
@@ -37,8 +38,10 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         The number of results that the folder then holds.
 
     Raises:
-        InvalidArgumentError: No evaluation in half precision is done.
-        FileExistsAlreadyError: The folder exists and is not a submission.
+        InvalidArgumentError: No evaluation in half precision is done, or two results would have the same place.
+        FileExistsAlreadyError: The folder exists and is not a submission, or results of another set-up have the place of new
+            ones.
+        ResultError: A result is broken.
         FileWriteError: The folder cannot be written.
     """
     done = [job for job in jobs if job.kind == "evaluate" and job.settings["half_precision"] and is_done(job, root)]
@@ -51,11 +54,47 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         restore_folder(folder)
         if folder.is_dir() and not (folder / ABOUT).is_file():
             raise FileExistsAlreadyError(f"{folder} exists and is not a submission: it has no {ABOUT}; give another folder")
+        _check_places(results, folder)
         with atomic_folder(folder, replace=True) as partial:
-            hashes = _copy_old(folder, partial) | _publish_results(results, partial)
+            about = _copy_old(folder, partial)
+            hashes = about.get("checkpoints", {}) | _publish_results(results, partial)
             hashes = {result: sha256 for result, sha256 in hashes.items() if (partial / result).is_file()}
-            write_json(partial / ABOUT, dict(name=name, authors=authors, checkpoints=hashes))
+            write_json(partial / ABOUT, about | dict(name=name, authors=authors, checkpoints=hashes))
     return len(hashes)
+
+
+def _check_places(results: list[Path], folder: Path) -> None:
+    """Check that no two results have the same place, and that an entry's folder has results of one condition only.
+
+    Raises:
+        InvalidArgumentError: Two of the results would have the same place.
+        FileExistsAlreadyError: The folder holds results of another condition in the place of one of them.
+    """
+    new: dict[Path, tuple[Path, Condition]] = {}
+    places: set[Path] = set()
+    for path in results:
+        result = read_result(path)
+        entry, place, condition = folder / entry_name(result), _run_folder(folder, result) / path.name, condition_of(result)
+        other, known = new.setdefault(entry, (path, condition))
+        if known != condition or place in places:
+            raise InvalidArgumentError(
+                f"{other} of {known} and {path} of {condition} would both be published in {entry}"
+                f"{_differing_settings(known, condition)}; publish them from two studies into two folders"
+            )
+        places.add(place)
+    for entry, (path, condition) in new.items():
+        for old in sorted(entry.glob("seed*/*.json")):
+            if (known := condition_of(read_result(old))) != condition:
+                raise FileExistsAlreadyError(
+                    f"{old} is of {known}, and {path} of {condition} would be published beside it or in its place"
+                    f"{_differing_settings(known, condition)}; remove {entry}, or give another folder"
+                )
+
+
+def _differing_settings(first: Condition, second: Condition) -> str:
+    """Words that name the settings in which two conditions differ; "" if there are none."""
+    names = sorted({name for name, _ in set(first.settings) ^ set(second.settings)})
+    return f" (they differ in {', '.join(names)})" if names else ""
 
 
 def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
@@ -70,13 +109,13 @@ def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
     return hashes
 
 
-def _copy_old(folder: Path, partial: Path) -> dict[str, str]:
-    """Copy what the folder holds, and return the hashes of its checkpoints by their results."""
+def _copy_old(folder: Path, partial: Path) -> dict[str, Any]:
+    """Copy what the folder holds, and return the content of its submission.json."""
     if not folder.is_dir():
         return {}
     shutil.copytree(folder, partial, dirs_exist_ok=True)
     schema = json.loads((data_dir() / "submission_schema.json").read_text(encoding="utf-8"))
-    return read_json(folder / ABOUT, schema, "a submission")["checkpoints"]
+    return read_json(folder / ABOUT, schema, "a submission")
 
 
 def _run_folder(folder: Path, result: dict[str, Any]) -> Path:
@@ -97,7 +136,8 @@ def _publish_result(path: Path, checkpoint: Path, folder: Path) -> Path:
 def entry_name(result: dict[str, Any]) -> str:
     """Name of the folder of a result in its submission, such as "PegInsertion/rgb+tacff".
 
-    What differs from the paper's Table I is added: another policy, camera, number of demonstrations or argument of the task.
+    What differs from the paper's Table I is added: another policy, encoder of TacRGB than that of the cameras, camera, finger
+    pad, number of demonstrations or argument of the task. Two conditions that only differ in other settings share a name.
     """
     condition = condition_of(result)
     return "/".join((condition.task, "-".join((condition.obs_mode, *_differences(condition)))))
@@ -105,8 +145,12 @@ def entry_name(result: dict[str, Any]) -> str:
 
 def _differences(condition: Condition) -> list[str]:
     found = [] if condition.policy == DP else [condition.policy]
+    if condition.encoder not in ("", condition.network):
+        found.append(condition.encoder)
     if condition.cameras not in ((), (task_spec(condition.env_id).policy_camera,)):
         found += condition.cameras
+    if condition.pads not in ((), ("right",)):
+        found += condition.pads
     if condition.num_demos != training_demos(condition.task):
         found.append(f"{condition.num_demos}demos")
     if condition.variant:
@@ -114,8 +158,9 @@ def _differences(condition: Condition) -> list[str]:
     return found
 
 
-def _words(value: Any) -> list[str]:
-    """The innermost values of arguments, as parts of a file's name."""
-    if isinstance(value, dict):
-        return [word for part in value.values() for word in _words(part)]
-    return [re.sub(r"\W+", "_", str(value))]
+def _words(arguments: dict[str, Any]) -> list[str]:
+    """The innermost arguments of a task as parts of a file's name, such as "lighting_dim"."""
+    words = []
+    for name, value in arguments.items():
+        words += _words(value) if isinstance(value, dict) else [re.sub(r"\W+", "_", f"{name}_{value}").strip("_")]
+    return words
