@@ -21,10 +21,10 @@ from importlib import import_module
 from multiprocessing import active_children, forkserver, resource_tracker
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Any, Generic, TypeVar
+from weakref import WeakSet
 
 import torch
 from pebble import ProcessExpired, ProcessPool
-from pebble.pool.process import WORKERS_NAME
 
 from .errors import InvalidArgumentError, WorkFailedError
 from .typed_modules import imported
@@ -87,11 +87,22 @@ class WorkerContext(ForkServerContext):
     nor threads survive a fork of this process. They ignore Ctrl-C, as the server does.
     """
 
-    Process = WorkerProcess
-
     def __init__(self) -> None:
         super().__init__()
+        self._made: WeakSet[WorkerProcess] = WeakSet()
         _start_server()
+
+    def Process(self, *args: Any, **kwargs: Any) -> WorkerProcess:  # noqa: N802  # pyright: ignore[reportIncompatibleVariableOverride]
+        """A process that has not started; the arguments are those of `multiprocessing.Process`."""
+        process = WorkerProcess(*args, **kwargs)
+        self._made.add(process)
+        return process
+
+    def kill(self) -> None:
+        """Kill the processes of this context that run; those of other contexts go on."""
+        for process in active_children():
+            if process in self._made:
+                process.kill()
 
 
 def _start_server() -> None:
@@ -167,7 +178,8 @@ class WorkerPool(Generic[State, Task]):
         if workers < 1:
             raise InvalidArgumentError(f"{workers} worker processes are asked for; at least 1 is needed")
         worker = _Worker(make_state)
-        self._pool = ProcessPool(workers, context=WorkerContext(), initializer=_start, initargs=(worker, imported()))
+        self._context = WorkerContext()
+        self._pool = ProcessPool(workers, context=self._context, initializer=_start, initargs=(worker, imported()))
         self._running: dict[Future[Any], Task] = {}
 
     def __enter__(self) -> "WorkerPool[State, Task]":
@@ -178,9 +190,7 @@ class WorkerPool(Generic[State, Task]):
             self._pool.close()
         else:
             self._pool.stop()
-            for process in active_children():
-                if process.name == WORKERS_NAME:  # a request to end would wait until native code returns
-                    process.kill()
+            self._context.kill()  # a request to end would wait until native code returns
         self._pool.join()
 
     @property

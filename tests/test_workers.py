@@ -77,17 +77,30 @@ def test_errors_of_a_task_and_of_the_state_are_raised_in_the_caller():
                 finished.result()
 
 
-def test_an_exception_ends_tasks_that_run_and_wait():
-    def fail() -> None:
-        with WorkerPool(1, partial(counter, 0)) as pool:
-            for _ in range(3):
-                pool.submit(sleep, 100)
-            raise ZeroDivisionError
+def fail_while_tasks_run() -> None:
+    with WorkerPool(1, partial(counter, 0)) as pool:
+        for _ in range(3):
+            pool.submit(sleep, 100)
+        raise ZeroDivisionError
 
+
+def test_an_exception_ends_tasks_that_run_and_wait():
     before = time.monotonic()
     with pytest.raises(ZeroDivisionError):
-        fail()
+        fail_while_tasks_run()
     assert time.monotonic() - before < 50
+
+
+def test_an_exception_does_not_end_the_processes_of_another_pool():
+    with WorkerPool(1, partial(counter, 0)) as other:
+        other.submit(add, 1)
+        (first,) = other.as_finished()
+        with pytest.raises(ZeroDivisionError):
+            fail_while_tasks_run()
+        other.submit(add, 2)
+        (second,) = other.as_finished()
+    process, total = second.result()
+    assert (process, total) == (first.result()[0], 3)  # the same process, with its state
 
 
 class EndsTheProcess:
