@@ -5,19 +5,14 @@ of the same condition only if they differ in nothing but the training seed, the 
 """
 
 import hashlib
-import inspect
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from functools import cache
 from typing import Any
 
-from manifeel_ms3.errors import UnknownNameError
-from manifeel_ms3.evaluation.evaluate import SENSING
-from manifeel_ms3.tasks.registry import short_name, task_spec
+from manifeel_ms3.evaluation.variant import SENSING, variant_of
+from manifeel_ms3.tasks.registry import short_name
 
-BACKENDS = ("sim_backend", "render_backend")
-"""Arguments of an environment that say what computes it; they do not make another condition."""
 NO_SETTINGS = frozenset(
     {
         *("policy_name", "env_id", *SENSING, "num_demos", "env_kwargs"),  # these have fields of their own
@@ -135,38 +130,6 @@ def condition_of(result: dict[str, Any]) -> Condition:
 
 def _names(given: Any) -> tuple[str, ...]:
     return tuple(map(str, given)) if isinstance(given, (list, tuple)) else ()
-
-
-def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
-    """Arguments of a task that are not its defaults, as json; "" if there are none.
-
-    Args:
-        env_id: Id of the task.
-        env_kwargs: Arguments of `gym.make`.
-    """
-    defaults = _default_arguments(env_id)
-    other = {
-        name: value
-        for name, value in env_kwargs.items()
-        if name not in (*SENSING, *BACKENDS) and not (name in defaults and defaults[name] == value)
-    }
-    return json.dumps(other, sort_keys=True) if other else ""
-
-
-@cache
-def _default_arguments(env_id: str) -> dict[str, Any]:
-    """The defaults of a task's own arguments; {} for a task that is not registered here."""
-    try:
-        classes = task_spec(env_id).env_class.__mro__
-    except UnknownNameError:
-        return {}
-    parameters = [inspect.signature(one.__init__).parameters for one in reversed(classes) if "__init__" in vars(one)]
-    return {
-        name: parameter.default
-        for of_class in parameters
-        for name, parameter in of_class.items()
-        if parameter.default is not parameter.empty
-    }
 
 
 def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:

@@ -39,11 +39,9 @@ from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
 from .seed_list import read_seeds
+from .variant import SENSING
 
 log = logging.getLogger(__name__)
-SENSING = ("obs_mode", "cameras", "tactile_sensors")
-"""Arguments of the environment that have entries of their own in a checkpoint's configuration; its entry env_kwargs holds the
-other arguments, with which the demonstrations were recorded."""
 BACKEND = dict(sim_backend="physx_cpu")
 """Backend of the simulation, the one that demonstrations are recorded with."""
 

@@ -66,19 +66,20 @@ class Floor:
         return f"{self.rate:.0%} [{self.low:.0%}, {self.high:.0%}]"
 
 
-def floors_of(env_id: str, revision: int, folder: Path | None = None) -> dict[str, Floor]:
-    """The floors of a task by the names of the policies; {} where none were measured on this revision.
+def floors_of(env_id: str, revision: int, variant: str = "", folder: Path | None = None) -> dict[str, Floor]:
+    """The floors of a task by the names of the policies; {} where none were measured.
 
     Args:
         env_id: Id of the task.
         revision: Revision of the task.
+        variant: Arguments of the task other than its defaults, for which no floor is known; "" for the defaults.
         folder: Folder of the files; that of the package if not given.
 
     Raises:
         InvalidFileError: The file of the task is broken.
     """
     path = floors_file(env_id, folder)
-    if not path.is_file():
+    if variant or not path.is_file():
         return {}
     content: dict[str, Any] = read_json(path, FORM, "the failure floors of a task")
     if content["revision"] != revision:
@@ -98,9 +99,7 @@ def highest_floor(env_id: str, revision: int, variant: str = "", folder: Path | 
     Raises:
         InvalidFileError: The file of the task is broken.
     """
-    if variant:
-        return None
-    floors = floors_of(env_id, revision, folder).values()
+    floors = floors_of(env_id, revision, variant, folder).values()
     return max(floors, key=lambda floor: (floor.rate, floor.high), default=None)
 
 

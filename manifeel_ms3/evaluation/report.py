@@ -20,10 +20,11 @@ from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import make_env
 
 from .checkpoint_config import TRAINING_LOSS
-from .floors import Floor, floors_of
+from .floors import floors_of
 from .gentle import success_under_force
 from .policy import checked_device, load_policy
 from .result import read_result
+from .variant import variant_of
 
 with missing_extras_named():
     import jinja2
@@ -124,12 +125,6 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
-def _floors_of(result: dict[str, Any]) -> dict[str, Floor]:
-    """Success of policies that have learnt nothing; {} if it was not measured, or if the result has other task arguments."""
-    changed = result["env_kwargs"].keys() & {"fit", "lighting", "occlusion", "randomization"}
-    return {} if changed else floors_of(result["env_id"], result["revision"])
-
-
 def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
     """The device and the batch size of an evaluation, with which an episode runs as it did there."""
     return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
@@ -153,7 +148,7 @@ def main(args: Args) -> Path:
         result=result,
         outcome=outcome,
         rates={label: result[name] for name, label in RATES.items() if name in result},
-        floors=_floors_of(result),
+        floors=floors_of(result["env_id"], result["revision"], variant_of(result["env_id"], result["env_kwargs"])),
         force_curve=Markup(force_curve(result)),
         randomization=randomization_of(result),
         rows=rows,

@@ -34,7 +34,7 @@ def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
     about = dict(schema=FLOORS_SCHEMA, env_id=NUT, revision=spec.revision, git_commit=None, command="made up")
     floors_file(NUT, tmp_path).write_text(json.dumps(about | dict(floors={"mean action": mean})))
     (path,) = floors.main(floors.Args((NUT,), ("random",), episodes=1, out=tmp_path))
-    found = floors_of(NUT, spec.revision, tmp_path)
+    found = floors_of(NUT, spec.revision, folder=tmp_path)
     assert {name: (one.episodes, one.rate) for name, one in found.items()} == {"random": (1, 0.0), "mean action": (7, 0.5)}
     assert highest_floor(NUT, spec.revision, folder=tmp_path).policy == "mean action"
     assert floors._earlier(path, spec.revision + 1) == {}  # floors of another revision are not kept
@@ -44,7 +44,7 @@ def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
 @needs_renderer
 def test_all_policies_are_measured(tmp_path):
     floors.main(floors.Args((SEARCH,), episodes=2, out=tmp_path))
-    found = floors_of(SEARCH, task_spec(SEARCH).revision, tmp_path)
+    found = floors_of(SEARCH, task_spec(SEARCH).revision, folder=tmp_path)
     assert list(found) == list(POLICIES)
     assert all(floor.episodes == 2 for floor in found.values())
 

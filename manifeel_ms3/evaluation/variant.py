@@ -1,0 +1,47 @@
+"""Variants of a task: its arguments that are not the defaults, such as another fit, light, goal or sensor."""
+
+import inspect
+import json
+from functools import cache
+from typing import Any
+
+from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.tasks.registry import task_spec
+
+SENSING = ("obs_mode", "cameras", "tactile_sensors")
+"""Arguments of the environment that have entries of their own in a checkpoint's configuration; its entry env_kwargs holds the
+other arguments, with which the demonstrations were recorded."""
+BACKENDS = ("sim_backend", "render_backend")
+"""Arguments of an environment that say what computes it; they do not make another variant."""
+
+
+def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
+    """Arguments of a task that are not its defaults, as json; "" if there are none.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make`.
+    """
+    defaults = _default_arguments(env_id)
+    other = {
+        name: value
+        for name, value in env_kwargs.items()
+        if name not in (*SENSING, *BACKENDS) and not (name in defaults and defaults[name] == value)
+    }
+    return json.dumps(other, sort_keys=True) if other else ""
+
+
+@cache
+def _default_arguments(env_id: str) -> dict[str, Any]:
+    """The defaults of a task's own arguments; {} for a task that is not registered here."""
+    try:
+        classes = task_spec(env_id).env_class.__mro__
+    except UnknownNameError:
+        return {}
+    parameters = [inspect.signature(one.__init__).parameters for one in reversed(classes) if "__init__" in vars(one)]
+    return {
+        name: parameter.default
+        for of_class in parameters
+        for name, parameter in of_class.items()
+        if parameter.default is not parameter.empty
+    }
