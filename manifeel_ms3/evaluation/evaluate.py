@@ -34,7 +34,7 @@ from .checkpoint_config import CheckpointError, checkpoint_config
 from .engine import Evaluation, run_episodes
 from .entries import Entry, find_entry
 from .journal import Journal
-from .policy import BATCH_SIZES, STEP_TIMEOUT, PolicySource, checked_device
+from .policy import BATCH_SIZES, INFERENCE_STEPS, STEP_TIMEOUT, PolicySource, checked_device
 from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
@@ -153,6 +153,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
         out=args.out or Path("evaluation.json"),
         device=args.device or inference["device"],
         batch_size=args.batch_size or inference["batch_size"],
+        inference_steps=args.inference_steps or made["config"].get(INFERENCE_STEPS),
         stop_at_success=made["stop_at_success"],
         env_kwargs=args.env_kwargs if args.env_kwargs != "{}" else json.dumps(made["env_kwargs"]),
     )
@@ -213,7 +214,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
     given = json_object("--env-kwargs", args.env_kwargs)
     policy_kwargs = json_object("--policy-kwargs", args.policy_kwargs)
     if args.checkpoint is not None:
-        return _of_checkpoint(args, policy_kwargs | dict(inference_steps=args.inference_steps), given)
+        return _of_checkpoint(args, policy_kwargs | {INFERENCE_STEPS: args.inference_steps}, given)
     if args.env_id is None or args.obs_mode is None:
         raise InvalidArgumentError("a --policy of your own needs --env-id and --obs-mode")
     if unused := [name for name in ("device", "batch_size") if getattr(args, name) is not None]:
@@ -235,7 +236,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     if missing := [name for name in ("env_id", *SENSING) if name not in config]:
         raise CheckpointError(f"{checkpoint}: its config.json lacks {missing}; train the policy again")
     # recorded in the result, because it changes the actions
-    config |= {name: value for name, value in kwargs.items() if name == "inference_steps" and value}
+    config |= {name: value for name, value in kwargs.items() if name == INFERENCE_STEPS and value}
     env_id = task_spec(config["env_id"]).env_id
     trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
     sensing = {name: config[name] for name in SENSING}

@@ -4,7 +4,7 @@ import importlib
 import importlib.util
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +19,8 @@ from manifeel_ms3.typed_modules import look_in_working_folder
 from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash
 from .redaction import redacted
 
+INFERENCE_STEPS = "inference_steps"
+"""Argument of a checkpoint's policy, and entry of its configuration: the number of generation steps of an action chunk."""
 STEP_TIMEOUT = 60.0
 """Longest time in s that a policy may take for one action if no other time is given; set once, not tuned."""
 
@@ -134,6 +136,22 @@ class PolicySource:
                 f"{redacted(name)} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, "
                 "and its arguments as --policy-kwargs"
             ) from error
+
+    def as_in(self, result: dict[str, Any]) -> "PolicySource":
+        """The policy as it acted in a result.
+
+        A checkpoint's actions depend on its device, the size of its batches and the number of its generation steps; all three
+        are then those of the result. Any other policy stays as it is.
+
+        Raises:
+            MachineError: This machine does not have the device.
+        """
+        if self.checkpoint is None:
+            return self
+        recorded = {name: value for name, value in result["config"].items() if name == INFERENCE_STEPS}
+        kwargs = json.dumps(recorded | json.loads(self.kwargs))
+        inference = result["inference"]
+        return replace(self, kwargs=kwargs, device=checked_device(inference["device"]), batch_size=inference["batch_size"])
 
     @property
     def is_server(self) -> bool:

@@ -22,7 +22,7 @@ from manifeel_ms3.tasks.registry import make_env
 from .checkpoint_config import TRAINING_LOSS
 from .floors import floors_of
 from .gentle import success_under_force
-from .policy import checked_device, load_policy
+from .policy import PolicySource
 from .result import read_result
 from .variant import variant_of
 
@@ -125,11 +125,6 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
-def _inference_of(result: dict[str, Any]) -> dict[str, Any]:
-    """The device and the batch size of an evaluation, with which an episode runs as it did there."""
-    return result["inference"] | dict(device=checked_device(result["inference"]["device"]))
-
-
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
@@ -141,7 +136,7 @@ def main(args: Args) -> Path:
     result = read_result(args.run_dir / "evaluation.json")
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
-    policy = load_policy(args.run_dir / "checkpoints/last", **_inference_of(result))
+    policy = PolicySource(args.run_dir / "checkpoints/last").as_in(result).make()
     outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(

@@ -10,7 +10,6 @@ import math
 import random
 import secrets
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +23,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import HASHED, checkpoint_config, checkpoint_sha256
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
-from manifeel_ms3.evaluation.policy import PolicySource, checked_device
+from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.provenance import package_versions
 
@@ -212,6 +211,7 @@ def run_again(
 
     Raises:
         SubmissionError: An outcome differs.
+        MachineError: This machine does not have the device that computed a result.
     """
     seed = secrets.randbits(SEED_BITS) if seed is None else seed
     drawn = draw(submission, most, seed)
@@ -220,9 +220,8 @@ def run_again(
     for path, numbers in drawn.items():
         result = submission.results[path]
         submitted = [result["episodes"][k] for k in numbers]
-        source = _computed_as(sources[path], result["inference"])
         stop = result["stop_at_success"]
-        evaluation = Evaluation(source, result["env_id"], result["env_kwargs"], result["config"], stop)
+        evaluation = Evaluation(sources[path].as_in(result), result["env_id"], result["env_kwargs"], result["config"], stop)
         seeds = [episode["seed"] for episode in submitted]
         outcomes = run_episodes(evaluation, seeds, workers)
         faults += _faults_of_a_result(path, result, submitted, outcomes)
@@ -230,17 +229,6 @@ def run_again(
     if faults:
         raise SubmissionError(submission.folder, faults)
     return Rerun(seed, package_versions(), files)
-
-
-def _computed_as(source: PolicySource, inference: dict[str, Any]) -> PolicySource:
-    """The policy on the device and in the batches of a result, on which the last bits of its actions depend.
-
-    Raises:
-        MachineError: This machine does not have the device.
-    """
-    if source.checkpoint is None:
-        return source
-    return replace(source, device=checked_device(inference["device"]), batch_size=inference["batch_size"])
 
 
 def _faults_of_a_result(

@@ -26,7 +26,7 @@ from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.episode import run_episode
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.evaluation.policy import Policy, PolicySource, checked_device
+from manifeel_ms3.evaluation.policy import Policy, PolicySource
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.evaluation.rollout import evaluate_episode
 from manifeel_ms3.progress import progress_bar
@@ -80,10 +80,13 @@ class Source:
     """Arguments of `gym.make`."""
     entry: dict[str, Any]
     """The episode's entry in the header of the trajectory file, or in the result."""
-    is_result: bool
-    """Whether the file is a result of an evaluation, and not a trajectory file."""
-    inference: dict[str, Any]
-    """Device and batch size of the policy of a result; empty for a trajectory file."""
+    result: dict[str, Any] | None
+    """Content of the file if it is a result of an evaluation; None for a trajectory file."""
+
+    @property
+    def is_result(self) -> bool:
+        """Whether the file is a result of an evaluation, and not a trajectory file."""
+        return self.result is not None
 
     @property
     def seed(self) -> int:
@@ -155,8 +158,7 @@ def read_source(path: Path, episode: int) -> Source:
     if not 0 <= episode < count:
         raise InvalidArgumentError(f"--episode {episode}: {path} has the episodes 0 to {count - 1}")
     env_id = task_spec(about["env_id"]).env_id
-    kwargs, inference = dict(about["env_kwargs"]), content.get("inference", {})
-    return Source(path, env_id, kwargs, content["episodes"][episode], is_result, inference)
+    return Source(path, env_id, dict(about["env_kwargs"]), content["episodes"][episode], content if is_result else None)
 
 
 def _take(source: Source, args: Args) -> Take:
@@ -174,8 +176,8 @@ def _take(source: Source, args: Args) -> Take:
         counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
         with closing(video_env(source.env_id, source.env_kwargs, view)) as env:
             filmed = VideoWrapper(env, take, view, steps, lambda: bar.advance(counter))
-            if source.is_result:
-                evaluate_episode(filmed, _policy(source, args), source.seed, on_step=lambda _obs: None)
+            if source.result is not None:
+                evaluate_episode(filmed, _policy(source.path, source.result, args), source.seed, on_step=lambda _obs: None)
             else:
                 _replay(filmed, source)
     if any(take.successes) != source.success:
@@ -190,18 +192,17 @@ def _replay(env: VideoWrapper, source: Source) -> None:
     run_episode(env, source.seed, lambda: actions)
 
 
-def _policy(source: Source, args: Args) -> Policy:
+def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:
     """The policy of a result."""
     if args.policy is not None:
         return PolicySource(policy=args.policy, kwargs=args.policy_kwargs).make()
-    checkpoint = args.checkpoint or source.path.parent / "checkpoints/last"
+    checkpoint = args.checkpoint or path.parent / "checkpoints/last"
     if not checkpoint.is_dir():
         raise InvalidArgumentError(
-            f"{source.path} holds no actions, and there is no policy in {checkpoint} that could act again; give its "
+            f"{path} holds no actions, and there is no policy in {checkpoint} that could act again; give its "
             "--checkpoint or --policy"
         )
-    device = checked_device(source.inference.get("device"))
-    return PolicySource(checkpoint, None, args.policy_kwargs, device, source.inference.get("batch_size")).make()
+    return PolicySource(checkpoint, kwargs=args.policy_kwargs).as_in(result).make()
 
 
 def _name_difference(source: Source, success: bool) -> None:

@@ -7,11 +7,15 @@ from pathlib import Path
 import pytest
 
 from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
 from manifeel_ms3.evaluation.entries import find_entry
+from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.checks import check
+from manifeel_ms3.leaderboard.rerun import checkpoint_sources, run_again
 from manifeel_ms3.leaderboard.submission import read_submission
 from manifeel_ms3.provenance import machine
-from tests.tasks_and_marks import needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
+from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 BOARD = Path(__file__).parents[2] / "leaderboard"
 ENTRY = "cpu/PegInsertion/rgb+tacff"
@@ -46,6 +50,24 @@ def test_an_entry_is_run_again(tmp_path, caplog):
     assert said
     if machine()["cpu"] == published["machine"]["cpu"] and again["versions"] == published["versions"]:
         assert said[1] == "1"  # other processors round differently
+
+
+def test_an_entry_is_run_again_with_its_number_of_generation_steps(tmp_path, monkeypatch):
+    run = tmp_path / "leaderboard/tiny/Peg/tacff/seed0"
+    checkpoint = save_tiny_checkpoint(run / "checkpoints/00000001")
+    config = json.loads((checkpoint / "config.json").read_text()) | dict(env_id=PEG)
+    (checkpoint / "config.json").write_text(json.dumps(config))
+    bare = json.dumps(dict(render_backend="none", max_episode_steps=6))
+    result = run / "00000001.json"
+    evaluate.main(evaluate.Args(checkpoint, inference_steps=2, episodes=2, env_kwargs=bare, out=result))
+    about = dict(name="Tiny", authors="Us", checkpoints={"Peg/tacff/seed0/00000001.json": checkpoint_sha256(checkpoint)})
+    (tmp_path / "leaderboard/tiny/submission.json").write_text(json.dumps(about))
+    monkeypatch.chdir(tmp_path)
+    again = evaluate.main(evaluate.Args(entry="tiny/Peg/tacff", episodes=2))
+    assert config["inference_steps"] != read_result(again)["config"]["inference_steps"] == 2
+    submission = read_submission(tmp_path / "leaderboard/tiny")
+    rerun = run_again(submission, checkpoint_sources(submission, [checkpoint], "{}"), seed=0)
+    assert [len(file.episodes) for file in rerun.files.values()] == [2]  # an outcome that differs would be an error
 
 
 def test_an_entry_brings_its_own_checkpoint(tmp_path):
