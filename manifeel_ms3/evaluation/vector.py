@@ -28,11 +28,16 @@ def make_eval_envs(
 
     The arguments are those of `make_eval_envs` of ManiSkill's baselines.
 
+    Only "physx_cpu" gives the episodes of the evaluation seeds: there, each environment starts from its own seed. With
+    "physx_cuda", ManiSkill draws the initial states of all environments together, from the seed of the first one and on the
+    GPU. The episodes then repeat with the list of seeds, but are others than those that `manifeel eval` runs, and are no
+    part of the protocol.
+
     Args:
         env_id: Id of the task.
         num_envs: Number of environments. On the CPU each has a process of its own, which is spawned, since a renderer does
             not survive a fork; a script then needs `if __name__ == "__main__":`.
-        sim_backend: Backend of the simulation, "physx_cpu" or "physx_cuda".
+        sim_backend: Backend of the simulation: "physx_cpu", or "physx_cuda" with other initial states, see above.
         env_kwargs: Arguments of `gym.make`.
         other_kwargs: `obs_horizon`, the number of observations that are stacked by ManiSkill's `FrameStack`, which takes flat
             observations only (`obs_mode="state"`, or a wrapper that flattens); they are not stacked if not given.

@@ -280,7 +280,8 @@ class VisuotactileEnv(SceneryEnv):
         """Reset as ManiSkill does; with a seed, on the CPU, also build the scene anew (0.1 s).
 
         The engine's solver remembers earlier episodes. Only in a new scene is an episode a function of its seed alone, bit for
-        bit.
+        bit. Where several environments share a process, ManiSkill seeds the draws of their initial states with the first
+        environment's seed: they are then functions of that seed and of the number of environments.
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
         check_seed(seed)
