@@ -3,6 +3,9 @@
 Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
 holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. Both
 conditions have the same settings and the paper's number of demonstrations, except in the claim about that number.
+
+Interval and verdict are those of a single comparison. Of many comparisons without any difference, 5 % exclude zero by chance;
+the p-values after Holm's correction for all comparisons that were run say which differences remain.
 """
 
 import logging
@@ -18,7 +21,7 @@ from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
 from .encoder_ranking import ranking_tables
-from .estimates import Estimate, difference
+from .estimates import SIGNIFICANT, Estimate, difference, holm
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper_claims import Comparison, comparisons
@@ -30,6 +33,11 @@ Verdict = Literal["holds", "does not hold", "undecided"]
 MARGIN = 0.05
 """Largest gain in success that counts as none where a claim says that there is no gain: five points, our choice."""
 
+MANY_TESTS = """Interval, p and verdict are each of one comparison alone. The table tests {count} of them, and of many tests,
+5 % find a difference where there is none. The column "p, Holm" is corrected for all tests of the table (Holm 1979): {remaining}
+of the {count} differences have a corrected p below 0.05.
+"""
+
 
 @dataclass(frozen=True)
 class ClaimResult:
@@ -39,7 +47,10 @@ class ClaimResult:
     """How much more often the first condition succeeds."""
     p_value: float
     """Probability of so large a difference if both conditions succeed equally often."""
+    p_holm: float
+    """The p-value after Holm's correction for all comparisons that were run."""
     verdict: Verdict
+    """Whether the claim holds, by this comparison alone."""
     settings: TrainingSettings
     """Settings that both conditions were run with."""
 
@@ -53,14 +64,15 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
     Raises:
         ResultError: Results cannot be told apart, or are of different initial states.
     """
-    return {comparison: _results_of(comparison, found) for comparison in comparisons()}
-
-
-def _results_of(comparison: Comparison, found: Found) -> list[ClaimResult]:
-    outcomes = []
-    for settings, (first, second) in answering_all([comparison.first, comparison.second], found).items():
-        gap, p_value = difference(found[first], found[second])
-        outcomes.append(ClaimResult(gap, p_value, _verdict(comparison, gap), settings))
+    differences = {
+        (comparison, settings): difference(found[first], found[second])
+        for comparison in comparisons()
+        for settings, (first, second) in answering_all([comparison.first, comparison.second], found).items()
+    }
+    corrected = holm([p_value for _, p_value in differences.values()])
+    outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
+    for ((comparison, settings), (gap, p_value)), p_holm in zip(differences.items(), corrected, strict=True):
+        outcomes[comparison].append(ClaimResult(gap, p_value, p_holm, _verdict(comparison, gap), settings))
     return outcomes
 
 
@@ -73,16 +85,26 @@ def _verdict(comparison: Comparison, gap: Estimate) -> Verdict:
 def claims_page(found: Found) -> str:
     """Markdown: a table with a row for each comparison, those that were not run included, and the ranking of encoders.
 
+    A sentence says how many comparisons the table tests, and which p-values are corrected for their number.
+
     Args:
         found: The results that enter comparisons.
     """
-    rows = []
-    for comparison, outcomes in results_of_claims(found).items():
+    rows, answered = [], results_of_claims(found)
+    for comparison, outcomes in answered.items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
-        ran = [(one.difference.signed, f"{one.p_value:.3f}", one.verdict, one.settings) for one in outcomes]
-        rows += [(*what, *cells) for cells in ran or [(None, None, "not run", None)]]
-    table = markdown_table(("claim", "task", "compared", "difference", "p", "verdict", "settings"), rows)
-    return f"{table}\n{''.join(ranking_tables(found))}"
+        ran = [
+            (one.difference.signed, f"{one.p_value:.3f}", f"{one.p_holm:.3f}", one.verdict, one.settings) for one in outcomes
+        ]
+        rows += [(*what, *cells) for cells in ran or [(None, None, None, "not run", None)]]
+    table = markdown_table(("claim", "task", "compared", "difference", "p", "p, Holm", "verdict", "settings"), rows)
+    note = MANY_TESTS.format(count=sum(map(len, answered.values())), remaining=_remaining(answered))
+    return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
+
+
+def _remaining(answered: dict[Comparison, list[ClaimResult]]) -> int:
+    """Number of comparisons whose difference is significant after the correction."""
+    return sum(one.p_holm < SIGNIFICANT for outcomes in answered.values() for one in outcomes)
 
 
 def _compared(comparison: Comparison) -> str:

@@ -20,6 +20,8 @@ RESAMPLES = 4000
 """Number of resamples of a bootstrap; the ends of intervals then vary by less than half a point."""
 TAILS = (0.025, 0.975)
 """Quantiles at the ends of an interval of 95 %."""
+SIGNIFICANT = 0.05
+"""Largest p-value of a difference that counts as one."""
 NO_SPREAD = 1e-12
 """Range of resampled rates below which they differ only by rounding."""
 
@@ -80,6 +82,22 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
     drawn = np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides))
     rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
     return _estimate(value, drawn, (first, second), lowest=-1.0), float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P-values after Holm's correction (1979) for several tests, in their order.
+
+    The probability that any true hypothesis of the family has a corrected p-value below 5 % is 5 % at most, however the tests
+    depend on each other. A hypothesis may therefore be chosen from the family after looking at the results.
+
+    Args:
+        p_values: P-values of all tests of the family.
+    """
+    order = np.argsort(p_values)
+    factors = np.arange(len(order), 0, -1)
+    corrected = np.empty(len(order))
+    corrected[order] = np.maximum.accumulate(np.asarray(p_values)[order] * factors).clip(max=1.0)
+    return corrected.tolist()
 
 
 def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.ndarray:

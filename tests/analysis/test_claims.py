@@ -7,7 +7,7 @@ import pytest
 from manifeel_ms3.analysis import claims
 from manifeel_ms3.analysis.condition import Condition
 from manifeel_ms3.analysis.encoder_ranking import rankings, verdict_on
-from manifeel_ms3.analysis.estimates import Estimate
+from manifeel_ms3.analysis.estimates import Estimate, holm
 from manifeel_ms3.analysis.paper import ENCODERS, MODES, POLICIES, TACFF, TACRGB, VISION, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.protocol import collect, of_the_protocol
@@ -41,6 +41,17 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     page = (tmp_path / "claims.md").read_text()
     assert "| PegInsertion | rgb+tacff over rgb (wrist, diffusion_policy, 50 demonstrations) | +30% [" in page
     assert page.count("| not run |") == len(answers) - 1
+
+
+def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
+    for task in ("PegInsertion", "USBInsertion", "PowerPlugInsertion"):
+        write_run(tmp_path, VISION, 0.2, task=task)
+        write_run(tmp_path, TACFF, 0.32, task=task)
+    found = [outcome for _, _, outcome in answered(tmp_path)]
+    assert [one.p_holm for one in found] == holm([one.p_value for one in found])
+    assert any(one.verdict == "holds" and one.p_value < 0.05 < one.p_holm for one in found)
+    remaining = sum(one.p_holm < 0.05 for one in found)
+    assert f"{remaining} of the 3 differences have a corrected p below 0.05" in " ".join(page_of(tmp_path).split())
 
 
 def test_the_page_says_what_touch_adds_to_vision(tmp_path):
@@ -194,6 +205,21 @@ def test_encoders_that_are_near_each_other_decide_nothing(tmp_path):
     write_encoders(tmp_path, {task: dict.fromkeys(ENCODERS[task], 0.5) for task in ("GearAssembly", "ObjectSearch")})
     ((_, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
     assert verdict_on(ranked) == "undecided"
+
+
+def test_an_encoder_that_is_chosen_as_the_best_afterwards_must_be_better_by_more_than_chance(tmp_path):
+    """The best of four lies so far ahead of the worst that a test of these two alone would find a difference."""
+    rates = {task: dict(zip(ENCODERS[task], (0.68, 0.62, 0.56, 0.5), strict=True)) for task in ENCODERS}
+    for task, of_task in rates.items():
+        for encoder, rate in of_task.items():
+            write_run(tmp_path, TACRGB, rate, task=task, encoder=encoder, **NEEDS.get(encoder, {}))
+    ((_, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
+    clear = [(ranking, pair) for ranking in ranked for pair, gap in ranking.gaps.items() if gap.low > 0]
+    assert clear
+    assert not any(ranking.beats(*pair) for ranking, pair in clear)
+    assert verdict_on(ranked) == "undecided"
+    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith(f"| GearAssembly | {ranked[0].encoders[0]} |"))
+    assert row.endswith(f"| {ranked[0].p_values[ranked[0].encoders[:2]]:.3f} |")
 
 
 def test_encoders_from_different_weights_are_not_mixed(tmp_path):

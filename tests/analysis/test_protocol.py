@@ -7,7 +7,7 @@ import pytest
 
 from manifeel_ms3.analysis.census import census_table
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
-from manifeel_ms3.analysis.estimates import difference, mean_success
+from manifeel_ms3.analysis.estimates import difference, holm, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.tasks.registry import task_spec
@@ -175,6 +175,19 @@ def test_a_difference_is_found_where_there_is_one(rng):
     none, p = difference(runs(rng, 0.5), runs(rng, 0.5))
     assert none.low < 0 < none.high
     assert p > 0.05
+
+
+def test_p_values_are_corrected_as_holm_does():
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])  # 3 x, 2 x 0.03 twice, 4 x
+    assert holm([0.6, 0.9]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+def test_families_of_equal_conditions_rarely_show_a_difference(rng):
+    """Of 100 families of ten p-values without any difference, about 5 have one below 5 % after the correction, 40 before."""
+    families = rng.uniform(size=(100, 10))
+    assert (families.min(1) < 0.05).sum() > 30
+    assert sum(min(holm(family)) < 0.05 for family in families) < 12
 
 
 def test_initial_states_are_compared_one_by_one(rng):
