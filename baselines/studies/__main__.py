@@ -287,7 +287,7 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
     cpu = gpu = 0.0
     for (kind, title), group in track(groups.items(), "measuring", transient=True):
         needs = study.resources[kind]
-        costs = [cost.estimate(job, root, needs.workers) for job in group if not is_done(job, root)]
+        costs = [cost.estimate(job, root, needs.workers, gpus=needs.gpus) for job in group if not is_done(job, root)]
         hours = sum(one.seconds for one in costs if one) / 3600
         cpu, gpu = cpu + hours * needs.cpus, gpu + hours * needs.gpus
         source = "done" if not costs else costs[0].source if costs[0] else "not known before the first has run"

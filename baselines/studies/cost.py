@@ -18,6 +18,7 @@ from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE
 from baselines.common.train_args import default_steps
 from baselines.registry import policy_spec, preset_cli
+from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
@@ -84,7 +85,7 @@ class Trial:
         return known[self.key]["seconds"]
 
 
-def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEstimate | None:
+def estimate(job: Job, root: Path, workers: int, try_out: bool = True, gpus: float = 0.0) -> CostEstimate | None:
     """How long a job will take; None if that is not known.
 
     Args:
@@ -92,6 +93,7 @@ def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEs
         root: Folder of all jobs.
         workers: Number of processes that simulate.
         try_out: Whether to run trials if no job like this one was done here. The pretraining of encoders has no trials.
+        gpus: Number of GPUs that the study gives the job; trials run on the CPU without one, as the job does.
     """
     parallel = workers if job.kind in SIMULATING else 1
     took = [status["seconds"] / max(status["units"], 1) * status["parallel"] for status in _done(job, root)]
@@ -99,7 +101,7 @@ def estimate(job: Job, root: Path, workers: int, try_out: bool = True) -> CostEs
         return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")
     if not try_out or job.kind == "pretrain":
         return None
-    return CostEstimate(_unit_seconds(job, root) * _units(job) / parallel, "a trial")
+    return CostEstimate(_unit_seconds(job, root, gpus) * _units(job) / parallel, "a trial")
 
 
 def _done(job: Job, root: Path) -> list[dict[str, Any]]:
@@ -144,22 +146,30 @@ def _demonstration_steps(env_id: str) -> float:
 # -------------------------------------------------------------------- trials
 
 
-def trials_of(job: Job) -> tuple[Trial, ...]:
-    """The trials from which the cost of a job is estimated; none for the pretraining of an encoder."""
+def trials_of(job: Job, gpus: float = 0.0) -> tuple[Trial, ...]:
+    """The trials from which the cost of a job is estimated; none for the pretraining of an encoder.
+
+    Args:
+        job: The job.
+        gpus: Number of GPUs that the study gives the job.
+    """
     if job.kind == "record":
         return (_simulation_trial(job, OBS_MODE),)
     if job.kind == "pretrain":
         return ()
     train = job if job.kind == "train" else job.needs[0]
-    network = train.settings["policy"], *train_flags(_work(train.settings))
+    device = "cuda" if gpus and torch.cuda.is_available() else "cpu"
+    preset, *flags = train_flags(_work(train.settings))
+    network = train.settings["policy"], preset, "--device", device, *flags
     if job.kind == "train":
         return (Trial(gradient_step, network),)
-    return _simulation_trial(train.needs[0], training_args(train).obs_mode), Trial(inference, network)
+    as_evaluated = "--device", device, "--batch-size", str(BATCH_SIZES[device])
+    return _simulation_trial(train.needs[0], training_args(train).obs_mode), Trial(inference, (*network, *as_evaluated))
 
 
-def _unit_seconds(job: Job, root: Path) -> float:
+def _unit_seconds(job: Job, root: Path, gpus: float) -> float:
     """Seconds of one demonstration, gradient step or episode, with one process."""
-    seconds = [trial.seconds(root) for trial in trials_of(job)]
+    seconds = [trial.seconds(root) for trial in trials_of(job, gpus)]
     if job.kind == "train":
         return seconds[0]
     env_id = job.settings["env_id"]
@@ -220,15 +230,16 @@ def gradient_step(policy: str, *flags: str) -> float:
 
 
 def inference(policy: str, *flags: str) -> float:
-    """Seconds in which a policy generates its actions on the CPU.
+    """Seconds in which a policy generates the actions of one batch.
 
     Args:
         policy: Registered name of the policy.
-        flags: Preset and flags of training.
+        flags: Preset and flags of training, with the device and the batch size of the evaluation.
     """
-    network, args, obs, _ = _made_up(policy, (*flags, "--batch-size", "1", "--device", "cpu"))
+    network, args, obs, actions = _made_up(policy, flags)
     network.eval()
-    return _seconds(lambda: network.sample(obs, args.inference_steps, [torch.Generator()]), 1)
+    generators = [torch.Generator() for _ in actions]
+    return _seconds(lambda: network.sample(obs, args.inference_steps, generators).cpu(), 1)  # `cpu` waits for a GPU
 
 
 def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:

@@ -97,7 +97,7 @@ def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     jobs = jobs_of(study)
     pretrained = {"pretrain"} if any(grid.pretrain for grid in study.grids) else set()
     assert {job.kind for job in jobs} == {"record", "train", "evaluate"} | pretrained
-    trials = [trial for job in jobs for trial in cost.trials_of(job)]
+    trials = [trial for job in jobs for trial in cost.trials_of(job, study.resources[job.kind].gpus)]
     measured = {trial.key: dict(seconds=0.5) for trial in trials}  # the trials themselves: the tests below
     (tmp_path / cost.TRIALS).write_text(json.dumps(measured))
     table = study_command.plan(study, jobs, tmp_path)
@@ -132,6 +132,19 @@ def test_trials_do_not_repeat_for_what_costs_the_same():
     jobs = jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))
     steps = {trial.key for job in jobs if job.kind == "train" for trial in cost.trials_of(job)}
     assert len(steps) == 3  # one network for each observation mode, whatever the task, the camera and the seed
+
+
+def test_trials_run_where_their_jobs_do(monkeypatch):
+    study = read_study(REPOSITORY / "configs/modality.yaml")
+    evaluate = next(job for job in jobs_of(study) if job.kind == "evaluate")
+    given = study.resources["evaluate"].gpus
+    assert given > 0
+    for has_gpu, gpus, device, batch in ((True, given, "cuda", "16"), (True, 0, "cpu", "1"), (False, given, "cpu", "1")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
+        _, trial = cost.trials_of(evaluate, gpus)
+        assert trial.arguments[-4:] == ("--device", device, "--batch-size", batch)
+        (training,) = cost.trials_of(evaluate.needs[0], gpus)
+        assert training.arguments[2:4] == ("--device", device)
 
 
 def test_a_table_of_the_paper_stands_for_its_tasks(study):
