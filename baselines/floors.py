@@ -8,6 +8,7 @@ when it can no longer succeed, which saves time and changes no rate of success. 
 
 import json
 import logging
+import shlex
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from manifeel_ms3.tasks.registry import all_tasks, task_spec
 log = logging.getLogger(__name__)
 OBS_MODE = "rgb+tacff"
 """Observation mode of the untrained network."""
+THEN = " && "
+"""Text between the commands that measured the floors of a file, where these were several."""
 BLIND: dict[str, Any] = dict(obs_mode="none", env_kwargs='{"render_backend": "none"}')
 """Arguments of the evaluation of policies that observe nothing."""
 
@@ -63,15 +66,27 @@ def main(args: Args) -> list[Path]:
         UnknownNameError: A task is not registered.
         DemonstrationError: The demonstrations of a task are missing or broken.
     """
-    command = f"python -m baselines.floors --num-eval-episodes {args.episodes}"
-    return [_measure_task(env_id, args, command) for env_id in args.tasks or all_tasks()]
+    return [_measure_task(env_id, args) for env_id in args.tasks or all_tasks()]
 
 
-def _measure_task(env_id: str, args: Args, command: str) -> Path:
+def command_of(env_id: str, args: Args) -> str:
+    """The command that measures the same floors of one task, in the package's own folder of floors."""
+    flags = ["--num-eval-episodes", str(args.episodes)]
+    if args.policies != tuple(POLICIES):
+        flags += ["--policies", *args.policies]
+    if args.demos is not None:
+        flags += ["--demo-path", str(args.demos)]
+    return shlex.join(["python", "-m", "baselines.floors", env_id, *flags])
+
+
+def _measure_task(env_id: str, args: Args) -> Path:
     spec = task_spec(env_id)
     demos = _observed_demonstrations((args.demos or data_dir() / "sample") / spec.env_id)
     path = floors_file(spec.env_id, args.out)
-    floors = _earlier(path, spec.revision)
+    floors, commands = _earlier(path, spec.revision)
+    if floors.keys() <= set(args.policies):  # all are measured anew
+        commands = []
+    command = THEN.join(dict.fromkeys([*commands, command_of(spec.env_id, args)]))
     for name in args.policies:
         with tempfile.TemporaryDirectory() as folder:
             result = _evaluate(name, spec.env_id, demos, Path(folder), args)
@@ -96,12 +111,12 @@ def _observed_demonstrations(folder: Path) -> Path:
     raise DemonstrationError(f"{folder} has no trajectory file with {OBS_MODE}; record one with --obs-mode {OBS_MODE}")
 
 
-def _earlier(path: Path, revision: int) -> dict[str, Any]:
-    """The floors of this revision of the task that a file holds."""
+def _earlier(path: Path, revision: int) -> tuple[dict[str, Any], list[str]]:
+    """The floors of this revision of the task that a file holds, and the commands that measured them."""
     if not path.is_file():
-        return {}
+        return {}, []
     content = read_json(path, FORM, "the failure floors of a task")
-    return content["floors"] if content["revision"] == revision else {}
+    return (content["floors"], content["command"].split(THEN)) if content["revision"] == revision else ({}, [])
 
 
 def _evaluate(name: str, env_id: str, demos: Path, folder: Path, args: Args) -> dict[str, Any]:

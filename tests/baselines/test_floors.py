@@ -1,15 +1,17 @@
 """The command that measures failure floors, on the real simulator."""
 
 import json
+import shlex
 
 import numpy as np
 import pytest
+import tyro
 
 from baselines import floors
 from baselines.references import RandomActions
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file, floors_of, highest_floor
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.tasks_and_marks import PEG, needs_renderer
 
 NUT, SEARCH = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-ObjectSearch-v1"
@@ -37,7 +39,17 @@ def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):
     found = floors_of(NUT, spec.revision, folder=tmp_path)
     assert {name: (one.episodes, one.rate) for name, one in found.items()} == {"random": (1, 0.0), "mean action": (7, 0.5)}
     assert highest_floor(NUT, spec.revision, folder=tmp_path).policy == "mean action"
-    assert floors._earlier(path, spec.revision + 1) == {}  # floors of another revision are not kept
+    assert floors._earlier(path, spec.revision + 1) == ({}, [])  # floors of another revision are not kept
+    before, measured = json.loads(path.read_text())["command"].split(floors.THEN)
+    assert before == "made up"
+    assert tyro.cli(floors.Args, args=shlex.split(measured)[3:]) == floors.Args((NUT,), ("random",), episodes=1)
+
+
+def test_the_files_of_the_package_name_the_command_that_measures_their_task():
+    for env_id in all_tasks():
+        content = json.loads(floors_file(env_id).read_text())
+        counts = {floor["episodes"] for floor in content["floors"].values()}
+        assert [content["command"]] == [floors.command_of(env_id, floors.Args(episodes=count)) for count in counts]
 
 
 @pytest.mark.slow
