@@ -17,6 +17,7 @@ from mani_skill.utils.wrappers import FlattenRGBDObservationWrapper
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.sensors import pad_pose
 from manifeel_ms3.sensors.registry import SENSORS
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.wrappers import PadsAsCamerasWrapper
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG, needs_renderer
@@ -198,6 +199,15 @@ def test_ppo_improves_a_policy_on_what_it_observes():
         agent.watch(rollout.obs.flatten(0, 1))
         rewards.append(rollout.rewards.mean().item())
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.1
+
+
+def test_ppo_evaluates_on_none_of_the_held_out_seeds():
+    ppo = load("ppo")
+    envs = SyncVectorEnv([Aim] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    ppo.evaluate(ppo.Args(num_eval_steps=8), ppo.Agent(5, 2), envs)
+    seeds = [env.unwrapped.np_random_seed for env in envs.envs]
+    assert len(set(seeds)) == 3
+    assert max(seeds) < FIRST_EVALUATION_SEED
 
 
 @pytest.fixture
