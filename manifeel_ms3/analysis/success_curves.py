@@ -1,7 +1,9 @@
 """Success over the course of training, from the evaluations of a run's checkpoints: a figure, and a table as csv.
 
-The figure's axis is the number of environment steps that training has seen: each sample of a batch begins at one recorded step
-of a demonstration, so this number is gradient steps times batch size, and runs with different batch sizes can be compared.
+The figure's axis is the number of samples that training has seen: gradient steps times batch size, so that runs with different
+batch sizes can be compared. A sample begins at one recorded step of a demonstration, and is seen again in every epoch; samples
+are therefore no environment steps. Where several processes train together, the batch size is that of one of them, as in
+--batch-size, and training has seen as many times more samples as there are processes.
 """
 
 import csv
@@ -29,7 +31,7 @@ BAND_OPACITY = 0.15
 """Opacity of the band of an interval, from 0 to 1, so that curves behind it are visible."""
 HEADROOM = 0.02
 """Part of the axis of success that lies below 0 and above 1, so that curves at its ends are visible."""
-COLUMNS = ("task", "variant", "sensing", "policy", "settings", "id", "gradient_steps", "environment_steps")
+COLUMNS = ("task", "variant", "sensing", "policy", "settings", "id", "gradient_steps", "samples_seen")
 MEASURES = ("success", "low", "high", "training_seeds", "episodes")
 """Columns of the table: those that say what was trained, and those that say how often it succeeds."""
 
@@ -40,7 +42,7 @@ class Point:
 
     gradient_steps: int
     """Number of gradient steps of the checkpoint."""
-    environment_steps: int | None
+    samples_seen: int | None
     """Gradient steps times batch size; None if the configuration does not name the batch size."""
     success: Estimate
     """Success rate of the checkpoint."""
@@ -93,7 +95,7 @@ def curve_table(curves: dict[Condition, list[Point]]) -> str:
         )
         for point in points:
             success = [round(number, RATE_DECIMALS) for number in (point.success.value, point.success.low, point.success.high)]
-            amount = (point.gradient_steps, point.environment_steps)
+            amount = (point.gradient_steps, point.samples_seen)
             writer.writerow((*what, *amount, *success, point.training_seeds, point.episodes))
     return out.getvalue()
 
@@ -126,8 +128,8 @@ def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -
     fig = Figure(figsize=(PANEL[0] * len(tasks), PANEL[1]), layout="constrained")
     for ax, (task, conditions) in zip(fig.subplots(1, len(tasks), squeeze=False)[0], tasks.items(), strict=True):
         for condition in conditions:
-            _draw(ax, condition, [point for point in curves[condition] if point.environment_steps is not None])
-        ax.set(title=task, xlabel="environment steps trained on", ylabel="success", ylim=(-HEADROOM, 1 + HEADROOM))
+            _draw(ax, condition, [point for point in curves[condition] if point.samples_seen is not None])
+        ax.set(title=task, xlabel="samples seen in training", ylabel="success", ylim=(-HEADROOM, 1 + HEADROOM))
         ax.xaxis.set_major_formatter(EngFormatter(sep=""))  # 400k
         ax.legend(fontsize=LEGEND_SIZE)
     save_figure(fig, figure, DPI)
@@ -136,7 +138,7 @@ def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -
 
 
 def _draw(ax: Any, condition: Condition, points: list[Point]) -> None:
-    seen = [point.environment_steps for point in points]
+    seen = [point.samples_seen for point in points]
     label = ", ".join(
         filter(None, (condition.variant, condition.sensing, condition.policy, str(training_settings_of(condition))))
     )

@@ -17,7 +17,7 @@ def test_a_curve_has_a_point_for_each_step_over_all_seeds(tmp_path):
     ((condition, points),) = success_curves(results_in(tmp_path)).items()
     assert condition.task == "PegInsertion"
     assert [point.gradient_steps for point in points] == [TOTAL_STEPS * part // 4 for part in (1, 2, 3, 4)]
-    assert [point.environment_steps for point in points] == [16 * point.gradient_steps for point in points]
+    assert [point.samples_seen for point in points] == [16 * point.gradient_steps for point in points]
     for point in points:
         assert (point.success.value, point.training_seeds, point.episodes) == (0.3, 2, 50)
         assert point.success.low < 0.3 < point.success.high
@@ -39,6 +39,7 @@ def test_the_page_of_results_shows_the_curves_and_links_the_table(tmp_path):
     assert cv2.imread(str(tmp_path / "images/results_success.png")).std() > 5
     rows = list(csv.DictReader((tmp_path / "images/results_success.csv").open()))
     assert len(rows) == 2 * 2 * 3
+    assert all(int(row["samples_seen"]) == 8 * int(row["gradient_steps"]) for row in rows)  # the preset's batches of 8
     (last,) = (
         row
         for row in rows
