@@ -98,7 +98,7 @@ def evaluate_episode(
     env: gym.Env,
     policy: Policy,
     seed: int,
-    on_step: Callable[[dict[str, Any]], None] | None = None,
+    on_action: Callable[[np.ndarray], None] = lambda _action: None,
     step_timeout: float | None = None,
     stop_at_success: bool = False,
 ) -> EpisodeOutcome:
@@ -110,7 +110,7 @@ def evaluate_episode(
         env: Environment with one episode at a time (`num_envs=1`).
         policy: The policy.
         seed: Seed of the episode.
-        on_step: Function that is called with every observation, the last one included.
+        on_action: Function that is called with every action (A,) before it is done.
         step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
             in the main thread of a process.
         stop_at_success: End the episode at success or failure.
@@ -125,12 +125,11 @@ def evaluate_episode(
     try:
         _answer(lambda: begin_episode(policy, seed), step_timeout)
         while not over:
-            if on_step is not None:
-                on_step(obs)
             begin = time.perf_counter()
             action = _checked(_answer(lambda obs=obs: policy.act(obs), step_timeout), shape)
             metrics.thinking += time.perf_counter() - begin - getattr(policy, "waited", 0.0)
-            task.renders_cameras = on_step is not None or getattr(policy, "looks", True)
+            task.renders_cameras = getattr(policy, "looks", True)
+            on_action(action)
             obs, reward, terminated, truncated, info = env.step(action)
             metrics.add(float(reward), info)
             over = bool(truncated) or (stop_at_success and bool(terminated))
@@ -138,8 +137,6 @@ def evaluate_episode(
         fault = f"step {metrics.steps}: {error}"
     finally:
         task.renders_cameras = True
-    if on_step is not None:
-        on_step(obs)
     return metrics.outcome(not stop_at_success, fault, shortcoming=_shortcoming(task, metrics))
 
 

@@ -1,23 +1,27 @@
 """Videos of an episode, with the images of every camera and finger pad side by side."""
 
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
 import torch
 
 from manifeel_ms3.sensors.visualisation import observation_images
-from manifeel_ms3.tasks.registry import make_env
+from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .policy import Policy
 from .rollout import EpisodeOutcome, evaluate_episode
 
+VIEWS = ("wrist", "front")
+"""Cameras that every video shows, beside those of the policy."""
 TILE_HEIGHT = 240
 """Height of each image in a video, in pixels: that of a TacRGB image."""
 BLOCK = 8
@@ -34,7 +38,59 @@ class Frame:
     """RGB images (H, W, 3) uint8 by the names of their sensors."""
 
 
-def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[Frame]]:
+def act_again(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[np.ndarray]]:
+    """Run an evaluated episode again; return its outcome and its actions (A,).
+
+    The policy observes what it did in the evaluation and nothing else, so that any observation mode can be filmed. The images
+    of a video come from a second run with the same actions.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make` in the evaluation.
+        policy: The policy.
+        seed: Seed of the episode.
+    """
+    torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
+    actions: list[np.ndarray] = []
+    with closing(make_env(env_id, **env_kwargs)) as env:
+        return evaluate_episode(env, policy, seed, actions.append), actions
+
+
+def film_env(
+    env_id: str, env_kwargs: Mapping[str, Any], cameras: Iterable[str], pads: Iterable[str] = (), **others: Any
+) -> gym.Env:
+    """The environment of an episode with images of cameras, and of touch, in its observations.
+
+    Args:
+        env_id: Id of the task.
+        env_kwargs: Arguments of `gym.make` with which the episode was recorded or evaluated.
+        cameras: Cameras of the video, beside those of the episode.
+        pads: Finger pads of the video, beside those of the episode; the right one if there is none at all.
+        others: Further arguments of `gym.make`.
+
+    Raises:
+        MachineError: This machine has no renderer.
+    """
+    seen = env_kwargs.get("cameras") or [task_spec(env_id).policy_camera]
+    added: dict[str, Any] = dict(
+        obs_mode="rgb+tacrgb+tacff",
+        cameras=tuple(dict.fromkeys([*seen, *cameras])),
+        tactile_sensors=tuple(dict.fromkeys([*env_kwargs.get("tactile_sensors", ()), *pads])) or ("right",),
+        render_backend="auto",
+    )
+    return make_env(env_id, **dict(env_kwargs) | added | others)
+
+
+def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator[dict[str, Any]]:
+    """The observations of an episode with given actions (A,), from that of the reset to the last one."""
+    obs, _ = env.reset(seed=seed)
+    yield obs
+    for action in actions:
+        obs, *_ = env.step(action)
+        yield obs
+
+
+def record_episode(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[Frame]]:
     """Run an evaluated episode again, and keep the images of every step.
 
     Args:
@@ -42,19 +98,13 @@ def record_episode(env_id: str, env_kwargs: dict[str, Any], policy: Policy, seed
         env_kwargs: Arguments of `gym.make` in the evaluation; cameras and touch are added.
         policy: The policy.
         seed: Seed of the episode.
+
+    Raises:
+        MachineError: This machine has no renderer.
     """
-    torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
-    cameras = tuple(dict.fromkeys([*env_kwargs.get("cameras", ()), "wrist", "front"]))
-    kwargs: dict[str, Any] = env_kwargs | dict(obs_mode="rgb+tacrgb+tacff", cameras=cameras)
-    env = make_env(env_id, **kwargs)
-    frames: list[Frame] = []
-
-    def keep(obs: dict[str, Any]) -> None:
-        frames.append(Frame(observation_images(obs)))
-
-    outcome = evaluate_episode(env, policy, seed, keep)
-    env.close()
-    return outcome, frames
+    outcome, actions = act_again(env_id, env_kwargs, policy, seed)
+    with closing(film_env(env_id, env_kwargs, VIEWS)) as env:
+        return outcome, [Frame(observation_images(obs)) for obs in replayed(env, actions, seed)]
 
 
 def encode_video(frames: list[Frame], fps: int = CONTROL_FREQ) -> bytes:

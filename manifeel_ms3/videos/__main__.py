@@ -8,27 +8,29 @@ pad; arrows are shear) and the contact force over time, under the names of task,
     manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
 
 The episode of a trajectory file is replayed from its actions, and every image is rendered anew, so that the file needs no
-observations. A result holds no actions: its episode is run again with the policy, from `checkpoints/last` beside the result if
-no other is given.
+observations. A result holds no actions: they are those that its policy takes again, from `checkpoints/last` beside the
+result if no other is given.
 """
 
 import logging
 import sys
+from collections import deque
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.demonstrations.episode import run_episode
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Policy, PolicySource
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.evaluation.rollout import evaluate_episode
+from manifeel_ms3.evaluation.video import act_again, replayed
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
@@ -172,24 +174,24 @@ def _take(source: Source, args: Args) -> Take:
     kind = "policy" if source.is_result else "demonstration"
     take = Take(f"{spec.name}, {kind}, seed {source.seed}", spec.force_limit)
     steps = shown_steps(source.length, args.max_frames)
+    actions = _actions(source, args)
     with progress_bar() as bar:
         counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
         with closing(video_env(source.env_id, source.env_kwargs, view)) as env:
             filmed = VideoWrapper(env, take, view, steps, lambda: bar.advance(counter))
-            if source.result is not None:
-                evaluate_episode(filmed, _policy(source.path, source.result, args), source.seed, on_step=lambda _obs: None)
-            else:
-                _replay(filmed, source)
+            deque(replayed(filmed, actions, source.seed), maxlen=0)  # the wrapper keeps what is shown
     if any(take.successes) != source.success:
         _name_difference(source, any(take.successes))
     return take
 
 
-def _replay(env: VideoWrapper, source: Source) -> None:
-    path = source.path.with_suffix(".h5")
-    with open_trajectories(path) as file:
-        actions = file[f"traj_{source.entry['episode_id']}/actions"][()]
-    run_episode(env, source.seed, lambda: actions)
+def _actions(source: Source, args: Args) -> Iterable[np.ndarray]:
+    """The actions (A,) of an episode: those of the trajectory file, or those that the policy of a result takes now."""
+    if source.result is not None:
+        policy = _policy(source.path, source.result, args)
+        return act_again(source.env_id, source.env_kwargs, policy, source.seed)[1]
+    with open_trajectories(source.path.with_suffix(".h5")) as file:
+        return file[f"traj_{source.entry['episode_id']}/actions"][()]
 
 
 def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:

@@ -8,9 +8,9 @@ import gymnasium as gym
 import numpy as np
 from mani_skill.utils import common
 
+from manifeel_ms3.evaluation.video import film_env
 from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.obs_modes import PAD
-from manifeel_ms3.tasks.registry import make_env, task_spec
 
 SCENE_SIZE = 480
 """Width and height of the image of the scene, in pixels; chosen by eye."""
@@ -103,15 +103,8 @@ def video_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env
     Raises:
         MachineError: This machine has no renderer.
     """
-    added: dict[str, Any] = dict(
-        obs_mode="rgb+tacrgb+tacff",
-        cameras=tuple(dict.fromkeys([*(env_kwargs.get("cameras") or [task_spec(env_id).policy_camera]), view.camera])),
-        tactile_sensors=tuple(dict.fromkeys([*env_kwargs.get("tactile_sensors", ()), view.pad])),
-        render_backend="auto",
-        render_mode="rgb_array",
-        human_render_camera_configs=dict(width=SCENE_SIZE, height=SCENE_SIZE),
-    )
-    return make_env(env_id, **dict(env_kwargs) | added)
+    scene: dict[str, Any] = dict(render_mode="rgb_array", human_render_camera_configs=dict(width=SCENE_SIZE, height=SCENE_SIZE))
+    return film_env(env_id, env_kwargs, (view.camera,), (view.pad,), **scene)
 
 
 def shown_steps(length: int, most: int | None) -> set[int]:

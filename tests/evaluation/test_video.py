@@ -1,0 +1,41 @@
+"""Evaluated episodes can be filmed whatever the policy observes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from manifeel_ms3 import cli
+from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation.rollout import evaluate_episode
+from manifeel_ms3.evaluation.video import record_episode
+from tests.evaluation import policies
+from tests.tasks_and_marks import PEG, needs_renderer
+
+STEPS = 6
+SHOWN = {"wrist", "front", "tactile right: TacRGB", "tactile right: TacFF"}
+
+
+@needs_renderer
+@pytest.mark.parametrize("obs_mode", ["state", "state_dict", "depth+tacff", "tacff"])
+def test_a_policy_is_filmed_on_its_own_observations(make_env, obs_mode):
+    given = dict(obs_mode=obs_mode, cameras=["wrist"], max_episode_steps=STEPS, sim_backend="physx_cpu")
+    evaluated = evaluate_episode(make_env(**given), policies.FollowsAllItSees(), seed=3)
+    assert evaluated.error is None
+    outcome, frames = record_episode(PEG, given, policies.FollowsAllItSees(), 3)
+    assert (outcome.return_, outcome.peak_contact_force) == (evaluated.return_, evaluated.peak_contact_force)
+    assert len(frames) == STEPS + 1
+    assert all(set(frame.images) == SHOWN for frame in frames)
+    assert not np.array_equal(frames[0].images["front"], frames[-1].images["front"])
+
+
+@needs_renderer
+def test_an_evaluation_without_a_renderer_is_filmed_with_one(tmp_path):
+    bare = json.dumps(dict(render_backend="none", max_episode_steps=STEPS))
+    policy, out = "tests.evaluation.policies:FollowsAllItSees", tmp_path / "evaluation.json"
+    args = evaluate.Args(policy=policy, env_id=PEG, obs_mode="state", env_kwargs=bare, episodes=1, out=out, videos=(0,))
+    evaluate.main(args)
+    assert (tmp_path / "videos/100000.mp4").stat().st_size > 1000
+    film = tmp_path / "film.webp"
+    assert cli.main(["film", str(out), "--policy", policy, "--out", str(film), "--max-frames", "2", "--width", "524"]) == 0
+    assert film.stat().st_size > 1000
