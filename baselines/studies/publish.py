@@ -159,8 +159,9 @@ def _differences(condition: Condition) -> list[str]:
 
 
 def _words(arguments: dict[str, Any]) -> list[str]:
-    """The innermost arguments of a task as parts of a file's name, such as "lighting_dim"."""
+    """The innermost arguments of a task as parts of a file's name: texts alone, as "dim", others as "drift_0_1"."""
     words = []
     for name, value in arguments.items():
-        words += _words(value) if isinstance(value, dict) else [re.sub(r"\W+", "_", f"{name}_{value}").strip("_")]
+        text = value if isinstance(value, str) else f"{name}_{value}"
+        words += _words(value) if isinstance(value, dict) else [re.sub(r"\W+", "_", text).strip("_")]
     return words

@@ -434,6 +434,7 @@ def test_each_set_up_has_a_folder_of_its_own_in_a_submission(tmp_path):
         "PegInsertion/rgb+tacrgb-anytouch": dict(encoder="anytouch"),
         "PegInsertion/rgb+tacrgb-flow_matching": dict(policy="flow_matching"),
         "PegInsertion/rgb+tacrgb-front-left-right": dict(env_kwargs=dict(cameras=["front"], tactile_sensors=["left", "right"])),
+        "PegInsertion/rgb+tacrgb-dim": dict(env_kwargs=dict(lighting="dim")),
         "PegInsertion/rgb+tacrgb-drift_0_1": dict(env_kwargs=dict(imperfections=dict(drift=0.1))),
         "PegInsertion/rgb+tacrgb-dead_taxels_0_1": dict(env_kwargs=dict(imperfections=dict(dead_taxels=0.1))),
     }
