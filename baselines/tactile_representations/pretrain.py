@@ -26,7 +26,7 @@ from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header, task_of
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
@@ -138,11 +138,11 @@ def tacrgb_images(files: Iterable[Path], size: int, env_id: str | None = None) -
     """
     images = []
     for path in files:
-        task = read_header(path)["env_info"]["env_id"]
-        if env_id not in (None, task):
+        header = read_header(path)
+        if env_id not in (None, task := task_of(header)):
             raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demos")
         with open_trajectories(path) as file:
-            for i in range(len(read_header(path)["episodes"])):
+            for i in range(len(header["episodes"])):
                 trajectory: Any = file[f"traj_{i}"]
                 sensors = trajectory.get("obs/sensor_data", {})
                 pads = [

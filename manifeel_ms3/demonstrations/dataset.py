@@ -26,7 +26,7 @@ from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import record, render_observations
-from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header
+from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header, task_of
 from .recording import STATES_FILE, trajectory_name
 
 DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
@@ -136,7 +136,7 @@ def describe(path: Path) -> dict[str, Any]:
     header = read_header(path)
     episodes = header["episodes"]
     return dict(
-        env_id=header["env_info"]["env_id"].rpartition(":")[2],
+        env_id=task_of(header),
         env_kwargs=header["env_info"]["env_kwargs"],
         versions=header["versions"],
         revision=header.get("revision"),

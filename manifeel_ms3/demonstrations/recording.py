@@ -16,7 +16,7 @@ from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
 
-from .formats.maniskill_h5 import DemonstrationError, read_header
+from .formats.maniskill_h5 import DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
     Episode,
     consolidate,
@@ -306,5 +306,5 @@ def next_step(_args: Any, path: Path) -> str:
     if seen["obs_mode"] == "none":
         return f"{held}; `manifeel render-observations {path} --out FILE` adds observations"
     sensing = f"--obs-mode {seen['obs_mode']} --cameras {' '.join(seen['cameras'])}"
-    train = f"manifeel train diffusion_policy cpu --demo-path {path} --env-id {recorded['env_id'].rpartition(':')[2]} {sensing}"
+    train = f"manifeel train diffusion_policy cpu --demo-path {path} --env-id {task_of(header)} {sensing}"
     return f"{held}; `manifeel view {path}` shows them, `{train}` trains a policy"

@@ -29,7 +29,7 @@ from manifeel_ms3.workers import WorkerPool
 
 from .convert_actions import converted
 from .episode import run_episode
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
 from .replay import POSE
 
@@ -78,7 +78,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     source = read_header(args.path)
     if args.path.resolve() == args.out.resolve():
         raise InvalidArgumentError(f"--out {args.out} is the file that is read; give another")
-    env_id, env_kwargs = source["env_info"]["env_id"].rpartition(":")[2], _env_kwargs(args, source)
+    env_id, env_kwargs = task_of(source), _env_kwargs(args, source)
     header = make_header(env_id, env_kwargs) | dict(recorded_with=source.get("versions"), failed_seeds=[])
     source_kwargs = None
     if args.control_mode is not None:

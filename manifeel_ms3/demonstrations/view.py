@@ -25,7 +25,7 @@ from manifeel_ms3.errors import MachineError
 from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
 
 log = logging.getLogger(__name__)
 TIMELINE = "step"
@@ -165,7 +165,7 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
     if not 0 <= episode < len(header["episodes"]):
         raise DemonstrationError(f"{file} has episodes 0 to {len(header['episodes']) - 1}; there is no {episode}")
     entry = header["episodes"][episode]
-    title = f"{header['env_info']['env_id'].rpartition(':')[2]}, seed {entry['episode_seed']}"
+    title = f"{task_of(header)}, seed {entry['episode_seed']}"
     with open_trajectories(file) as opened:
         group = opened[f"traj_{entry['episode_id']}"]
         names = action_names(entry["control_mode"], group["actions"].shape[1])

@@ -20,7 +20,7 @@ from baselines.tactile_representations.pretrain import patch_discriminator
 from baselines.tactile_representations.sparsh import Sparsh
 from baselines.tactile_representations.t3 import T3
 from baselines.tactile_representations.unit import UniT
-from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.demonstrations import DemonstrationError, read_header, record
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from tests.tasks_and_marks import PEG
@@ -107,6 +107,12 @@ def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match="a multiple of 16, not 250; give --image-size 224"):
         trained("t3", pictures, out, image_size=250)
     assert not out.exists()
+
+
+def test_a_recording_of_ours_is_of_its_task(tmp_path):
+    sensing = dict(obs_mode="tacrgb", cameras=(), tactile_sensors=("right",))
+    path = record.main(record.Args(PEG, 1, 1, 0, tmp_path / "peg.h5", **sensing, env_kwargs='{"fit": "paper"}'))
+    assert len(pretrain.tacrgb_images([path], 32, PEG)) == read_header(path)["episodes"][0]["elapsed_steps"] + 1
 
 
 def test_training_takes_the_size_and_the_statistics_of_the_images(pictures, tmp_path, monkeypatch):

@@ -19,7 +19,7 @@ from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
-from .maniskill_h5 import each_demonstration, observation_keys, read_header
+from .maniskill_h5 import each_demonstration, observation_keys, read_header, task_of
 from .own_files import broken_if_fails, read_origin, require_task
 from .zarr_arrays import open_arrays
 
@@ -191,9 +191,10 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
 
 def _about(path: Path) -> dict[str, Any]:
     """The attributes of a store that is written from a trajectory file."""
-    recorded = read_header(path)["env_info"]
-    units = recorded["env_kwargs"].get("tactile", {}).get("units", TactileSensorConfig.units)
-    return dict(env_id=recorded["env_id"].rpartition(":")[2], env_kwargs=recorded["env_kwargs"], force_field_units=units)
+    header = read_header(path)
+    env_kwargs = header["env_info"]["env_kwargs"]
+    units = env_kwargs.get("tactile", {}).get("units", TactileSensorConfig.units)
+    return dict(env_id=task_of(header), env_kwargs=env_kwargs, force_field_units=units)
 
 
 def _from_paper(key: str, values: np.ndarray) -> np.ndarray:

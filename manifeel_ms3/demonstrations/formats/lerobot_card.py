@@ -3,6 +3,8 @@
 import json
 from typing import Any
 
+from .maniskill_h5 import task_of
+
 FRONT = """---
 license: apache-2.0
 task_categories:
@@ -50,7 +52,7 @@ def card(header: dict[str, Any], task: str, info: dict[str, Any]) -> str:
         info: The content of meta/info.json.
     """
     about = dict(
-        env_id=header["env_info"]["env_id"].rpartition(":")[2],
+        env_id=task_of(header),
         task=task,
         episodes=info["total_episodes"],
         frames=info["total_frames"],

@@ -19,7 +19,7 @@ from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
 from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
-from .maniskill_h5 import each_demonstration, observation_keys, read_header
+from .maniskill_h5 import each_demonstration, observation_keys, read_header, task_of
 
 FILES_PER_CHUNK = 1000
 """Number of files in a folder, lerobot's default."""
@@ -69,8 +69,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     write_json(folder / "meta/stats.json", {name: joined_statistics(name, entries) for name in writer.features})
     info = _info(writer, len(entries), start)
     (folder / CARD).write_text(card(header, task, info), encoding="utf-8")
-    recorded = header["env_info"]
-    write_json(folder / ORIGIN, dict(env_id=recorded["env_id"].rpartition(":")[2], env_kwargs=recorded["env_kwargs"]))
+    write_json(folder / ORIGIN, dict(env_id=task_of(header), env_kwargs=header["env_info"]["env_kwargs"]))
     write_json(folder / INFO, info)  # last: a folder without it is not a dataset
 
 
@@ -88,7 +87,7 @@ def pyarrow() -> tuple[Any, Any]:
 
 def _instruction(header: dict[str, Any]) -> str:
     """The sentence that tells a robot what to do; the id of a task that is not registered here, or has no sentence."""
-    env_id = header["env_info"]["env_id"].rpartition(":")[2]
+    env_id = task_of(header)
     try:
         return task_spec(env_id).instruction or env_id
     except UnknownNameError:

@@ -70,6 +70,15 @@ def read_header(path: Path) -> dict[str, Any]:
         raise DemonstrationError(str(error)) from error
 
 
+def task_of(header: dict[str, Any]) -> str:
+    """Environment id of the task of a trajectory file, without the module that ManiSkill's files name before a colon.
+
+    Args:
+        header: The json beside the file.
+    """
+    return header["env_info"]["env_id"].rpartition(":")[2]
+
+
 @contextmanager
 def open_trajectories(path: Path) -> Iterator[Any]:
     """Open a trajectory file, to read from it within the context.
@@ -116,7 +125,7 @@ def read_demonstrations(
     """
     path = Path(path)
     header = read_header(path)
-    found = header["env_info"]["env_id"].rpartition(":")[2]
+    found = task_of(header)
     if env_id is not None and found != env_id:
         raise DemonstrationError(f"{path} holds demonstrations of {found}, not of {env_id}; give one recorded for {env_id}")
     count = len(header["episodes"]) if num is None else num
