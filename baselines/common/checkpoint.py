@@ -182,18 +182,38 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
         )
 
 
-def pack(optimizer: torch.optim.Optimizer, model: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """The optimiser's state, the weights without EMA and the states of torch's random number generators, as named tensors."""
+def random_state() -> dict[str, torch.Tensor]:
+    """The states of torch's random number generators in this process, as named tensors."""
+    state = dict(random=torch.get_rng_state())
+    return state | dict(cuda_random=torch.cuda.get_rng_state()) if torch.cuda.is_available() else state
+
+
+def pack(
+    optimizer: torch.optim.Optimizer, model: torch.nn.Module, random_states: list[dict[str, torch.Tensor]]
+) -> dict[str, torch.Tensor]:
+    """The optimiser's state, the weights without EMA and the states of random number generators, as named tensors.
+
+    Args:
+        optimizer: The optimiser.
+        model: The policy.
+        random_states: What `random_state` gives in each process, in the order of their ranks.
+    """
     packed = {f"model.{name}": t for name, t in model.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         packed |= {f"optimizer.{index}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    packed["random"] = torch.get_rng_state()
-    if torch.cuda.is_available():
-        packed["cuda_random"] = torch.cuda.get_rng_state()
+    for rank, state in enumerate(random_states):
+        packed |= {_of_rank(name, rank): value for name, value in state.items()}
     return packed
 
 
-def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, model: torch.nn.Module, source: Path) -> None:
+def _of_rank(name: str, rank: int) -> str:
+    """Name of a process's own tensor among those that are packed; the first process's has no number."""
+    return f"{name}.{rank}" if rank else name
+
+
+def unpack(
+    packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, model: torch.nn.Module, source: Path, rank: int
+) -> None:
     """Restore what `pack` saved.
 
     Args:
@@ -201,6 +221,7 @@ def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, mo
         optimizer: The optimiser.
         model: The policy.
         source: The checkpoint, for the error's message.
+        rank: Rank of this process, whose own random states are restored.
 
     Raises:
         CheckpointError: The weights belong to another architecture, or something is missing or damaged.
@@ -208,9 +229,9 @@ def unpack(packed: dict[str, torch.Tensor], optimizer: torch.optim.Optimizer, mo
     load_weights(model, {n.removeprefix("model."): t for n, t in packed.items() if n.startswith("model.")}, source)
     try:
         _restore_optimizer(packed, optimizer)
-        torch.set_rng_state(packed["random"])
-        if "cuda_random" in packed and torch.cuda.is_available():
-            torch.cuda.set_rng_state(packed["cuda_random"])
+        torch.set_rng_state(packed[_of_rank("random", rank)])
+        if (on_gpu := _of_rank("cuda_random", rank)) in packed and torch.cuda.is_available():
+            torch.cuda.set_rng_state(packed[on_gpu])
     except (LookupError, ValueError, TypeError, RuntimeError) as error:
         raise CheckpointError(f"{source}: the state of training cannot be restored ({error}); train anew") from error
 

@@ -1,6 +1,7 @@
 """Training on several devices at once, with one process for each, started by `torchrun`."""
 
 import os
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -16,10 +17,13 @@ class Processes:
 
     def __init__(self, device: str):
         self.rank, self.count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-        local = f":{os.environ['LOCAL_RANK']}" if "LOCAL_RANK" in os.environ and device == "cuda" else ""
-        self.device = torch.device(device + local)
+        self.device = torch.device(device)
+        gpu = None
+        if "LOCAL_RANK" in os.environ and device == "cuda":
+            self.device = gpu = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+            torch.cuda.set_device(gpu)  # or what names no GPU, such as the noise, would be on the first one in every process
         if self.count > 1:
-            dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
+            dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo", device_id=gpu)
 
     @property
     def first(self) -> bool:
@@ -37,12 +41,15 @@ class Processes:
             dist.broadcast_object_list(values, src=0, device=self.device)
         return values[0]
 
-    def wait(self) -> None:
-        """Wait until all processes have reached this call."""
+    def of_all(self, value: Any) -> list[Any]:
+        """What each process gives, in the order of their ranks; all processes call it together."""
+        values = [value] * self.count
         if self.count > 1:
-            dist.barrier()
+            dist.all_gather_object(values, value)
+        return values
 
     def close(self) -> None:
-        """Leave the group of processes."""
+        """Wait until all processes have reached this call, and leave the group."""
         if self.count > 1:
+            dist.barrier()
             dist.destroy_process_group()

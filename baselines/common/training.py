@@ -34,6 +34,7 @@ from .checkpoint import (
     newest_checkpoint,
     pack,
     prune,
+    random_state,
     read_tensors,
     require_same_config,
     save_checkpoint,
@@ -53,7 +54,7 @@ log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
 """Folder of the checkpoints' evaluations in the folder of a run."""
 RANK_SEED_STRIDE = 1_000_003
-"""Difference between the noise seeds of two processes; a prime number that is larger than usual seeds and numbers of steps."""
+"""Difference between the noise seeds of two processes; a prime number that is larger than usual seeds."""
 
 
 class TrainingError(WorkFailedError):
@@ -133,8 +134,8 @@ class Trainer:
         self.step, self.begin = 0, time.time()
         if args.resume:
             self._resume()
-        if not self.processes.first:  # each process draws its own noise
-            torch.manual_seed(args.seed + RANK_SEED_STRIDE * self.processes.rank + self.step)
+        elif not self.processes.first:  # each process draws its own noise
+            torch.manual_seed(args.seed + RANK_SEED_STRIDE * self.processes.rank)
 
         self.model = self.processes.with_mean_gradients(self.policy).train()
         self.evaluation = BackgroundEvaluation(
@@ -186,13 +187,18 @@ class Trainer:
         self.step += 1
 
     def save(self) -> Path:
-        """Write a checkpoint of the present step, make it the last, and return its folder."""
+        """Write a checkpoint of the present step, make it the last, and return its folder.
+
+        All processes call it together, and the first one writes.
+        """
+        folder, random_states = self.checkpoints / f"{self.step:08d}", self.processes.of_all(random_state())
+        if not self.processes.first:
+            return folder
         weights = dict(self.policy.state_dict())
         for (name, _), averaged in zip(self.policy.named_parameters(), self.ema.shadow_params, strict=True):
             weights[name] = averaged
-        state = pack(self.optimizer, self.policy) | self.order.state_dict()
+        state = pack(self.optimizer, self.policy, random_states) | self.order.state_dict()
         cost = dict(trained_on=machine(), training_seconds=round(time.time() - self.begin, 1))
-        folder = self.checkpoints / f"{self.step:08d}"
         save_checkpoint(folder, self.config | cost | dict(step=self.step), weights, state)
         make_last(folder)
         return folder
@@ -210,13 +216,16 @@ class Trainer:
         return policy
 
     def _resume(self) -> None:
-        """Continue from the newest checkpoint, bit for bit as if the run had not stopped."""
+        """Continue from the newest checkpoint, as if the run had not stopped.
+
+        On a CPU this is so bit for bit with up to two processes; the sum over more may round differently in another order.
+        """
         last = newest_checkpoint(self.checkpoints)
         saved = checkpoint_config(last)
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
         state = read_tensors(last / TRAINING)
         self.order.load_state_dict(state)
-        unpack(state, self.optimizer, self.policy, last)
+        unpack(state, self.optimizer, self.policy, last, self.processes.rank)
         averaged = read_tensors(last / WEIGHTS)
         self.ema.shadow_params = [averaged[name].to(self.device) for name, _ in self.policy.named_parameters()]
         self.ema.optimization_step = self.step = saved["step"]
@@ -258,13 +267,13 @@ class Trainer:
 
     def _save_and_evaluate(self) -> None:
         """Write a checkpoint, queue its evaluation, and delete old checkpoints."""
-        if self.log is None:
-            return
-        self.log.sync()
+        if self.log:
+            self.log.sync()
         checkpoint = self.save()
-        if self._is_evaluated(self.step):
-            self.evaluation.submit(checkpoint)
-        prune(self.checkpoints, self.args.keep, self.evaluation.in_use)
+        if self.log:
+            if self._is_evaluated(self.step):
+                self.evaluation.submit(checkpoint)
+            prune(self.checkpoints, self.args.keep, self.evaluation.in_use)
 
     def _log_evaluations(self, wait: bool = False) -> None:
         """Log the evaluations that have finished; wait for all of them if asked."""
@@ -273,13 +282,12 @@ class Trainer:
                 self.log.write(entry, self.evaluation.video_of(int(entry["step"])))
 
     def _finish(self) -> Path:
-        """Wait for the evaluations and for the other processes, and return the last checkpoint."""
+        """Leave the other processes, wait for the evaluations, and return the last checkpoint."""
+        self.processes.close()  # first, because a process that waits in NCCL's barrier gives up after 10 minutes
         if self.log:
             self._log_evaluations(wait=True)
             prune(self.checkpoints, self.args.keep, set())
             self.log.close()
-        self.processes.wait()
-        self.processes.close()
         return self.checkpoints / LAST
 
 

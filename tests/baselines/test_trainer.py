@@ -17,6 +17,8 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.registry import PolicySpec, require_distinct
 from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
 
+from .two_processes import end_before_the_evaluation, in_two_processes, resume_and_compare
+
 CPU = torch.device("cpu")
 SPEC = observation_spec("tacff", (), ("right",), 64)
 
@@ -137,6 +139,17 @@ def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(tr
     assert all(torch.equal(own, other) for own, other in pairs)
     assert second.optimizer.param_groups[0]["lr"] == first.optimizer.param_groups[0]["lr"]
     assert torch.equal(second.order.take(4), first.order.take(4))
+
+
+def test_two_processes_resume_bit_for_bit(trainer_args):
+    in_two_processes(resume_and_compare, trainer_args)
+
+
+def test_only_the_first_process_waits_for_the_evaluations(trainer_args):
+    env_kwargs = '{"render_backend": "none", "max_episode_steps": 20}'
+    in_two_processes(
+        end_before_the_evaluation, dataclasses.replace(trainer_args, num_eval_episodes=1, eval_env_kwargs=env_kwargs)
+    )
 
 
 def test_force_field_encoders_take_the_taxels_of_the_data():

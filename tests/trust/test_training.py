@@ -20,6 +20,7 @@ from baselines.common.checkpoint import (
     newest_checkpoint,
     pack,
     prune,
+    random_state,
     read_tensors,
     save_checkpoint,
     unpack,
@@ -264,10 +265,10 @@ def test_a_damaged_state_of_training_is_refused_in_one_line(harm, tmp_path):
     optimizer = torch.optim.AdamW(model.parameters())
     model(torch.ones(1, 2)).sum().backward()
     optimizer.step()
-    state = pack(optimizer, model)
-    unpack(state, optimizer, model, tmp_path)
+    state = pack(optimizer, model, [random_state()])
+    unpack(state, optimizer, model, tmp_path, rank=0)
     harm(state)
     with pytest.raises(CheckpointError) as refused:
-        unpack(state, optimizer, model, tmp_path)
+        unpack(state, optimizer, model, tmp_path, rank=0)
     assert str(tmp_path) in str(refused.value)
     assert "\n" not in str(refused.value)

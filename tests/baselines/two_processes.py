@@ -1,0 +1,56 @@
+"""Training in two processes, which run what torchrun starts: the same function in each, told apart by its environment."""
+
+import os
+import socket
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch.multiprocessing.spawn import spawn
+
+from baselines.common.processes import Processes
+from baselines.common.train_args import TrainArgs
+from baselines.common.training import Trainer
+from baselines.diffusion_policy.policy import DiffusionPolicy
+
+
+def in_two_processes(what: Callable[[TrainArgs], None], args: TrainArgs) -> None:
+    """Run a function in two processes; what one of them raises is raised here."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    spawn(_run, (what, args, port), nprocs=2)
+
+
+def _run(rank: int, what: Callable[[TrainArgs], None], args: TrainArgs, port: int) -> None:
+    os.environ |= dict(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2", MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    torch.set_num_threads(1)
+    what(args)
+
+
+def resume_and_compare(args: TrainArgs) -> None:
+    """Train, save and train on; then resume from what was saved, which must lead to the same weights."""
+    processes = Processes("cpu")
+    whole = Trainer(args, DiffusionPolicy, processes)
+    _take_steps(whole, 2)
+    whole.save()
+    _take_steps(whole, 2)
+    resumed = Trainer(replace(args, resume=True), DiffusionPolicy, processes)
+    assert resumed.step == 2
+    _take_steps(resumed, 2)
+    for (name, own), other in zip(resumed.policy.named_parameters(), whole.policy.parameters(), strict=True):
+        assert torch.equal(own, other), name
+    processes.close()
+
+
+def _take_steps(trainer: Trainer, count: int) -> None:
+    for _ in range(count):
+        trainer.take_step()
+
+
+def end_before_the_evaluation(args: TrainArgs) -> None:
+    """Train to the end, and look whether the last checkpoint has been evaluated when a process is done."""
+    assert args.run_dir
+    processes = Processes("cpu")
+    last = Trainer(args, DiffusionPolicy, processes).run()
+    result = args.run_dir / f"evaluations/{last.resolve().name}.json"
+    assert result.exists() == processes.first, "only the first process waits for the evaluation"
