@@ -16,7 +16,7 @@ from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
 from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
-from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
@@ -121,7 +121,8 @@ class Trainer:
         self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
         self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
-        self.config = run_config(args, policy_class, self.dataset) | dict(total_steps=self.total_steps)
+        amount = dict(total_steps=self.total_steps, num_processes=processes.count)
+        self.config = run_config(args, policy_class, self.dataset) | amount
 
         self.policy = self._make_policy(policy_class)
         self.optimizer = torch.optim.AdamW(self.policy.parameters(), lr, args.betas, weight_decay=args.weight_decay, fused=True)
@@ -221,7 +222,7 @@ class Trainer:
         On a CPU this is so bit for bit with up to two processes; the sum over more may round differently in another order.
         """
         last = newest_checkpoint(self.checkpoints)
-        saved = checkpoint_config(last)
+        saved = IMPLIED | checkpoint_config(last)
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
         state = read_tensors(last / TRAINING)
         self.order.load_state_dict(state)

@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from manifeel_ms3.evaluation.variant import SENSING, variant_of
-from manifeel_ms3.tasks.registry import short_name
+from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.evaluation.checkpoint_config import IMPLIED
+from manifeel_ms3.evaluation.evaluate import SENSING
+from manifeel_ms3.tasks.registry import short_name, task_spec
 
 NO_SETTINGS = frozenset(
     {
@@ -140,7 +142,8 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
         obs_mode: Observation mode, without which some settings have no effect.
     """
     idle = {name for name, modes in OF_MODALITIES.items() if not set(modes) & set(obs_mode.split("+"))}
-    named = {name: value for name, value in config.items() if name not in NO_SETTINGS and name != "obs_mode"}
+    no_settings = NO_SETTINGS | {"obs_mode"}
+    named = {n: value for n, value in config.items() if n not in no_settings and (n, value) not in IMPLIED.items()}
     return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
 
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from manifeel_ms3.evaluation.checkpoint_config import samples_per_step
 from manifeel_ms3.files import read_json
 
 from .condition import condition_of
@@ -62,16 +63,19 @@ def runtime_table(results: Sequence[dict[str, Any]]) -> str:
 def _is_of_runtime(result: dict[str, Any], encoder: str) -> bool:
     condition, config = condition_of(result), result["config"]
     asked = (condition.task in RUNTIME_TASKS, condition.policy == DP, condition.obs_mode == TACRGB)
-    known = all(config.get(name) for name in ("training_seconds", "step", "num_samples", "batch_size", "trained_on"))
+    known = all(config.get(name) for name in ("training_seconds", "step", "num_samples", "trained_on"))
+    known = known and samples_per_step(config) is not None
     return all(asked) and known and condition.encoder == encoder and condition.num_demos == RUNTIME_DEMOS
 
 
 def _timed(result: dict[str, Any]) -> tuple[float, float, str]:
     """Seconds of an epoch, samples per second, and the machine."""
     config = result["config"]
+    samples = samples_per_step(config)
+    assert samples, "results of unknown batch size are left out"
     step_seconds = config["training_seconds"] / config["step"]
-    epoch = step_seconds * math.ceil(config["num_samples"] / config["batch_size"])
-    return epoch, config["batch_size"] / step_seconds, config["trained_on"]["gpu"] or config["trained_on"]["cpu"]
+    epoch = step_seconds * math.ceil(config["num_samples"] / samples)
+    return epoch, samples / step_seconds, config["trained_on"]["gpu"] or config["trained_on"]["cpu"]
 
 
 def similarity_table(files: Sequence[Path]) -> str:

@@ -1,9 +1,8 @@
 """Success over the course of training, from the evaluations of a run's checkpoints: a figure, and a table as csv.
 
-The figure's axis is the number of samples that training has seen: gradient steps times batch size, so that runs with different
-batch sizes can be compared. A sample begins at one recorded step of a demonstration, and is seen again in every epoch; samples
-are therefore no environment steps. Where several processes train together, the batch size is that of one of them, as in
---batch-size, and training has seen as many times more samples as there are processes.
+The figure's axis is the number of environment steps that training has seen: each sample of a batch begins at one recorded step
+of a demonstration, so this number is gradient steps times batch size times processes, and runs that differ in these can be
+compared.
 """
 
 import csv
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.evaluation.checkpoint_config import samples_per_step
 from manifeel_ms3.evaluation.result import RATE_DECIMALS
 from manifeel_ms3.files import write_text
 
@@ -42,8 +42,8 @@ class Point:
 
     gradient_steps: int
     """Number of gradient steps of the checkpoint."""
-    samples_seen: int | None
-    """Gradient steps times batch size; None if the configuration does not name the batch size."""
+    environment_steps: int | None
+    """Number of samples of all gradient steps; None if the configuration does not name the batch size."""
     success: Estimate
     """Success rate of the checkpoint."""
     training_seeds: int
@@ -74,9 +74,9 @@ def success_curves(results: Sequence[dict[str, Any]]) -> dict[Condition, list[Po
 
 def _point(step: int, results: list[dict[str, Any]]) -> Point:
     (evaluated,) = collect(results).values()
-    batch_size = results[0]["config"].get("batch_size")
+    samples = samples_per_step(results[0]["config"])
     seeds, _, episodes = evaluated.success.shape
-    return Point(step, step * batch_size if isinstance(batch_size, int) else None, mean_success(evaluated), seeds, episodes)
+    return Point(step, None if samples is None else step * samples, mean_success(evaluated), seeds, episodes)
 
 
 def curve_table(curves: dict[Condition, list[Point]]) -> str:

@@ -15,6 +15,9 @@ TRAINING_LOSS = "losses/total_loss"
 HASHED = ("model.safetensors", "config.json")
 """Files of a checkpoint from whose contents, one after the other, its published hash is computed."""
 
+IMPLIED = {"num_processes": 1}
+"""Settings that configurations of older versions lack, with the values that they count as having."""
+
 
 class CheckpointError(InvalidFileError):
     """A checkpoint folder is missing, broken or of an older version."""
@@ -40,6 +43,19 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
             f"{path} holds a {type(config).__name__} instead of an object; the checkpoint is broken, use another one"
         )
     return config
+
+
+def samples_per_step(config: dict[str, Any]) -> int | None:
+    """Number of samples in a gradient step of a training run, over all its processes.
+
+    Args:
+        config: Configuration of the policy.
+
+    Returns:
+        None if the configuration does not name them.
+    """
+    of_each, processes = config.get("batch_size"), (IMPLIED | config)["num_processes"]
+    return of_each * processes if isinstance(of_each, int) and isinstance(processes, int) else None
 
 
 def checkpoint_hash(checkpoint: Path) -> str:

@@ -107,6 +107,13 @@ def test_what_is_written_down_beside_the_settings_makes_no_other_policy():
     assert "policy.encoder.freeze_tacrgb" in dict(settings_of(config, "rgb+tacrgb"))
 
 
+def test_a_run_of_several_processes_is_of_another_condition_than_one_that_does_not_name_them():
+    config = config_of("diffusion_policy", "paper", "PegInsertion", "rgb", 0)
+    alone, together = (dict(settings_of(config | dict(num_processes=count), "rgb")) for count in (1, 2))
+    assert alone == dict(settings_of(config, "rgb"))
+    assert together == alone | {"num_processes": "2"}
+
+
 def test_results_of_different_initial_states_are_not_mixed(tmp_path, rng):
     write(tmp_path, 0, 10, [True, False])
     write(tmp_path, 1, 10, [True])

@@ -13,7 +13,7 @@ from .made_up import TOTAL_STEPS, page_of, write_run
 
 def test_a_curve_has_a_point_for_each_step_over_all_seeds(tmp_path):
     for seed, rate in enumerate((0.2, 0.4)):
-        write_run(tmp_path, VISION, rate, seed, checkpoints=4, batch_size=16)
+        write_run(tmp_path, VISION, rate, seed, checkpoints=4, batch_size=8, num_processes=2)
     ((condition, points),) = success_curves(results_in(tmp_path)).items()
     assert condition.task == "PegInsertion"
     assert [point.gradient_steps for point in points] == [TOTAL_STEPS * part // 4 for part in (1, 2, 3, 4)]

@@ -23,7 +23,7 @@ from baselines.flow_matching import train as flow
 from baselines.references import MeanAction, Untrained
 from baselines.registry import PolicySpec
 from manifeel_ms3.demonstrations import read_demonstrations
-from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config, samples_per_step
 from tests.tasks_and_marks import PEG
 
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
@@ -286,4 +286,8 @@ def test_two_processes_train_one_policy(run, tmp_path):
     losses = [entry["losses/total_loss"] for entry in log_of(tmp_path)]
     assert len(losses) == 3
     assert losses[-1] < 0.8 * losses[0]
-    assert checkpoint_config(tmp_path / "checkpoints/last")["step"] == 60
+    config = checkpoint_config(tmp_path / "checkpoints/last")
+    assert (config["step"], samples_per_step(config)) == (60, 2 * 16)
+    alone = [sys.executable, "baselines/diffusion_policy/train.py", *arguments, "--resume"]
+    resumed = subprocess.run(alone, capture_output=True, text=True, check=False)
+    assert "was trained with other settings (num_processes: 2 there, 1 now)" in resumed.stderr

@@ -1,0 +1,17 @@
+"""What stands beside the paper's numbers on the page of results."""
+
+import pytest
+
+from manifeel_ms3.analysis.paper import RUNTIME_DEMOS, TACRGB
+from manifeel_ms3.analysis.paper_beside import runtime_table
+from manifeel_ms3.evaluation.result import results_in
+
+from .made_up import TOTAL_STEPS, write_run
+
+
+@pytest.mark.parametrize(("processes", "minutes", "rate"), [({}, "50.0", "8.0"), (dict(num_processes=2), "25.0", "16.0")])
+def test_minutes_of_an_epoch_count_the_samples_of_all_processes(processes, minutes, rate, tmp_path):
+    timed = dict(num_samples=24_000, batch_size=8, training_seconds=float(TOTAL_STEPS), trained_on=dict(gpu="A30", cpu="EPYC"))
+    write_run(tmp_path, TACRGB, 0.5, task="BallSorting", checkpoints=1, num_demos=RUNTIME_DEMOS, **timed, **processes)
+    (row,) = (line for line in runtime_table(results_in(tmp_path)).splitlines() if "A30 |" in line)
+    assert [cell.strip() for cell in row.split("|")][3:6] == [minutes, rate, "A30"]
