@@ -31,11 +31,11 @@ from .convert_actions import converted
 from .episode import run_episode
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
-from .replay import POSE
+from .replay import pose_difference
 
 log = logging.getLogger(__name__)
 DEVIATION = "replay_deviation"
-"""Field of an episode's json: largest difference of a replayed pose from the recorded one."""
+"""Field of an episode's json, if its replay differs: largest difference of a pose from the recorded one at the same step."""
 
 
 @dataclass
@@ -147,27 +147,29 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
         return None
     if source is None:
         with open_trajectories(path) as file:
-            if deviation := _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"]):
-                episode.info[DEVIATION] = deviation
+            deviation = _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"], len(actions))
+        if deviation or len(actions) != episode.info["elapsed_steps"]:
+            episode.info[DEVIATION] = deviation
     return recorder.write(episode)
 
 
-def _deviation(recorded: Any, replayed: dict[str, np.ndarray]) -> float:
-    """Largest difference of any actor's pose at any step, in m or in a quaternion's components; 0 where all are the same.
+def _deviation(recorded: Any, replayed: dict[str, np.ndarray], steps: int) -> float:
+    """Largest difference of any actor's pose at any step that both have, in m or in a quaternion's components.
 
     Args:
         recorded: Group of the file that holds the states (T + 1, 13) of the actors.
-        replayed: The states of the replay by actor.
+        replayed: The states of the replay by actor, of fewer steps if it ended earlier.
+        steps: Number T of recorded actions.
 
     Raises:
-        DemonstrationError: The recording has states of other actors, or of another number of steps.
+        DemonstrationError: The recording has states of other actors, or not after every action.
     """
     differences = [0.0]
     for name, states in replayed.items():
         before = recorded.get(name)
-        if before is None or before.shape != states.shape:
+        if before is None or before.shape != (steps + 1, *states.shape[1:]):
             raise DemonstrationError(f"{recorded.file.filename} has no states of {name} at every step; record it again")
-        differences.append(float(np.abs(before[:, POSE] - states[:, POSE]).max()))
+        differences.append(pose_difference(before[: len(states)], states))
     return max(differences)
 
 

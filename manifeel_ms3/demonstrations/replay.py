@@ -21,8 +21,8 @@ from .formats.h5_checks import POSE_SIZE
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
-POSE = slice(0, POSE_SIZE)
-"""Part of an actor's state that is its pose: position (m) and quaternion wxyz."""
+POSITION, ROTATION = slice(0, 3), slice(3, POSE_SIZE)
+"""Parts of an actor's state that are its position (m) and its quaternion wxyz."""
 
 
 @dataclass
@@ -72,9 +72,22 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
             actors: Any = common.to_numpy(base.get_state_dict()["actors"])
             if missing := sorted(set(actors) - set(ends)):
                 raise DemonstrationError(f"{path} lacks the states of {missing} in traj_{info['episode_id']}; record it again")
-            deviation = max(float(np.abs(state[0, POSE] - ends[name]).max()) for name, state in actors.items())
+            deviation = max(pose_difference(ends[name], state[0]) for name, state in actors.items())
             results.append(Replay(info["episode_seed"], success, deviation))
     return results
+
+
+def pose_difference(recorded: np.ndarray, replayed: np.ndarray) -> float:
+    """Largest difference of an object's poses, in m or in a quaternion's components; q and -q are the same rotation.
+
+    Args:
+        recorded: Recorded states (..., 13), which begin with the pose.
+        replayed: States (..., 13) of the replay at the same steps.
+    """
+    before, after = recorded[..., ROTATION], replayed[..., ROTATION]
+    sign = np.where((before * after).sum(-1, keepdims=True) < 0, -1, 1)
+    differences = (recorded[..., POSITION] - replayed[..., POSITION], before - sign * after)
+    return max(float(np.abs(difference).max()) for difference in differences)
 
 
 def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
@@ -96,11 +109,11 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
 
 
 def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """The actions (T, A) of a recorded episode, and the last pose (7,) of each object."""
+    """The actions (T, A) of a recorded episode, and the last state (13,) of each object."""
     with open_trajectories(path) as file:
         group = file[f"traj_{episode}"]
         actors = group["env_states/actors"]
-        return group["actions"][()], {name: actors[name][-1, POSE] for name in actors}
+        return group["actions"][()], {name: actors[name][-1] for name in actors}
 
 
 def main(args: Args) -> int:

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from manifeel_ms3.demonstrations import DemonstrationError, dataset, record, render_observations
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, record, render_observations, replay
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import MachineError
@@ -84,6 +84,30 @@ def test_a_replay_that_rounds_differently_is_kept_with_its_own_states_and_one_th
         moved = after["traj_0/env_states/actors/peg"][()] - before["traj_0/env_states/actors/peg"][()]
     assert np.abs(moved[:-1]).max() == 0.0
     assert moved[-1, 0] == pytest.approx(-1e-3, rel=1e-3)
+
+
+def test_a_replay_that_ends_earlier_is_compared_as_far_as_it_goes(folder, tmp_path):
+    states = damaged(folder, tmp_path) / PEG / STATES
+    with h5py.File(states, "r+") as file:
+        for name, values in arrays_of(states).items():
+            if name.startswith("traj_0/"):
+                del file[name]
+                file[name] = np.concatenate([values, values[-1:]])  # as another processor would have recorded it
+    render_observations.main(render_observations.Args(states, tmp_path / "rendered.h5", "tacff", (), num=1))
+    (recorded, _), (episode,) = (read_header(path)["episodes"] for path in (states, tmp_path / "rendered.h5"))
+    assert episode["elapsed_steps"] == recorded["elapsed_steps"]  # the json is that of the shorter episode
+    assert episode["replay_deviation"] == 0.0
+
+
+def test_a_quaternion_of_the_other_sign_is_the_same_rotation(folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    with h5py.File(copy / PEG / STATES, "r+") as file:
+        for states in file["traj_0/env_states/actors"].values():
+            states[:, 3:7] *= -1
+    assert replay.replay(copy / PEG / STATES, 1)[0].deviation == 0.0
+    render_observations.main(render_observations.Args(copy / PEG / STATES, tmp_path / "rendered.h5", "tacff", (), num=1))
+    (episode,) = read_header(tmp_path / "rendered.h5")["episodes"]
+    assert "replay_deviation" not in episode
 
 
 def test_states_of_another_task_are_refused(folder, tmp_path):
