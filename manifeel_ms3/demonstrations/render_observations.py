@@ -21,6 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from manifeel_ms3.arguments import by_name
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import episode_counter
@@ -53,7 +54,7 @@ class Args:
     tactile_sensors: tuple[str, ...] = SIDES
     """Sides of the tactile sensors to render."""
     image_size: int | None = None
-    """Width and height of camera images in pixels; the task's 256 if not given."""
+    """Width and height of camera images in pixels; those of the recording, 256 by default, if not given."""
     control_mode: str | None = None
     """Controller to which the actions are converted, such as pd_joint_pos; that of the recording if not given."""
     workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
@@ -124,9 +125,22 @@ def _env_kwargs(args: Args, source: dict[str, Any]) -> dict[str, Any]:
     """Arguments of the environment that renders: those of the recording, with the changes that the arguments ask for."""
     sensing = dict(obs_mode=args.obs_mode, cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     asked: dict[str, Any] = {} if args.control_mode is None else dict(control_mode=args.control_mode)
+    recorded = source["env_info"]["env_kwargs"]
     if args.image_size is not None:
-        asked["sensor_configs"] = dict(width=args.image_size, height=args.image_size)
-    return source["env_info"]["env_kwargs"] | sensing | asked
+        asked["sensor_configs"] = _resized(recorded.get("sensor_configs") or {}, args.image_size, args.cameras)
+    return recorded | sensing | asked
+
+
+def _resized(configs: Any, size: int, cameras: tuple[str, ...]) -> dict[str, Any]:
+    """ManiSkill's `sensor_configs` with another width and height of all cameras' images.
+
+    Raises:
+        InvalidArgumentError: The given `sensor_configs` are not a dict.
+    """
+    shape = dict(width=size, height=size)
+    given = dict(by_name("sensor_configs", configs, "dict(wrist=dict(width=128))"))
+    own = {camera: given[camera] | shape for camera in cameras if isinstance(given.get(camera), dict)}
+    return given | shape | own
 
 
 def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) -> dict[str, Any] | None:

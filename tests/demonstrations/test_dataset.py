@@ -110,6 +110,19 @@ def test_a_quaternion_of_the_other_sign_is_the_same_rotation(folder, tmp_path):
     assert "replay_deviation" not in episode
 
 
+def test_another_size_of_images_keeps_the_other_settings_of_the_recorded_sensors(tmp_path):
+    pad = dict(units="tacsl")
+    configs = dict(shader_pack="minimal", wrist=dict(width=64, fov=1.0), tactile_right=pad)
+    kwargs = json.dumps(dict(fit="paper", render_backend="none", sensor_configs=configs))
+    sensing = dict(obs_mode="tacff", cameras=("wrist",), tactile_sensors=("right",))
+    recorded = record.main(record.Args(PEG, 1, out=tmp_path / "recorded.h5", **sensing, env_kwargs=kwargs))
+    rendered = tmp_path / "rendered.h5"
+    render_observations.main(render_observations.Args(recorded, rendered, **sensing, image_size=128))
+    size = dict(width=128, height=128)
+    expected = dict(shader_pack="minimal", **size, wrist=dict(fov=1.0, **size), tactile_right=pad)
+    assert read_header(rendered)["env_info"]["env_kwargs"]["sensor_configs"] == expected
+
+
 def test_states_of_another_task_are_refused(folder, tmp_path):
     states = damaged(folder, tmp_path) / PEG / STATES
     with h5py.File(states, "r+") as file:
