@@ -81,15 +81,16 @@ def main(args: Args) -> Path:
 def _record_all(args: Args) -> Path:
     counts = {spec.env_id: args.num or spec.paper_demos for spec in map(task_spec, args.tasks)}
     observed = args.obs_mode != "none"
-    _check_room(args, counts if observed else {})
     files = {
         task: (args.out / task / STATES_FILE, args.out / task / trajectory_name(task, dict(obs_mode=args.obs_mode)))
         for task in counts
     }
+    if observed:
+        _check_room(args, {task: max(0, counts[task] - _num_finished(trajectory)) for task, (_, trajectory) in files.items()})
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
         wanted = [path for paths in files.values() for path in paths[: 1 + observed]]
-        done = sum(count_episodes(path) for path in wanted if path.is_file())
+        done = sum(map(_num_finished, wanted))
         progress = bar.add_task("all tasks", total=total, completed=min(done, total))
         count = partial(bar.advance, progress)
         for task, (states, trajectory) in files.items():
@@ -109,8 +110,13 @@ def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
     return record.Args(task, num, args.workers, out=path, obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs=backend)
 
 
+def _num_finished(path: Path) -> int:
+    """Number of episodes that a trajectory file holds already; 0 if there is no file."""
+    return count_episodes(path) if path.is_file() else 0
+
+
 def _check_room(args: Args, counts: dict[str, int]) -> None:
-    """Check that the disk has room for the number of demonstrations of each task.
+    """Check that the disk has room for the number of demonstrations of each task that are still to be rendered.
 
     Raises:
         MachineError: The disk has too little room.
@@ -120,8 +126,8 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
     full = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
     if (needed := full * max(pixels, SMALLEST_SHARE)) > free:
         raise MachineError(
-            f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} episodes take up to {needed / 1e9:.1f} GB; give "
-            "another --out, fewer --tasks or --cameras, or --obs-mode none (finished episodes are kept)"
+            f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} more episodes take up to {needed / 1e9:.1f} GB; "
+            "give another --out, fewer --tasks or --cameras, or --obs-mode none (finished episodes are kept)"
         )
 
 

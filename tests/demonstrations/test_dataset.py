@@ -13,7 +13,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import MachineError
 from manifeel_ms3.paths import data_dir
-from manifeel_ms3.tasks.registry import all_tasks
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trajectories import arrays_of
 
@@ -54,6 +54,15 @@ def test_same_command_again_does_nothing(folder):
     dataset.main(dataset.Args(folder, (PEG,), num=2, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
     assert (folder / PEG / OBSERVED).stat().st_mtime_ns == before
     assert not list(folder.rglob("*.episodes"))
+
+
+def test_only_episodes_that_are_not_there_yet_need_room(folder, monkeypatch):
+    room = 1.5e6 * task_spec(PEG).demo_megabytes  # for one more episode
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda path: type("Usage", (), dict(free=room)))
+    sensing = dict(obs_mode="tacff", cameras=(), tactile_sensors=("right",))
+    dataset.main(dataset.Args(folder, (PEG,), num=2, **sensing))
+    with pytest.raises(MachineError, match="2 more episodes take up to"):
+        dataset.main(dataset.Args(folder, (PEG,), num=4, **sensing))
 
 
 def damaged(folder: Path, tmp_path: Path) -> Path:
