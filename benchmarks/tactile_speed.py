@@ -152,7 +152,7 @@ def main(args: Args) -> None:
     assert optics is not None
     depth = rays.heights(model.pixels).clamp(min=0).unflatten(1, config.image_shape)
     surface = optics.surface(depth)
-    background, plain = optics.background.numpy(), surface[0].double().numpy()
+    background, plain = optics.levels.round().to(torch.uint8).numpy(), surface[0].double().numpy()
     with use_torch_threads_for_warp():  # as the sensor runs it
         ours = milliseconds(lambda: optics.shade(surface), args.seconds)
         skirted = milliseconds(lambda: optics.shade(optics.surface(depth)), args.seconds)

@@ -11,5 +11,10 @@ CPU = torch.device("cpu")
 GRID = ContactGrid.covering(CONFIG.gel.size, 3.5e-4, CPU)
 
 
+def background(optics: Optics) -> torch.Tensor:
+    """Image (H, W, 3) of the untouched gel, uint8."""
+    return (optics.levels + 0.5).clamp(0, 255).to(torch.uint8)
+
+
 def make_optics(num_pads: int = 1, **fields) -> Optics:
     return Optics(with_options(CONFIG, fields), GRID, num_pads, CPU)

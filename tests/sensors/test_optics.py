@@ -13,11 +13,11 @@ from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
 from manifeel_ms3.sensors.optics.lights import lamp_shader
 from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
-from manifeel_ms3.sensors.optics.tacrgb import Optics, shader_of
+from manifeel_ms3.sensors.optics.tacrgb import Optics
 from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
 from manifeel_ms3.verification.published_colours import change_images, pressed_shapes, published_table, ssim
 from tests.sensors.make_calibration import write_table
-from tests.sensors.optics import CONFIG, CPU, GRID, make_optics
+from tests.sensors.optics import CONFIG, CPU, GRID, background, make_optics
 from tests.sensors.readers import photometric_stereo
 
 
@@ -36,7 +36,7 @@ def ball(radius: float, depth: float, x: float = 0.0, y: float = 0.0) -> torch.T
 
 def test_flat_gel_is_the_background_exactly():
     optics, flat = make_optics(2), torch.zeros(2, 240, 320)
-    assert (optics.shade(optics.surface(flat)) == optics.background).all()
+    assert (optics.shade(optics.surface(flat)) == background(optics)).all()
 
 
 def test_more_surfaces_than_pads_are_refused(optics):
@@ -46,8 +46,8 @@ def test_more_surfaces_than_pads_are_refused(optics):
 
 def test_untouched_regions_stay_background(optics):
     image = optics.shade(optics.surface(ball(0.004, 5e-4, x=-6e-3, y=-10e-3)))[0]
-    assert (image[160:, 200:] == optics.background[160:, 200:]).all()
-    assert (image != optics.background).any(-1).float().mean() > 0.02
+    assert (image[160:, 200:] == background(optics)[160:, 200:]).all()
+    assert (image != background(optics)).any(-1).float().mean() > 0.02
 
 
 def test_colour_has_no_seam_over_the_direction_of_the_gradient():
@@ -82,10 +82,10 @@ def test_noise_is_seeded():
     assert (first != second).any()
     assert (first[0] != first[1]).any()
     assert (optics.shade(surface) == second).all()
-    for noise in (first.float() - optics.background, second.float() - optics.background):
+    for noise in (first.float() - background(optics), second.float() - background(optics)):
         assert noise.mean().item() == pytest.approx(0.0, abs=0.05)
         assert noise.std().item() == pytest.approx(3.0, rel=0.02)
-    colours = (first[0].float() - optics.background).flatten(0, 1).T
+    colours = (first[0].float() - background(optics)).flatten(0, 1).T
     assert (torch.corrcoef(colours) - torch.eye(3)).abs().max() < 0.02  # channels are independent
 
 
@@ -98,7 +98,7 @@ def test_episodes_differ_in_light_as_far_as_asked():
     optics.reset(torch.tensor([1]), np.array([1]))
     image = optics.shade(optics.surface(press))
     assert (image[0] == image[1]).all()
-    assert (optics.shade(torch.zeros(2, 240, 320)) == optics.background).all()
+    assert (optics.shade(torch.zeros(2, 240, 320)) == background(optics)).all()
 
 
 def test_shadow_darkens_behind_the_bump_and_nowhere_else(optics):
@@ -289,7 +289,10 @@ def test_height_comes_back_from_the_picture_of_other_sensors(sensor, figure):
     x, y = np.meshgrid(*((np.arange(n) - (n - 1) / 2) * config.pixel_size for n in config.image_shape), indexing="ij")
     height = (np.sqrt(np.maximum(0.004**2 - x**2 - y**2, 0)) - 0.004 + 6e-4).clip(min=0)
     surface = optics.surface(torch.as_tensor(height, dtype=torch.float32)[None])
-    found = photometric_stereo(optics.shade(surface)[0].numpy(), shader_of(config), config.pixel_size, step=4)
+    lights, calibration = config.optics.lights, config.optics.calibration
+    gel = (config.gel.curvature, config.image_shape, config.pixel_size)
+    shader = lamp_shader(lights, *gel) if lights else Shader.load(Path(calibration))
+    found = photometric_stereo(optics.shade(surface)[0].numpy(), shader, config.pixel_size, step=4)
     off = np.abs(found - surface[0, ::4, ::4].numpy()).max()
     figure(f"height from the {sensor}'s picture by photometric stereo, mm off", 1e3 * off, at_most=0.1)
-    assert (optics.shade(torch.zeros(1, 240, 320)) == optics.background).all()
+    assert (optics.shade(torch.zeros(1, 240, 320)) == background(optics)).all()

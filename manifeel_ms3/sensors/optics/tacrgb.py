@@ -193,7 +193,6 @@ class Optics:
         self._response, self._background, to_light = _shading_maps(*recipe, device)
         self._to_light = wp.array(to_light, dtype=wp.vec2f, device=warp_device(device))
         self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=warp_device(device))
-        self.background = (wp.to_torch(self._background) + 0.5).clamp(0, 255).to(torch.uint8)
         self.levels = wp.to_torch(self._background)
         """Levels (H, W, 3) of the untouched gel's image before they are rounded, grey levels."""
         self._wide = [GaussianBlur(coarse, sigma / cell, device) for sigma in WIDE_SIGMAS]
@@ -294,16 +293,6 @@ class Optics:
         uphill = torch.stack(torch.gradient(pressed, spacing=COARSE * self.config.pixel_size, dim=(1, 2)), dim=-1)
         moved = dragged - MARKER_BULGE * self.config.gel.thickness * uphill
         return F.pad(moved / self.config.pixel_size, (0, 1))
-
-
-def shader_of(config: TactileSensorConfig) -> Shader:
-    """The compact shader of a sensor.
-
-    Raises:
-        InvalidFileError: Its calibration is missing, or is neither a shader file nor a table in Taxim's format.
-    """
-    optics = config.optics
-    return _shader(Path(optics.calibration), optics.lights, config.gel.curvature, config.image_shape, config.pixel_size)
 
 
 def _shader(
