@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED
-from manifeel_ms3.evaluation.evaluate import SENSING
-from manifeel_ms3.tasks.registry import short_name, task_spec
+from manifeel_ms3.evaluation.variant import SENSING, variant_of
+from manifeel_ms3.tasks.registry import short_name
 
 NO_SETTINGS = frozenset(
     {

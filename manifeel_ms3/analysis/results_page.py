@@ -66,10 +66,10 @@ it, and `manifeel eval --entry NAME` runs its episodes again and reports in how 
 configs/tables_cpu.yaml` produces all results of the small networks.
 """
 CURVES = """
-![Success over environment steps trained on]({figure})
+![Success over the samples seen in training]({figure})
 
-Success of the checkpoints in the course of training, with 95 % intervals. Each sample of a batch counts as one environment
-step: their number is that of the gradient steps times the batch size. The numbers are also available as [csv]({table}).
+Success of the checkpoints in the course of training, with 95 % intervals. The number of samples is that of the
+gradient steps times the batch size times the processes. The numbers are also available as [csv]({table}).
 """
 GENTLE = """
 ## Gentle success

@@ -1,8 +1,8 @@
 """Success over the course of training, from the evaluations of a run's checkpoints: a figure, and a table as csv.
 
-The figure's axis is the number of environment steps that training has seen: each sample of a batch begins at one recorded step
-of a demonstration, so this number is gradient steps times batch size times processes, and runs that differ in these can be
-compared.
+The figure's axis is the number of samples that training has seen: gradient steps times batch size times processes, so that
+runs that differ in these can be compared. A sample begins at one recorded step of a demonstration, and is seen again in every
+epoch; samples are therefore no environment steps.
 """
 
 import csv
@@ -42,7 +42,7 @@ class Point:
 
     gradient_steps: int
     """Number of gradient steps of the checkpoint."""
-    environment_steps: int | None
+    samples_seen: int | None
     """Number of samples of all gradient steps; None if the configuration does not name the batch size."""
     success: Estimate
     """Success rate of the checkpoint."""

@@ -21,7 +21,7 @@ MAX_TILT = np.deg2rad(2.0)
     paper_demos=30,
     paper_tables=("I",),
     demo_megabytes=70.0,
-    demo_steps=403,
+    demo_steps=404,
     revision=4,
     force_limit=24.0,
 )
