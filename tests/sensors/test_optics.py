@@ -217,7 +217,7 @@ def test_shader_is_fitted_from_ball_presses(optics, tmp_path):
         cv2.imwrite(str(tmp_path / f"{k}.png"), shader.shade(surface)[0].numpy()[..., ::-1])
         row, col = x / CONFIG.pixel_size + 119.5, y / CONFIG.pixel_size + 159.5
         presses.append(f"{k}.png,{row},{col},{contact - 1.5}")
-    cv2.imwrite(str(tmp_path / "background.png"), shader.background.numpy()[..., ::-1])
+    cv2.imwrite(str(tmp_path / "background.png"), background(shader).numpy()[..., ::-1])
     (tmp_path / "presses.csv").write_text("\n".join(["file,row,col,radius", *presses]))
     known = dict(folder=tmp_path, ball_radius=radius, pixel_size=CONFIG.pixel_size)
     main(Presses(**known, out=tmp_path / "out" / "shader.npz"))
@@ -243,7 +243,7 @@ def test_circles_that_were_drawn_by_hand_are_shifted_to_where_the_ball_was(tmp_p
         true.append((x / CONFIG.pixel_size + 39.5, y / CONFIG.pixel_size + 49.5))
         radii.append(np.sqrt(radius**2 - (radius - depth) ** 2) / CONFIG.pixel_size - 3)
     drawn = np.array(true) + rng.integers(-6, 7, (6, 2))
-    pack = dict(f0=shader.background.numpy()[rows, cols, ::-1], imgs=np.stack(images), touch_center=drawn[:, ::-1])
+    pack = dict(f0=background(shader).numpy()[rows, cols, ::-1], imgs=np.stack(images), touch_center=drawn[:, ::-1])
     np.savez(tmp_path / "dataPack.npz", **pack, touch_radius=radii)
     background, read, circles = read_pack(tmp_path / "dataPack.npz")
     assert circles[:, :2] == pytest.approx(drawn)
