@@ -245,9 +245,9 @@ def test_circles_that_were_drawn_by_hand_are_shifted_to_where_the_ball_was(tmp_p
     drawn = np.array(true) + rng.integers(-6, 7, (6, 2))
     pack = dict(f0=background(shader).numpy()[rows, cols, ::-1], imgs=np.stack(images), touch_center=drawn[:, ::-1])
     np.savez(tmp_path / "dataPack.npz", **pack, touch_radius=radii)
-    background, read, circles = read_pack(tmp_path / "dataPack.npz")
+    untouched, read, circles = read_pack(tmp_path / "dataPack.npz")
     assert circles[:, :2] == pytest.approx(drawn)
-    refined = refined_circles(background, read, circles, radius, CONFIG.pixel_size, uniform=True)
+    refined = refined_circles(untouched, read, circles, radius, CONFIG.pixel_size, uniform=True)
     error = [np.linalg.norm(found[:, :2] - true, axis=1).mean() for found in (circles, refined)]
     assert error[1] < 0.65 * error[0]
     known = dict(ball_radius=radius, pixel_size=CONFIG.pixel_size, uniform=True, out=tmp_path / "shader.npz")
