@@ -60,8 +60,8 @@ def card_path(spec: TaskSpec) -> Path:
 
 def card(spec: TaskSpec) -> str:
     """The Markdown page of a task."""
-    facts = (_facts(spec), _randomization(spec), _arguments(spec), _measured(spec), _use(spec))
-    return "\n".join((_head(spec), _description(spec), *facts, MADE))
+    sections = (_facts(spec), _randomization(spec), _arguments(spec), _measured(spec), _use(spec))
+    return "\n".join((_head(spec), _description(spec), *sections, MADE))
 
 
 def _head(spec: TaskSpec) -> str:

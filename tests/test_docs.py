@@ -89,6 +89,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site/api/sensors/index.html").read_text()
     assert "TactileSensor" in page
+    formulas = [(tmp_path / f"site/{name}/index.html").read_text() for name in ("sensor", "evaluation")]
+    assert all("<math" in html and "arithmatex" not in html for html in formulas)
     assert not dead_links(tmp_path / "site")
 
 
