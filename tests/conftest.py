@@ -18,8 +18,14 @@ LONG = ("test_studies", "test_training", "test_end_to_end", "test_recordings", "
 
 
 def pytest_collection_modifyitems(items):
-    """Run long files first, so that no process waits for one at the end; skip tests marked `gpu` where there is none."""
+    """Run long files first, so that no process waits for one at the end; skip tests marked `gpu` where there is none.
+
+    Slow tests have no time limit.
+    """
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.timeout(0))
     if not torch.cuda.is_available():
         for item in items:
             if item.get_closest_marker("gpu"):

@@ -284,7 +284,8 @@ class Trainer:
 
     def _finish(self) -> Path:
         """Leave the other processes, wait for the evaluations, and return the last checkpoint."""
-        self.processes.close()  # first, because a process that waits in NCCL's barrier gives up after 10 minutes
+        del self.model  # before the group of processes, which it may not outlive
+        self.processes.close()  # now, because a process that waits in NCCL's barrier gives up after 10 minutes
         if self.log:
             self._log_evaluations(wait=True)
             prune(self.checkpoints, self.args.keep, set())

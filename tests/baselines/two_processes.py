@@ -2,10 +2,12 @@
 
 import os
 import socket
+import weakref
 from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+import torch.distributed as dist
 from torch.multiprocessing.spawn import spawn
 
 from baselines.common.processes import Processes
@@ -30,6 +32,11 @@ def _run(rank: int, what: Callable[[TrainArgs], None], args: TrainArgs, port: in
 def resume_and_compare(args: TrainArgs) -> None:
     """Train, save and train on; then resume from what was saved, which must lead to the same weights."""
     processes = Processes("cpu")
+    _resume_and_compare(args, processes)  # its trainers are gone when the group of processes ends
+    processes.close()
+
+
+def _resume_and_compare(args: TrainArgs, processes: Processes) -> None:
     whole = Trainer(args, DiffusionPolicy, processes)
     _take_steps(whole, 2)
     whole.save()
@@ -39,7 +46,6 @@ def resume_and_compare(args: TrainArgs) -> None:
     _take_steps(resumed, 2)
     for (name, own), other in zip(resumed.policy.named_parameters(), whole.policy.parameters(), strict=True):
         assert torch.equal(own, other), name
-    processes.close()
 
 
 def _take_steps(trainer: Trainer, count: int) -> None:
@@ -48,9 +54,23 @@ def _take_steps(trainer: Trainer, count: int) -> None:
 
 
 def end_before_the_evaluation(args: TrainArgs) -> None:
-    """Train to the end, and look whether the last checkpoint has been evaluated when a process is done."""
+    """Train to the end, and look whether the last checkpoint has been evaluated when a process is done.
+
+    The model with mean gradients must be gone before the group of processes ends, or a process may never end
+    (`Processes.close`).
+    """
     assert args.run_dir
     processes = Processes("cpu")
-    last = Trainer(args, DiffusionPolicy, processes).run()
+    trainer = Trainer(args, DiffusionPolicy, processes)
+    model, end_group, ended = weakref.ref(trainer.model), dist.destroy_process_group, []
+
+    def end_group_without_model() -> None:
+        assert model() is None, "the model is the last owner of the group"
+        end_group()
+        ended.append(True)
+
+    dist.destroy_process_group = end_group_without_model
+    last = trainer.run()
+    assert ended
     result = args.run_dir / f"evaluations/{last.resolve().name}.json"
     assert result.exists() == processes.first, "only the first process waits for the evaluation"
