@@ -153,7 +153,7 @@ def _measured(spec: TaskSpec) -> str:
     for page, title, columns in (("tasks.md", "The demonstrator", 4), ("audit.md", "What camera and touch reveal", 6)):
         if found := rows_of(DOCS / page, spec.name, columns):
             names, rows = found
-            source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured, and on which revision.\n"
+            source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
     return "\n".join([*parts, _results(spec)])
 

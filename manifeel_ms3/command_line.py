@@ -9,6 +9,7 @@ import gc
 import json
 import logging
 import os
+import platform
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,6 +31,8 @@ PACKAGE = "manifeel-ms3"
 """Name of this package's distribution."""
 DISTRIBUTIONS = {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
 """Names of distributions by the names of their modules, where the two differ."""
+NEWER_PYTHON = {"python_version": "3.99", "python_full_version": "3.99.0"}
+"""Variables of requirements' markers, for a version of Python that is newer than any that a marker names."""
 
 
 def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], str] | None = None) -> int:
@@ -73,21 +76,24 @@ def missing_extras_named() -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        if extra := _extra_with(error.name or ""):
-            raise MissingExtraError(
-                f"{error.name} is not installed: pip install '{PACKAGE}[{extra}]'", name=error.name
-            ) from error
-        raise
+        if not (found := _extra_with(error.name or "")):
+            raise
+        extra, of_this_python = found
+        mend = f"pip install '{PACKAGE}[{extra}]'"
+        if not of_this_python:
+            mend = f"it needs a newer Python than {platform.python_version()}; there, {mend}"
+        raise MissingExtraError(f"{error.name} is not installed: {mend}", name=error.name) from error
 
 
-def _extra_with(module: str) -> str | None:
-    """The extra of this package that installs a module; None if there is none."""
+def _extra_with(module: str) -> tuple[str, bool] | None:
+    """The extra of this package that installs a module, and whether it does so in this Python; None if there is none."""
     package = module.partition(".")[0]
     name = DISTRIBUTIONS.get(package, package).replace("_", "-")
     for requirement in map(Requirement, requires(PACKAGE) or []):
         for extra in metadata(PACKAGE).get_all("Provides-Extra") or []:
-            if requirement.name == name and requirement.marker and requirement.marker.evaluate({"extra": extra}):
-                return extra
+            marker = requirement.marker
+            if requirement.name == name and marker and marker.evaluate({"extra": extra} | NEWER_PYTHON):
+                return extra, marker.evaluate({"extra": extra})
     return None
 
 

@@ -203,7 +203,7 @@ main() {
   esac
   install_system_packages
   install_python_packages
-  say "Ready. Renderer: $(.venv/bin/python -c 'from manifeel_ms3.rendering.backend import available_render_backend as b; print(b())')"
+  say "Ready. Activate the environment with: source .venv/bin/activate. Renderer: $(.venv/bin/python -c 'from manifeel_ms3.rendering.backend import available_render_backend as b; print(b())')"
 }
 
 if [ "${BASH_SOURCE[0]}" = "$0" ]; then main "$@"; fi

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import platform
 import re
 import shutil
 import subprocess
@@ -15,7 +16,7 @@ import tyro
 from baselines import floors
 from baselines.flow_matching import train as flow_matching
 from baselines.tactile_representations import pretrain
-from manifeel_ms3 import cli
+from manifeel_ms3 import cli, command_line
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
 from manifeel_ms3.demonstrations.recording import next_step
@@ -173,6 +174,11 @@ def test_a_library_of_an_extra_is_named_with_the_extra(monkeypatch, capsys):
         assert f"{module} is not installed: pip install 'manifeel-ms3[{extra}]'" in capsys.readouterr().err
     with pytest.raises(ModuleNotFoundError, match="no_library_of_ours"):
         run(import_it, "no_library_of_ours")  # no extra would install it: a fault, with its traceback
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    monkeypatch.setattr(command_line, "requires", lambda _: ["zarr>=3; python_version >= '3.98' and extra == 'zarr'"])
+    assert run(import_it, "zarr") == 1
+    newer = f"it needs a newer Python than {platform.python_version()}; there, pip install 'manifeel-ms3[zarr]'"
+    assert f"zarr is not installed: {newer}" in capsys.readouterr().err
 
 
 def test_a_command_without_its_extra_is_one_line(monkeypatch, capsys):

@@ -61,6 +61,8 @@ def test_a_shown_command_and_its_flags_exist(line, capsys):
         assert importlib.util.find_spec(words[2]), line
     elif name == "make":
         assert f"\n{words[1]}:" in (REPOSITORY / "Makefile").read_text(), line
+    elif name == "source":  # the environment that the set-up makes
+        assert words[1:] == [".venv/bin/activate"], line
     else:
         assert name == "pip" or words[:2] == ["manifeel", "--help"], line
 

@@ -20,6 +20,7 @@ from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
+from .condition import Condition
 from .encoder_ranking import ranking_tables
 from .estimates import SIGNIFICANT, Estimate, difference, holm
 from .markdown import markdown_table
@@ -33,9 +34,9 @@ Verdict = Literal["holds", "does not hold", "undecided"]
 MARGIN = 0.05
 """Largest gain in success that counts as none where a claim says that there is no gain: five points, our choice."""
 
-MANY_TESTS = """Interval, p and verdict are each of one comparison alone. The table tests {count} of them, and of many tests,
-5 % find a difference where there is none. The column "p, Holm" is corrected for all tests of the table (Holm 1979): {remaining}
-of the {count} differences have a corrected p below 0.05.
+MANY_TESTS = """Interval, p and verdict are each of one comparison alone. The table compares {count} pairs of conditions, some
+of them for several claims, and of many tests, 5 % find a difference where there is none. The column "p, Holm" is corrected for
+all tests of the table (Holm 1979): {remaining} of the {count} differences have a corrected p below 0.05.
 """
 
 
@@ -48,11 +49,13 @@ class ClaimResult:
     p_value: float
     """Probability of so large a difference if both conditions succeed equally often."""
     p_holm: float
-    """The p-value after Holm's correction for all comparisons that were run."""
+    """The p-value after Holm's correction for all pairs of conditions that were compared."""
     verdict: Verdict
     """Whether the claim holds, by this comparison alone."""
     settings: TrainingSettings
     """Settings that both conditions were run with."""
+    conditions: frozenset[Condition]
+    """The two conditions."""
 
 
 def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
@@ -64,15 +67,19 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
     Raises:
         ResultError: Results cannot be told apart, or are of different initial states.
     """
-    differences = {
-        (comparison, settings): difference(found[first], found[second])
+    pairs = {
+        (comparison, settings): (first, second)
         for comparison in comparisons()
         for settings, (first, second) in answering_all([comparison.first, comparison.second], found).items()
     }
-    corrected = holm([p_value for _, p_value in differences.values()])
+    differences = {(first, second): difference(found[first], found[second]) for first, second in pairs.values()}
+    tests = {frozenset(pair): p_value for pair, (_, p_value) in differences.items()}  # several claims may rest on one test
+    corrected = dict(zip(tests, holm(list(tests.values())), strict=True))
     outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
-    for ((comparison, settings), (gap, p_value)), p_holm in zip(differences.items(), corrected, strict=True):
-        outcomes[comparison].append(ClaimResult(gap, p_value, p_holm, _verdict(comparison, gap), settings))
+    for (comparison, settings), pair in pairs.items():
+        (gap, _), test = differences[pair], frozenset(pair)
+        verdict = _verdict(comparison, gap)
+        outcomes[comparison].append(ClaimResult(gap, tests[test], corrected[test], verdict, settings, test))
     return outcomes
 
 
@@ -98,13 +105,9 @@ def claims_page(found: Found) -> str:
         ]
         rows += [(*what, *cells) for cells in ran or [(None, None, None, "not run", None)]]
     table = markdown_table(("claim", "task", "compared", "difference", "p", "p, Holm", "verdict", "settings"), rows)
-    note = MANY_TESTS.format(count=sum(map(len, answered.values())), remaining=_remaining(answered))
+    tests = {one.conditions: one.p_holm for outcomes in answered.values() for one in outcomes}
+    note = MANY_TESTS.format(count=len(tests), remaining=sum(p_holm < SIGNIFICANT for p_holm in tests.values()))
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
-
-
-def _remaining(answered: dict[Comparison, list[ClaimResult]]) -> int:
-    """Number of comparisons whose difference is significant after the correction."""
-    return sum(one.p_holm < SIGNIFICANT for outcomes in answered.values() for one in outcomes)
 
 
 def _compared(comparison: Comparison) -> str:

@@ -27,8 +27,8 @@ SIMILARITY_TEXT = """
 
 Distances between simulated and real tactile images in the feature space of a network; a smaller distance means that they are
 more alike. The paper used a ResNet that it does not name. Our distances need images of a real sensor, which this repository
-does not have: `manifeel similarity --sim peg.h5 --real IMAGES --object ball` measures them, and this page shows them if it
-is given the folder of the measurement.
+does not have: `manifeel similarity --sim peg.h5 --real IMAGES --object ball --features inception` measures them, and this page
+shows them if it is given the folder of the measurement.
 """
 _ESTIMATE = {
     "type": "object",

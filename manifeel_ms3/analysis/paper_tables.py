@@ -26,8 +26,9 @@ nothing, where it was measured ([failure floors](#failure-floors)). The paper co
 set-ups has only dim light, but its Tables I and II report different rates for the same policies. Here, Tables II and III are
 therefore run in both lights.
 """
-NEEDS_GPU = """
-Not run: {what}. They need a GPU; `manifeel study configs/paper.yaml --dry-run` estimates the hours on your machine.
+NOT_RUN = """
+Not run: {what}. `manifeel study configs/paper.yaml` runs them, on a GPU; with `--dry-run` it estimates the hours on your
+machine.
 """
 HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
 """Headings of the tables' columns, by observation mode."""
@@ -55,7 +56,7 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
         files: Links to the result files of conditions.
     """
     yield TEXT
-    all_settings = _all_settings(found)
+    all_settings, by_other_policies, by_encoder = _all_settings(found), False, False
     for settings in all_settings:
         if rows := list(_rows_by_sensing(found, files, settings, {(task, DP): rates for task, rates in MODALITIES.items()})):
             yield f"\n### Table I, what touch adds: Diffusion Policy, {settings}\n\n"
@@ -63,17 +64,21 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
         by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
         rows = list(_rows_by_sensing(found, files, settings, by_policy))
         if {policy for (_, policy), _ in rows} - {DP}:
+            by_other_policies = True
             yield f"\n### Table II, three policies: {settings}\n\n"
             yield _with_floors(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
         if rows := list(_rows_by_encoder(found, files, settings)):
+            by_encoder = True
             yield f"\n### Table III, encoders of TacRGB: {settings}\n\n"
             names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
             yield _with_floors(("task", *names), rows)
     missing = [] if any(settings.preset == PAPER for settings in all_settings) else ["the networks of the paper (ResNet-18)"]
-    if not any(True for settings in all_settings for _ in _rows_by_encoder(found, files, settings)):
+    if not by_other_policies:
+        missing.append("Table II, the Equivariant Diffusion Policy and Flow Matching")
+    if not by_encoder:
         missing.append("Table III, the encoders with published weights")
     if missing:
-        yield NEEDS_GPU.format(what=", and ".join(missing))
+        yield NOT_RUN.format(what="; ".join(missing))
 
 
 def _with_floors(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -38,6 +38,10 @@ difficult the tasks are.
 """
 
 
+COMPARED = {"I": "obs_mode", "II": "policy", "III": "encoder"}
+"""Attribute of a condition that each table of the paper compares."""
+
+
 @dataclass(frozen=True)
 class Ranked:
     """A condition that the paper reports and that was run here."""
@@ -121,14 +125,18 @@ def _with_interval(measure: Callable[[np.ndarray], float], ours: np.ndarray, dra
 
 
 def _ranked_by_table(found: Found) -> Iterator[tuple[str, TrainingSettings, list[Ranked]]]:
-    """The conditions of each table that were run, by their set-up; the paper's preset is first."""
+    """The conditions of each table that were run, by their set-up; the paper's preset is first.
+
+    A table is left out where its conditions do not differ in what it compares.
+    """
     by_table: dict[str, dict[TrainingSettings, list[Ranked]]] = {}
     for table, wanted, rate in reported():
         for settings, condition in answering(wanted, found).items():
             by_table.setdefault(table, {}).setdefault(settings, []).append(Ranked(condition, rate.mean, found[condition]))
     for table, all_settings in by_table.items():
         for settings in sorted(all_settings, key=lambda one: one.sort_key):
-            yield table, settings, all_settings[settings]
+            if len({getattr(one.condition, COMPARED[table]) for one in all_settings[settings]}) > 1:
+                yield table, settings, all_settings[settings]
 
 
 def _scopes(conditions: list[Ranked]) -> Iterator[tuple[str, list[Ranked], list[list[int]]]]:

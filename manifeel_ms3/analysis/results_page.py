@@ -50,9 +50,12 @@ An episode is a success if the task was solved at any step. A rate is the mean o
 most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states; "of" gives the number
 of each. "Std" is the standard deviation over training seeds. "Gentle success" counts the episodes that succeed before the
 contact force exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor"
-is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "Settings"
-names the preset of the policy and what differs from it, and "id" is a hash of everything that defines the condition. "Cost"
-is the time of training, summed over the seeds.
+is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "By the
+paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)); results of
+before it was measured lack it. "TacRGB encoder" is the network for tactile images: `fine_cnn` is the small one of the preset
+`cpu`, trained from scratch. "Settings" names the preset of the policy and what differs from it, and "id" is a hash of
+everything that defines the condition. "Cost" is the time of training, summed over the seeds, and "on" the machine, of which
+each job used one core.
 """
 CHART = """
 ![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})

@@ -54,6 +54,17 @@ def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
     assert f"{remaining} of the 3 differences have a corrected p below 0.05" in " ".join(page_of(tmp_path).split())
 
 
+def test_one_pair_of_conditions_is_one_test_whatever_claims_rest_on_it(tmp_path):
+    for camera in ("front", "wrist"):
+        for mode, rate in ((VISION, 0.3), (TACRGB, 0.5)):
+            write_run(tmp_path, mode, rate, task="ObjectSearch", env_kwargs=dict(cameras=[camera]))
+    found = answered(tmp_path)
+    assert [claim[:2] for claim, _, _ in found] == ["2.", "8."]  # TacRGB helps, and does so from the front camera
+    assert len({one.conditions for _, _, one in found}) == 1
+    assert all(one.p_holm == one.p_value == found[0][2].p_value for _, _, one in found)
+    assert "The table compares 1 pairs" in " ".join(page_of(tmp_path).split())
+
+
 def test_the_page_says_what_touch_adds_to_vision(tmp_path):
     write_run(tmp_path, VISION, 0.2)
     assert "What touch adds, and how" not in page_of(tmp_path)  # nothing to compare with
@@ -76,7 +87,8 @@ def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     assert (tmp_path / re.search(r"\]\((.*?\.json)\)", beside)[1]).is_file()
     assert (tmp_path / "images/results_sensing.png").stat().st_size > 1000
     assert "### Table II" not in page  # it would repeat Table I
-    assert "Table III, the encoders with published weights. They need a GPU" in page
+    missing = "Table II, the Equivariant Diffusion Policy and Flow Matching; Table III, the encoders with published weights"
+    assert f"Not run: {missing}. " in " ".join(page.split())
     assert "What learning gained" not in page
 
 

@@ -61,3 +61,13 @@ def test_the_page_ranks_three_conditions_or_more(tmp_path):
     page = page_of(tmp_path / "runs", tmp_path / "results.md")
     assert "| I | paper | within tasks | 3 | 1.00 [" in page
     assert "| 0.00 [0.00, " in page
+
+
+def test_tables_whose_conditions_do_not_differ_in_what_they_compare_are_not_ranked(tmp_path):
+    for mode, rate in zip(MODES, (0.2, 0.3, 0.6), strict=True):
+        write_run(tmp_path, mode, rate, task="GearAssembly")
+    page = page_of(tmp_path)
+    assert "| I | paper | within tasks | 3 |" in page
+    assert "| II | " not in page
+    write_run(tmp_path, MODES[0], 0.4, task="GearAssembly", policy="flow_matching")
+    assert "| II | paper | within tasks | 4 |" in page_of(tmp_path)
