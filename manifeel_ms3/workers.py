@@ -35,6 +35,8 @@ Task = TypeVar("Task")
 
 SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable of Python 3.11 and later, with which a new interpreter finds no modules in the current folder."""
+ENDED_EARLY = os.EX_SOFTWARE
+"""Exit code that stands for 0 where a process ends in the midst of its work, for example by `os._exit(0)` in a policy."""
 
 
 @contextmanager
@@ -63,6 +65,12 @@ def without_ctrl_c() -> Iterator[None]:
 
 class WorkerProcess(ForkServerProcess):
     """A process of `WorkerContext`, with the environment variables that this process has as it starts it."""
+
+    @property
+    def exitcode(self) -> int | None:
+        """The exit code; `ENDED_EARLY` if it is 0, because a worker never ends by itself, and pebble reports no code of 0."""
+        code = super().exitcode
+        return ENDED_EARLY if code == 0 else code
 
     @staticmethod
     def _Popen(process_obj: Any) -> Any:  # noqa: N802 (the name is that of multiprocessing)

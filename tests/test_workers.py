@@ -68,6 +68,18 @@ def test_a_process_that_dies_fails_its_task_alone():
     assert raised.value.exit_code == -signal.SIGKILL
 
 
+def leave(state: list[int], number: int) -> None:
+    os._exit(0)
+
+
+def test_a_process_that_ends_without_an_error_fails_its_task():
+    with WorkerPool(1, partial(counter, 0)) as pool:
+        pool.submit(leave, 1)
+        (finished,) = pool.as_finished()
+    with pytest.raises(WorkerDiedError, match="worked on 1 ended with exit code 70"):
+        finished.result()
+
+
 def test_errors_of_a_task_and_of_the_state_are_raised_in_the_caller():
     for make_state, error in ((partial(counter, 0), KeyError), (broken_state, InvalidArgumentError)):
         with WorkerPool(1, make_state) as pool:

@@ -94,6 +94,12 @@ class BackgroundEvaluation:
         }
         return [{"step": step, **{f"eval/{name}": value for name, value in scalars.items()}}]
 
+    def stop(self) -> None:
+        """End the evaluation that is running, which continues where it stopped when its checkpoint is submitted again."""
+        if self._running:
+            self._running[1].kill()
+            self._running[1].wait()
+
     def video_of(self, step: int) -> Path | None:
         """The video of a checkpoint's evaluation; None if there is none."""
         path = self.folder / "videos" / f"{step}.mp4"

@@ -157,9 +157,19 @@ class Trainer:
     def run(self) -> Path:
         """Train to the last step, and return the last checkpoint.
 
+        An evaluation that is running when an exception ends the training is stopped, too.
+
         Raises:
             TrainingError: The loss is not a finite number.
         """
+        try:
+            self._train()
+            return self._finish()
+        finally:
+            self.evaluation.stop()
+
+    def _train(self) -> None:
+        """Train to the last step, with checkpoints and logs on the way."""
         with progress_bar(disable=not self.processes.first) as bar:
             task = bar.add_task("training", total=self.total_steps, completed=self.step)
             while self.step < self.total_steps:
@@ -172,7 +182,6 @@ class Trainer:
                 if self.step % self.args.log_freq == 0:
                     self._log_evaluations()
                 bar.update(task, completed=self.step)
-        return self._finish()
 
     def take_step(self) -> None:
         """Take one gradient step on the next batch."""

@@ -188,6 +188,11 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
                     needed = [results[need.key] for need in job.needs]
                     results[job.key] = task.remote(Path.cwd(), job, root, needs.workers, *needed)
                     running[results[job.key]] = job
+                if not running:
+                    raise MachineError(
+                        f"{study.name}: {len(waiting)} jobs wait, and no machine of the cluster has room for the first of "
+                        f"them, {waiting[0].title}; add a machine, and start the study again, which continues"
+                    )
                 ended, _ = ray.wait(list(running), timeout=POLL_SECONDS, fetch_local=False)
                 for result in ended:
                     del running[result]
@@ -228,11 +233,13 @@ def _error(result: Any) -> str:
 
 
 def _require_resources(study: Study) -> None:
+    machines = [machine["Resources"] for machine in ray.nodes() if machine["Alive"]]
     for kind, needs in study.resources.items():
-        for name, field, available in _resources():
+        for name, field, _ in _resources():
+            available = max(machine.get(name, 0.0) for machine in machines)  # a job runs on one of them
             if (wanted := getattr(needs, field)) > available:
                 raise MachineError(
-                    f"{study.name}: {kind} needs {wanted:g} {name}s, and {available:g} are available; change "
+                    f"{study.name}: {kind} needs {wanted:g} {name}s, and a machine has {available:g} of them; change "
                     "`resources` in the study's file, or give the --address of a Ray cluster"
                 )
 

@@ -109,5 +109,4 @@ def _make_env_and_policy(evaluation: Evaluation, address: str | None) -> tuple[g
 
 def _run_seed(evaluation: Evaluation, env_and_policy: tuple[gym.Env, Policy], seed: int) -> EpisodeOutcome:
     env, policy = env_and_policy
-    limit = None if getattr(policy, "limits_itself", False) else evaluation.step_timeout
-    return evaluate_episode(env, policy, seed, step_timeout=limit, stop_at_success=evaluation.stop_at_success)
+    return evaluate_episode(env, policy, seed, step_timeout=evaluation.step_timeout, stop_at_success=evaluation.stop_at_success)

@@ -275,7 +275,8 @@ def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:
     with missing_extras_named():
         from .video import encode_video, record_episode
 
-    _, frames = record_episode(evaluation.env_id, evaluation.env_kwargs, evaluation.source.make(), seed)
+    policy = evaluation.source.make()
+    _, frames = record_episode(evaluation.env_id, evaluation.env_kwargs, policy, seed, evaluation.step_timeout)
     path = folder / f"{seed}.mp4"
     with atomic_write(path) as partial_path:
         partial_path.write_bytes(encode_video(frames))

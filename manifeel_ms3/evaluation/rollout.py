@@ -111,8 +111,8 @@ def evaluate_episode(
         policy: The policy.
         seed: Seed of the episode.
         on_action: Function that is called with every action (A,) before it is done.
-        step_timeout: Longest time that the policy may take for one action, in s; no limit if not given. A limit works only
-            in the main thread of a process.
+        step_timeout: Longest time that the policy may take for one action, in s; no limit if not given, or if the policy's
+            attribute `limits_itself` is true. A limit works only in the main thread of a process.
         stop_at_success: End the episode at success or failure.
 
     Raises:
@@ -122,6 +122,7 @@ def evaluate_episode(
     task: Any = env.unwrapped
     shape = task.single_action_space.shape
     metrics, over, fault = _Metrics(seed), False, None
+    step_timeout = None if getattr(policy, "limits_itself", False) else step_timeout
     try:
         _answer(lambda: begin_episode(policy, seed), step_timeout)
         while not over:
@@ -234,7 +235,7 @@ def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
             return ask()
     except (PolicyFault, PolicyUnavailableError):
         raise
-    except Exception as error:  # a policy may raise anything
+    except (Exception, SystemExit) as error:  # a policy may raise anything
         raise PolicyFault(f"{type(error).__name__}: {error}") from error
 
 

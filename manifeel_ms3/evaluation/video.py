@@ -17,7 +17,7 @@ from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
-from .policy import Policy
+from .policy import STEP_TIMEOUT, Policy
 from .rollout import EpisodeOutcome, evaluate_episode
 
 VIEWS = ("wrist", "front")
@@ -38,7 +38,9 @@ class Frame:
     """RGB images (H, W, 3) uint8 by the names of their sensors."""
 
 
-def act_again(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[np.ndarray]]:
+def act_again(
+    env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int, step_timeout: float = STEP_TIMEOUT
+) -> tuple[EpisodeOutcome, list[np.ndarray]]:
     """Run an evaluated episode again; return its outcome and its actions (A,).
 
     The policy observes what it did in the evaluation and nothing else, so that any observation mode can be filmed. The images
@@ -49,11 +51,12 @@ def act_again(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: 
         env_kwargs: Arguments of `gym.make` in the evaluation.
         policy: The policy.
         seed: Seed of the episode.
+        step_timeout: Longest time that the policy may take for one action, in s, after which the episode ends.
     """
     torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
     actions: list[np.ndarray] = []
     with closing(make_env(env_id, **env_kwargs)) as env:
-        return evaluate_episode(env, policy, seed, actions.append), actions
+        return evaluate_episode(env, policy, seed, actions.append, step_timeout), actions
 
 
 def film_env(
@@ -90,7 +93,9 @@ def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator
         yield obs
 
 
-def record_episode(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int) -> tuple[EpisodeOutcome, list[Frame]]:
+def record_episode(
+    env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, seed: int, step_timeout: float = STEP_TIMEOUT
+) -> tuple[EpisodeOutcome, list[Frame]]:
     """Run an evaluated episode again, and keep the images of every step.
 
     Args:
@@ -98,11 +103,12 @@ def record_episode(env_id: str, env_kwargs: Mapping[str, Any], policy: Policy, s
         env_kwargs: Arguments of `gym.make` in the evaluation; cameras and touch are added.
         policy: The policy.
         seed: Seed of the episode.
+        step_timeout: Longest time that the policy may take for one action, in s, after which the episode ends.
 
     Raises:
         MachineError: This machine has no renderer.
     """
-    outcome, actions = act_again(env_id, env_kwargs, policy, seed)
+    outcome, actions = act_again(env_id, env_kwargs, policy, seed, step_timeout)
     with closing(film_env(env_id, env_kwargs, VIEWS)) as env:
         return outcome, [Frame(observation_images(obs)) for obs in replayed(env, actions, seed)]
 

@@ -46,10 +46,12 @@ class LocalServer(viser.ViserServer):
         label: Title of the page.
 
     Raises:
-        MachineError: The installed version of viser starts its server in another way, so that it cannot be closed to others.
+        MachineError: The host is no address of this machine, or the installed version of viser starts its server in another
+            way, so that it cannot be closed to others.
     """
 
     def __init__(self, host: str, port: int, label: str):
+        _require_address(host)  # viser would try one port after the other, and then wait for ever
         self._token, self._guarded = secrets.token_urlsafe(TOKEN_BYTES), False
         logging.getLogger("websockets").setLevel(logging.CRITICAL)  # it logs every page that opens or closes
         with _serving_with(self._serve_guarded), redirect_stdout(io.StringIO()):  # viser prints an address without the token
@@ -105,6 +107,27 @@ class LocalServer(viser.ViserServer):
         if name in LOOPBACK_NAMES or name == host:
             return True
         return host in ANY_ADDRESS and (name == socket.gethostname().lower() or _is_ip_address(name))
+
+
+def _require_address(host: str) -> None:
+    """Raise a MachineError if this machine cannot listen on any address that a name or a number stands for."""
+    reason: OSError | None = None
+    try:
+        for family, kind, _, _, address in socket.getaddrinfo(
+            host or None, 0, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        ):
+            try:
+                with socket.socket(family, kind) as one:
+                    one.bind(address)
+                return
+            except OSError as error:
+                reason = error
+    except socket.gaierror as error:
+        reason = error
+    raise MachineError(
+        f"this machine cannot listen on the host {host!r} ({reason}); give one of its own addresses, or 127.0.0.1 for this "
+        "machine alone, or 0.0.0.0 for all of its addresses"
+    )
 
 
 @contextmanager

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+from contextlib import suppress
 from itertools import pairwise
 
+import psutil
 import pytest
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
@@ -183,3 +185,29 @@ def test_two_policies_with_one_class_of_arguments_are_refused():
 def test_a_policy_under_another_name_than_its_own_is_refused():
     with pytest.raises(PluginError, match="register it as 'diffusion_policy'"):
         require_distinct({"mine": diffusion.SPEC})
+
+
+def evaluates(process: psutil.Process) -> bool:
+    with suppress(psutil.Error):  # it may have ended
+        return "manifeel_ms3.evaluation.evaluate" in process.cmdline()
+    return False
+
+
+def test_an_evaluation_does_not_outlive_a_training_that_fails(trainer_args, monkeypatch):
+    """It would go on in the folder of the run, where a resumed training evaluates the same checkpoint."""
+    kwargs = '{"render_backend": "none"}'
+    args = dataclasses.replace(trainer_args, save_freq=1, log_freq=1, num_eval_episodes=50, eval_env_kwargs=kwargs)
+    trainer, evaluations = Trainer(args, diffusion.DiffusionPolicy, Processes("cpu")), []
+    take_step = trainer.take_step
+
+    def take_one_step() -> None:
+        evaluations.extend(filter(evaluates, psutil.Process().children()))
+        if evaluations:
+            raise TrainingError("the loss is not a number")
+        take_step()
+
+    monkeypatch.setattr(trainer, "take_step", take_one_step)
+    with pytest.raises(TrainingError):
+        trainer.run()
+    (evaluation,) = evaluations
+    assert not evaluation.is_running()

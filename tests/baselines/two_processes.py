@@ -20,7 +20,7 @@ def in_two_processes(what: Callable[[TrainArgs], None], args: TrainArgs) -> None
     """Run a function in two processes; what one of them raises is raised here."""
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    spawn(_run, (what, args, port), nprocs=2)
+    spawn(_run, (what, args, port), nprocs=2, daemon=True)
 
 
 def _run(rank: int, what: Callable[[TrainArgs], None], args: TrainArgs, port: int) -> None:

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 import time
 
 import numpy as np
@@ -48,6 +49,20 @@ class Crashes(StandStill):
     def reset(self):
         super().reset()
         os._exit(7)
+
+
+class Leaves(StandStill):
+    """Ends its process as if all were well."""
+
+    def act(self, obs):
+        os._exit(0)
+
+
+class Exits(StandStill):
+    """Calls `sys.exit`, as a script does at its end."""
+
+    def act(self, obs):
+        sys.exit(0)
 
 
 class CannotBeMade(StandStill):

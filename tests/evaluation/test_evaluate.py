@@ -47,6 +47,8 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
         ("SaysWords", "step 0: the action is no array of numbers"),
         ("Sleeps", "step 0: no answer within 1 s"),
         ("Crashes", "exit code 7"),
+        ("Leaves", "exit code 70"),
+        ("Exits", "step 0: SystemExit: 0"),
     ],
 )
 def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from manifeel_ms3 import cli
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.rollout import evaluate_episode
-from manifeel_ms3.evaluation.video import record_episode
+from manifeel_ms3.evaluation.video import act_again, record_episode
 from tests.evaluation import policies
 from tests.tasks_and_marks import PEG, needs_renderer
 
@@ -27,6 +27,13 @@ def test_a_policy_is_filmed_on_its_own_observations(make_env, obs_mode):
     assert len(frames) == STEPS + 1
     assert all(set(frame.images) == SHOWN for frame in frames)
     assert not np.array_equal(frames[0].images["front"], frames[-1].images["front"])
+
+
+def test_a_policy_that_hangs_is_not_waited_for():
+    given = dict(obs_mode="state", render_backend="none", sim_backend="physx_cpu")
+    outcome, actions = act_again(PEG, given, policies.Sleeps(), 3, step_timeout=1.0)
+    assert "no answer within 1 s" in outcome.error
+    assert not actions
 
 
 @needs_renderer

@@ -48,7 +48,7 @@ class Desk:
         self.env = gym.make(task, **self.kwargs)
         self.operator, self.screen = Operator(steerable_axes(self.env.unwrapped.control_mode)), Notes()
         self.session = Session(self.env, task, self.kwargs, out, 0, self.operator)
-        self.thread = threading.Thread(target=self.session.run, args=(self.screen,))
+        self.thread = threading.Thread(target=self.session.run, args=(self.screen,), daemon=True)
         self.thread.start()
         wait_until(lambda: self.screen.steps > 0)
 

@@ -43,7 +43,7 @@ def train(args: TrainArgs) -> Path:
 
 def start(args: TrainArgs) -> Any:
     """Train in another process."""
-    process = FORKING.Process(target=train, args=(args,))
+    process = FORKING.Process(target=train, args=(args,), daemon=True)
     process.start()
     return process
 
