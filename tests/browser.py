@@ -28,13 +28,17 @@ class Browser:
         assert program, "no Chromium"
         options = [*FLAGS, "--remote-debugging-port=0", f"--user-data-dir={folder}", f"--window-size={size[0]},{size[1]}"]
         self._process = subprocess.Popen([program, *options, address], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        port_file = folder / "DevToolsActivePort"
-        wait_until(lambda: port_file.is_file() and len(port_file.read_text().split()) == 2)
-        port = port_file.read_text().split()[0]
-        with urllib.request.urlopen(f"http://localhost:{port}/json/list") as answer:
-            (page,) = [target for target in json.load(answer) if target["type"] == "page"]
-        self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
         self._number = 0
+        port_file = folder / "DevToolsActivePort"
+        try:
+            wait_until(lambda: port_file.is_file() and len(port_file.read_text().split()) == 2)
+            port = port_file.read_text().split()[0]
+            with urllib.request.urlopen(f"http://localhost:{port}/json/list", timeout=60) as answer:
+                (page,) = [target for target in json.load(answer) if target["type"] == "page"]
+            self._socket = connect(page["webSocketDebuggerUrl"], max_size=None)
+        except BaseException:
+            self._process.kill()
+            raise
 
     def __enter__(self) -> "Browser":
         return self

@@ -51,21 +51,29 @@ def _forked(
 ) -> CompletedProcess[str]:
     path = [str(folder), str(REPOSITORY)] if on_path else [str(REPOSITORY)]
     with tempfile.TemporaryDirectory() as outputs:
-        connection = _server()
+        server, connection = _server()
         connection.send((do, list(map(str, arguments)), folder, path, os.environ | environment, outputs))
-        code = connection.recv()
+        try:
+            code = connection.recv()
+        except BaseException:  # a test's time is up; the next command needs another server
+            server.kill()
+            _server.cache_clear()
+            raise
         out, err = (Path(outputs, name).read_text() for name in ("stdout", "stderr"))
         return CompletedProcess(arguments, code, out, err)
 
 
 @cache
-def _server() -> Connection:
-    """Connection to the process that has imported the libraries; not the forkserver, of which a process has only one."""
+def _server() -> tuple[subprocess.Popen, Connection]:
+    """The process that has imported the libraries, and a connection to it.
+
+    It is not the forkserver, of which a process has only one.
+    """
     ours, theirs = multiprocessing.Pipe()
     program = f"from tests.command_process import serve; serve({theirs.fileno()})"
-    subprocess.Popen([sys.executable, "-c", program], cwd=REPOSITORY, pass_fds=[theirs.fileno()])
+    server = subprocess.Popen([sys.executable, "-c", program], cwd=REPOSITORY, pass_fds=[theirs.fileno()])
     theirs.close()
-    return ours
+    return server, ours
 
 
 def serve(connection: int) -> None:

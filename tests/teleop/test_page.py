@@ -29,13 +29,16 @@ def address(tmp_path):
     command = [sys.executable, "-m", "manifeel_ms3.teleop", PEG, *files, *slow_machine]
     heeding = ["env", "--default-signal=INT", *command]  # a background job's processes ignore SIGINT by default
     process = subprocess.Popen(heeding, stderr=subprocess.PIPE, text=True)
-    address = next(line for line in process.stderr if "shows the robot" in line).split()[0]
-    assert address.startswith(f"http://localhost:{port}/")
-    yield address
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 0, said
-    assert "what was saved" in said
+    try:
+        address = next(line for line in process.stderr if "shows the robot" in line).split()[0]
+        assert address.startswith(f"http://localhost:{port}/")
+        yield address
+        process.send_signal(signal.SIGINT)
+        said = process.communicate(timeout=60)[1]
+        assert process.returncode == 0, said
+        assert "what was saved" in said
+    finally:
+        process.kill()
 
 
 def listening_addresses(port: int) -> set[str]:
@@ -50,27 +53,27 @@ def test_a_person_records_an_episode(address, tmp_path):
     wait_until(lambda: listening_addresses(port), 120)
     assert listening_addresses(port) <= {"0100007F", "00000000000000000000000001000000"}  # localhost, of IPv4 and IPv6
 
-    first = Browser(address, tmp_path / "first")
-    wait_until(lambda: "you steer" in first.text and "ready" in first.text)
-    with Browser(address, tmp_path / "second") as second:
-        wait_until(lambda: "you watch" in second.text and "discard" in second.text)
-        first.press(*SPACE)
-        wait_until(lambda: "recording" in second.text, page=second)
-        first.press(*DOWN, times=20)  # held for a second, which is few steps on a slow machine
-        second.press(*AHEAD, times=5)  # ignored
-        second.press(*SPACE)
-        wait_until(lambda: "recording" in second.text, page=second)
-        first.close()
-        wait_until(lambda: "paused" in second.text, page=second)
-        second.press(*SPACE)  # ignored, too, before this page has taken over
-        second.click("take over")
-        wait_until(lambda: "you steer" in second.text, page=second)
-        assert "paused" in second.text
-        second.press(*SPACE)
-        wait_until(lambda: "recording" in second.text, page=second)
-        second.press(*DOWN, times=10)
-        second.press(*ENTER)
-        wait_until(lambda: "1 saved" in second.text, page=second)
+    with Browser(address, tmp_path / "first") as first:
+        wait_until(lambda: "you steer" in first.text and "ready" in first.text)
+        with Browser(address, tmp_path / "second") as second:
+            wait_until(lambda: "you watch" in second.text and "discard" in second.text)
+            first.press(*SPACE)
+            wait_until(lambda: "recording" in second.text, page=second)
+            first.press(*DOWN, times=20)  # held for a second, which is few steps on a slow machine
+            second.press(*AHEAD, times=5)  # ignored
+            second.press(*SPACE)
+            wait_until(lambda: "recording" in second.text, page=second)
+            first.close()
+            wait_until(lambda: "paused" in second.text, page=second)
+            second.press(*SPACE)  # ignored, too, before this page has taken over
+            second.click("take over")
+            wait_until(lambda: "you steer" in second.text, page=second)
+            assert "paused" in second.text
+            second.press(*SPACE)
+            wait_until(lambda: "recording" in second.text, page=second)
+            second.press(*DOWN, times=10)
+            second.press(*ENTER)
+            wait_until(lambda: "1 saved" in second.text, page=second)
 
     with open_trajectories(path) as file:
         actions = np.asarray(file["traj_0/actions"])
