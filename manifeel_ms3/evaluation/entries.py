@@ -40,7 +40,10 @@ class Entry:
     """Folder of the checkpoint."""
 
     def agreement(self, outcomes: list[EpisodeOutcome]) -> str:
-        """Sentence that says how many of the given outcomes agree with those of the entry, and names the first difference."""
+        """Sentence that says how many of the given outcomes agree with those of the entry.
+
+        If some differ, it also has the number of successes on both sides and the first difference.
+        """
         submitted = {episode["seed"]: episode for episode in self.result["episodes"]}
         compared = [outcome for outcome in outcomes if outcome.seed in submitted]
         differing = {one.seed: found for one in compared if (found := differences(submitted[one.seed], one))}
@@ -48,10 +51,11 @@ class Entry:
         if not differing:
             return sentence
         seed, found = next(iter(differing.items()))
+        here, there = sum(one.success_once for one in compared), sum(submitted[one.seed]["success_once"] for one in compared)
         versions, machine = self.result["versions"], self.result["machine"]
         return (
-            f"{sentence}; in the episode of seed {seed}, {found[0]}. It was evaluated with torch {versions['torch']} on "
-            f"{machine['cpu']}; other versions and processors round differently"
+            f"{sentence}; {here} succeed here, {there} there. In the episode of seed {seed}, {found[0]}. It was evaluated with "
+            f"torch {versions['torch']} on {machine['cpu']}; other versions and processors round differently"
         )
 
 

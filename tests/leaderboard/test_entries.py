@@ -14,6 +14,7 @@ from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.rerun import checkpoint_sources, run_again
 from manifeel_ms3.leaderboard.submission import read_submission
 from manifeel_ms3.provenance import machine
+from tests.outcomes import made_up
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
@@ -50,6 +51,16 @@ def test_an_entry_is_run_again(tmp_path, caplog):
     assert said
     if machine()["cpu"] == published["machine"]["cpu"] and again["versions"] == published["versions"]:
         assert said[1] == "1"  # other processors round differently
+
+
+def test_outcomes_that_differ_are_counted_and_the_first_is_named():
+    entry = find_entry(ENTRY)
+    (seed,) = (episode["seed"] for episode in entry.result["episodes"][:1])
+    other = not entry.result["episodes"][0]["success_once"]
+    said = entry.agreement([made_up(seed, other)])
+    counts = f"{int(other)} succeed here, {int(not other)} there"
+    assert said.startswith(f"0 of 1 episodes agree with those of the entry {ENTRY}; {counts}. ")
+    assert f"In the episode of seed {seed}, success_once says {not other}, run again it is {other}" in said
 
 
 def test_an_entry_is_run_again_with_its_number_of_generation_steps(tmp_path, monkeypatch):
