@@ -49,7 +49,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=70.0,
-    demo_steps=420,
+    demo_steps=419,
     revision=4,
     force_limit=36.0,
 )
