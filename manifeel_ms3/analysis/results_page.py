@@ -124,7 +124,9 @@ def main(args: Args) -> Path:
     """
     by_file = results_by_file(*args.results)
     results = list(by_file.values())
-    files = {condition_of(result): os.path.relpath(path, args.out.parent) for path, result in by_file.items()}
+    files: dict[Condition, str] = {}
+    for path, result in by_file.items():  # the first seed's, beside which its checkpoint lies
+        files.setdefault(condition_of(result), os.path.relpath(path, args.out.parent))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
@@ -249,7 +251,7 @@ def _table_of_conditions(
 
 
 def _by_the_paper(results: ConditionResults) -> str | None:
-    """Share of the episodes that met the threshold of the paper's public code; None where it was not measured."""
+    """Share of the episodes that met the threshold of the paper's public code; None where some were not measured."""
     successes = successes_by_the_paper(results.episodes)
     return None if successes is None else f"{np.mean(successes):.0%}"
 

@@ -106,11 +106,12 @@ def summary_of(episodes: list[dict[str, Any]], force_limit: float | None) -> dic
 
 
 def successes_by_the_paper(episodes: list[dict[str, Any]]) -> list[bool] | None:
-    """Whether each episode met the threshold of the paper's public code; None where that is not known.
+    """Whether each episode met the threshold of the paper's public code; None where that is not known of all of them.
 
     Episodes of which nothing could be measured, such as those of a policy that crashed, have no such entry: they did not.
     """
-    if not any("success_paper" in episode for episode in episodes):
+    measured = [episode for episode in episodes if "success_paper" in episode or not episode["error"]]
+    if not measured or not all("success_paper" in episode for episode in measured):
         return None
     return [episode.get("success_paper", False) for episode in episodes]
 

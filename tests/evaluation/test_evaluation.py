@@ -108,6 +108,8 @@ def test_an_episode_without_an_outcome_is_no_success_by_the_papers_threshold():
     episodes = list(map(outcome_as_json, (reached, failed_outcome(2, "the process crashed", stop_at_success=False))))
     assert summary_of(episodes, None)["success_paper"]["rate"] == 0.5
     assert "success_paper" not in summary_of(episodes[1:], None)  # as of a task without a threshold
+    older = outcome_as_json(made_up(3, True))  # of before it was measured
+    assert "success_paper" not in summary_of([*episodes, older], None)
 
 
 def test_an_episode_is_said_to_have_succeeded_whatever_came_after(pulled_out):
