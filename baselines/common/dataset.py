@@ -1,4 +1,4 @@
-"""Demonstrations in memory, and the sequences of their steps that training draws."""
+"""Demonstrations in memory, the sequences of their steps that training draws, and the order in which it draws them."""
 
 from collections.abc import Iterable
 from functools import partial
@@ -134,3 +134,33 @@ class SequenceDataset:
         """The observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) of the samples `index` (B,)."""
         obs_index = self._obs_index[index]
         return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]
+
+
+class SampleOrder:
+    """Indices of samples, in an order that is shuffled anew for each epoch.
+
+    Args:
+        num_samples: Number of samples of an epoch.
+        seed: Seed of the order.
+    """
+
+    def __init__(self, num_samples: int, seed: int):
+        self.num_samples = num_samples
+        self._generator = torch.Generator().manual_seed(seed)
+        self._left = torch.empty(0, dtype=torch.long)
+
+    def take(self, count: int) -> torch.Tensor:
+        """The next `count` indices; those left of an epoch are followed by the first of the next."""
+        while len(self._left) < count:
+            self._left = torch.cat([self._left, torch.randperm(self.num_samples, generator=self._generator)])
+        taken, self._left = self._left[:count], self._left[count:]
+        return taken
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The indices left of this epoch, and the state of the random number generator."""
+        return dict(order=self._left, order_random=self._generator.get_state())
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        """Continue from a state of `state_dict`; further entries are ignored."""
+        self._left = state["order"]
+        self._generator.set_state(state["order_random"])

@@ -41,7 +41,7 @@ from .checkpoint import (
     saved_checkpoints,
     unpack,
 )
-from .dataset import Episode, SequenceDataset, read_episodes, recorded_env_kwargs
+from .dataset import Episode, SampleOrder, SequenceDataset, read_episodes, recorded_env_kwargs
 from .encoders import load_pretrained
 from .memory import keep_freed_memory, lay_out_channels_last
 from .observation import ObservationSpec
@@ -300,36 +300,6 @@ class Trainer:
             prune(self.checkpoints, self.args.keep, set())
             self.log.close()
         return self.checkpoints / LAST
-
-
-class SampleOrder:
-    """Indices of samples, in an order that is shuffled anew for each epoch.
-
-    Args:
-        num_samples: Number of samples of an epoch.
-        seed: Seed of the order.
-    """
-
-    def __init__(self, num_samples: int, seed: int):
-        self.num_samples = num_samples
-        self._generator = torch.Generator().manual_seed(seed)
-        self._left = torch.empty(0, dtype=torch.long)
-
-    def take(self, count: int) -> torch.Tensor:
-        """The next `count` indices; those left of an epoch are followed by the first of the next."""
-        while len(self._left) < count:
-            self._left = torch.cat([self._left, torch.randperm(self.num_samples, generator=self._generator)])
-        taken, self._left = self._left[:count], self._left[count:]
-        return taken
-
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """The indices left of this epoch, and the state of the random number generator."""
-        return dict(order=self._left, order_random=self._generator.get_state())
-
-    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Continue from a state of `state_dict`; further entries are ignored."""
-        self._left = state["order"]
-        self._generator.set_state(state["order_random"])
 
 
 class RecentLosses:

@@ -11,11 +11,12 @@ import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 
 from baselines.common.checkpoint import TRAINING, prune
+from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
 from baselines.common.train_args import PAPER_EPOCHS, default_steps
-from baselines.common.training import RecentLosses, SampleOrder, Trainer, TrainingError, fast_forward, with_taxel_shape
+from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.registry import PolicySpec, require_distinct
 from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
