@@ -1,4 +1,4 @@
-"""Publishing a study: its results become a submission of the leaderboard, with one checkpoint of each row that succeeds."""
+"""Publishing a study: its results become a submission of the leaderboard, with one checkpoint of each row."""
 
 import json
 import re
@@ -124,14 +124,11 @@ def _run_folder(folder: Path, result: dict[str, Any]) -> Path:
 
 
 def _publish_result(path: Path, checkpoint: Path, folder: Path) -> Path:
-    """Copy a result, and its checkpoint if it is of the first training seed; return the copy of the result.
-
-    The checkpoint of a policy that never succeeds is left out: megabytes whose evaluation nobody needs to repeat.
-    """
+    """Copy a result, and its checkpoint if it is of the first training seed; return the copy of the result."""
     result = read_result(path)
     run = _run_folder(folder, result)
     run.mkdir(parents=True, exist_ok=True)
-    if result["training_seed"] == 0 and result["success_once"]["rate"] > 0:
+    if result["training_seed"] == 0:
         shutil.copytree(checkpoint, run / CHECKPOINTS / checkpoint.name)
     return Path(shutil.copyfile(path, run / path.name))
 
