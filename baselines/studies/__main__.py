@@ -43,6 +43,8 @@ SHOWN = 8
 """Largest number of running jobs in the table; set once, not tuned."""
 POLL_SECONDS = 2
 """Time between two updates of the table, in s; set once, not tuned."""
+RESOURCES = (("CPU", "cpus"), ("GPU", "gpus"))
+"""Ray's name of each resource, and the field of `Resources` that asks for it."""
 RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
@@ -205,7 +207,8 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
 def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job | None:
     """The first waiting job whose needed jobs have ended and whose resources are free; None if there is none."""
     taken = [study.resources[job.kind] for job in running.values()]
-    free = {name: count - sum(getattr(one, field) for one in taken) for name, field, count in _resources()}
+    available = ray.cluster_resources()
+    free = {name: available.get(name, 0.0) - sum(getattr(one, field) for one in taken) for name, field in RESOURCES}
     unfinished = {job.key for job in (*waiting, *running.values())}
     for job in waiting:
         needs = study.resources[job.kind]
@@ -213,12 +216,6 @@ def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job 
         if fits and not any(need.key in unfinished for need in job.needs):
             return job
     return None
-
-
-def _resources() -> list[tuple[str, str, float]]:
-    """Ray's name of each resource, the field of `Resources` that asks for it, and how much of it the machines have."""
-    available = ray.cluster_resources()
-    return [(name, field, available.get(name, 0.0)) for name, field in (("CPU", "cpus"), ("GPU", "gpus"))]
 
 
 def _error(result: Any) -> str:
@@ -235,7 +232,7 @@ def _error(result: Any) -> str:
 def _require_resources(study: Study) -> None:
     machines = [machine["Resources"] for machine in ray.nodes() if machine["Alive"]]
     for kind, needs in study.resources.items():
-        for name, field, _ in _resources():
+        for name, field in RESOURCES:
             available = max(machine.get(name, 0.0) for machine in machines)  # a job runs on one of them
             if (wanted := getattr(needs, field)) > available:
                 raise MachineError(

@@ -24,7 +24,6 @@ from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.jobs import is_done, perform
-from baselines.studies.publish import publish
 from baselines.studies.study import Job, StudyError, jobs_of, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
@@ -34,13 +33,10 @@ from manifeel_ms3.analysis.matching import as_the_paper_says
 from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.presets import training_settings_of
-from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, InvalidFileError, MachineError, UnknownNameError
+from manifeel_ms3.errors import InvalidFileError, MachineError, UnknownNameError
 from manifeel_ms3.evaluation import evaluate as evaluation
-from manifeel_ms3.evaluation.checkpoint_config import HASHED
 from manifeel_ms3.evaluation.result import results_in
-from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
-from tests.analysis.made_up import write_run
 from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[2]
@@ -405,69 +401,3 @@ def test_a_policy_is_trained_once_and_evaluated_with_each_set_of_arguments():
     given = {job.settings["env_kwargs"] for job in jobs if job.kind == "evaluate"}
     assert {"{}", '{"imperfections": {"delay": 2}}'} < given
     assert all(job.settings["env_kwargs"] == "{}" for job in jobs if job.kind == "record")
-
-
-# -------------------------------------------------------------------- publishing
-
-
-def finished(root: Path, title: str, **run) -> Job:
-    """An evaluation in half precision that is done, with one made-up result and its checkpoint."""
-    job = Job("evaluate", title, dict(half_precision=True, title=title))
-    folder = job.folder(root)
-    write_run(root / title, "rgb+tacrgb", 0.5, checkpoints=1, **run)
-    (result,) = (root / title).rglob("*.json")
-    checkpoint = folder / CHECKPOINTS / result.stem
-    checkpoint.mkdir(parents=True)
-    result.rename(folder / result.name)
-    for name in HASHED:
-        (checkpoint / name).write_text(title)
-    (folder / "done.json").write_text(json.dumps(dict(settings=job.settings)))
-    return job
-
-
-def test_each_set_up_has_a_folder_of_its_own_in_a_submission(tmp_path):
-    root, board = tmp_path / "study", tmp_path / "board"
-    set_ups = {
-        "PegInsertion/rgb+tacrgb": {},
-        "PegInsertion/rgb+tacrgb-unit": dict(encoder="unit"),
-        "PegInsertion/rgb+tacrgb-t3": dict(encoder="t3"),
-        "PegInsertion/rgb+tacrgb-anytouch": dict(encoder="anytouch"),
-        "PegInsertion/rgb+tacrgb-flow_matching": dict(policy="flow_matching"),
-        "PegInsertion/rgb+tacrgb-front-left-right": dict(env_kwargs=dict(cameras=["front"], tactile_sensors=["left", "right"])),
-        "PegInsertion/rgb+tacrgb-dim": dict(env_kwargs=dict(lighting="dim")),
-        "PegInsertion/rgb+tacrgb-drift_0_1": dict(env_kwargs=dict(imperfections=dict(drift=0.1))),
-        "PegInsertion/rgb+tacrgb-dead_taxels_0_1": dict(env_kwargs=dict(imperfections=dict(dead_taxels=0.1))),
-    }
-    jobs = [finished(root, f"run {k}", **run) for k, run in enumerate(set_ups.values())]
-    for number_of_times in (1, 2):  # the second time, the same results are replaced
-        assert publish(jobs, root, board, "tables", "us") == len(set_ups), number_of_times
-        names = {path.parents[1].relative_to(board).as_posix() for path in board.glob("*/*/seed0/*.json")}
-        assert names == set(set_ups)
-
-
-def test_results_of_another_set_up_are_not_overwritten(tmp_path):
-    root, board = tmp_path / "study", tmp_path / "board"
-    first, other_seed = finished(root, "first"), finished(root, "other seed", seed=1)
-    slower, again = finished(root, "slower", lr=1e-5), finished(root, "again")
-    for both in ([first, slower], [first, again]):
-        with pytest.raises(InvalidArgumentError, match=r"would both be published in .*PegInsertion/rgb\+tacrgb"):
-            publish(both, root, board, "tables", "us")
-    assert not board.exists()
-    assert publish([first], root, board, "tables", "us") == 1
-    (published,) = board.glob("*/*/seed0/*.json")
-    before = published.read_bytes()
-    for seed in (0, 1):
-        with pytest.raises(FileExistsAlreadyError, match=r"\(they differ in lr\); remove .*PegInsertion/rgb\+tacrgb, or"):
-            publish([finished(root, f"slower, seed {seed}", lr=1e-5, seed=seed)], root, board, "tables", "us")
-    assert publish([other_seed], root, board, "tables", "us") == 2
-    assert published.read_bytes() == before
-
-
-def test_a_submission_without_checkpoints_keeps_its_link(tmp_path):
-    board = tmp_path / "board"
-    board.mkdir()
-    (board / "submission.json").write_text(json.dumps(dict(name="old", authors="we", link="https://example.org")))
-    assert publish([finished(tmp_path, "first")], tmp_path, board, "new", "us") == 1
-    about = json.loads((board / "submission.json").read_text())
-    assert (about["name"], about["authors"], about["link"]) == ("new", "us", "https://example.org")
-    assert len(about["checkpoints"]) == 1
