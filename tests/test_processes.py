@@ -10,6 +10,7 @@ import psutil
 import pytest
 import torch
 
+from manifeel_ms3.rendering import backend
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from tests.tasks_and_marks import PEG, needs_renderer
 
@@ -33,9 +34,10 @@ def test_two_environments_do_not_disturb_each_other(make_env):
     assert [list(values) for values in together] == list(alone)
 
 
-def _answer(connection, kwargs: dict) -> None:
+def _answer(connection, kwargs: dict, prepare=lambda: None) -> None:
     import manifeel_ms3  # noqa: F401
 
+    prepare()
     try:
         env = gym.make(PEG, sim_backend="physx_cpu", **kwargs)
         connection.send(list(rewards(env, 2)))
@@ -44,10 +46,10 @@ def _answer(connection, kwargs: dict) -> None:
         connection.send(str(error))
 
 
-def _in_process(how: str, kwargs: dict):
+def _in_process(how: str, kwargs: dict, *prepare):
     context = multiprocessing.get_context(how)
     here, there = context.Pipe()
-    process = context.Process(target=_answer, args=(there, kwargs))
+    process = context.Process(target=_answer, args=(there, kwargs, *prepare))
     process.start()
     try:
         assert here.poll(PATIENCE), "it hangs"
@@ -74,6 +76,34 @@ def test_in_another_process_while_there_is_one_here(make_env, how, threads):
     expected = list(rewards(here, 2))
     assert _in_process(how, dict(obs_mode="tacff", render_backend="none")) == expected
     assert list(rewards(here, 2)) == expected
+
+
+def _use_cuda_as_after_a_fork() -> None:
+    """Let torch behave as in a process that was forked from one that has used CUDA."""
+
+    def refuse(*_args):
+        raise RuntimeError("Cannot re-initialize CUDA in forked subprocess")
+
+    torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 1
+    torch.cuda.init = torch.cuda.get_rng_state = refuse
+
+
+def test_in_a_process_that_was_forked_from_one_with_cuda():
+    bare = dict(obs_mode="tacff", render_backend="none")
+    assert len(_in_process("fork", bare, _use_cuda_as_after_a_fork)) == 2
+
+
+def test_a_process_keeps_its_renderer(monkeypatch):
+    """SAPIEN renders on one device per process."""
+    monkeypatch.setattr(backend, "_first_that_works", lambda: "gpu")
+    for name, value in (("_renders_in", None), ("_renders_on", None)):
+        monkeypatch.setattr(backend, name, value)
+    assert [backend.available_render_backend(asked) for asked in ("cpu", "auto", "none", "auto")] == [
+        "cpu",
+        "cpu",
+        "none",
+        "cpu",
+    ]
 
 
 @needs_renderer

@@ -24,6 +24,8 @@ _IMPORTED_IN = os.getpid()
 """Id of the process that has imported this module; a forked process has another one."""
 _renders_in: int | None = None
 """Id of the process that has a renderer, None if none has; a fork copies this number, but not the renderer."""
+_renders_on: str | None = None
+"""Where this process renders, "gpu" or "cpu"; None if it has no renderer. SAPIEN renders on one device per process."""
 
 
 def available_render_backend(asked: str = "auto") -> str:
@@ -32,14 +34,14 @@ def available_render_backend(asked: str = "auto") -> str:
     A process that was forked from one with a renderer has none.
 
     Args:
-        asked: "gpu", "cpu" or "none", or "auto" for the first of them that works.
+        asked: "gpu", "cpu" or "none", or "auto" for the one that this process uses already, or else the first that works.
     """
-    global _renders_in
+    global _renders_in, _renders_on
     if asked == "none" or renderer_lost():
         return "none"
-    backend = _first_that_works() if asked == "auto" else asked
+    backend = (_renders_on or _first_that_works()) if asked == "auto" else asked
     if backend != "none":
-        _renders_in = os.getpid()
+        _renders_in, _renders_on = os.getpid(), backend
         _keep_inherited_objects_after_fork()
     return backend
 
@@ -58,10 +60,20 @@ def renderer_lost() -> bool:
     return _renders_in not in (None, os.getpid())
 
 
-def use_one_thread_after_fork() -> None:
-    """Let torch use one thread in a forked process, where it would wait for ever for OpenMP's other threads."""
-    if os.getpid() != _IMPORTED_IN:
-        torch.set_num_threads(1)
+def restrict_torch_after_fork() -> None:
+    """Let torch use one thread and no GPU in a forked process.
+
+    It would wait for ever for OpenMP's other threads. ManiSkill saves the random state of every GPU that torch counts when it
+    builds a scene, which torch refuses in a process that was forked from one that has used CUDA.
+    """
+    if os.getpid() == _IMPORTED_IN:
+        return
+    torch.set_num_threads(1)
+    if torch.cuda.is_available():
+        try:
+            torch.cuda.init()
+        except RuntimeError:
+            torch.cuda.device_count = lambda: 0
 
 
 @functools.cache

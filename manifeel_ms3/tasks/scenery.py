@@ -96,7 +96,8 @@ class SceneryEnv(SensingEnv):
 
     def render_rgb_array(self, camera_name: str | None = None):
         with fine_shadow(self._lamps, SHADOWS[self._quality]):
-            return super().render_rgb_array(camera_name)
+            image = super().render_rgb_array(camera_name)
+        return None if image is None else image.to(self.device)  # a GPU may render for a simulation on the CPU
 
     def _build_bench(self) -> None:
         """Add table and floor to the scene."""

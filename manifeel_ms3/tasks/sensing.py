@@ -74,12 +74,16 @@ class SensingEnv(BaseEnv):
             self.scene.update_render(update_sensors=True, update_human_render_cameras=False)
         for camera in cameras.values():
             camera.capture()
+        self._read_pads()  # while the renderer draws: `get_obs` waits until the images are there
         observed = {
-            name: camera.get_obs(**textures, apply_texture_transforms=apply_texture_transforms)
+            name: self._on_device(camera.get_obs(**textures, apply_texture_transforms=apply_texture_transforms))
             for name, camera in cameras.items()
         }
-        self._read_pads()
         return observed | {name: sensor.get_obs() for name, sensor in self._tactile_sensors.items()}
+
+    def _on_device(self, images: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """The images on the environment's device; a GPU that renders for a simulation on the CPU leaves them in its memory."""
+        return {name: image.to(self.device) for name, image in images.items()}
 
     def _read_pads(self) -> None:
         """Read the pads whose readings are stale, and no others."""

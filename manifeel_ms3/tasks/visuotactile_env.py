@@ -22,7 +22,7 @@ from manifeel_ms3.rendering.backend import (
     NO_RENDERER,
     available_render_backend,
     renderer_lost,
-    use_one_thread_after_fork,
+    restrict_torch_after_fork,
 )
 from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
@@ -166,7 +166,7 @@ class VisuotactileEnv(SceneryEnv):
         )
         one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
         check_num_envs(kwargs.get("num_envs", 1))
-        use_one_thread_after_fork()
+        restrict_torch_after_fork()
         backend = available_render_backend(render_backend)
         self._require_renderer(backend, own_mode, kwargs.get("render_mode"))
         super().__init__(

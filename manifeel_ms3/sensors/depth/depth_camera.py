@@ -74,7 +74,7 @@ class CameraDepth:
         self.camera.capture()
         depth = -self.camera.get_obs(rgb=False, depth=False, position=True, segmentation=False)["position"][..., 2]
         height = torch.where(depth > 0, self._start - depth, torch.full_like(depth, -REACH))
-        self._height = height[:, None]  # (N, 1, rows, cols)
+        self._height = height[:, None].to(self.scene.device)  # (N, 1, rows, cols); a GPU may render for a CPU's simulation
 
     def heights(self, grid: torch.Tensor, window: Window | None = None) -> torch.Tensor:
         """Height (N, C), m, of the nearest surface above (+: into) the face at points (C, 2), m; -REACH if there is none.
