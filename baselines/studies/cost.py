@@ -3,7 +3,8 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -37,8 +38,10 @@ GRADIENT_STEPS = 2
 LONG_CALL = 10.0
 """Time in s of a first call beyond which it is not repeated, as the initialization of libraries is a small part of it; set
 once, not tuned."""
+QUICK_STEP = 1.0
+"""Time in s below which the gradients of a whole batch are measured on the CPU; set once, not tuned."""
 TRIAL_BATCH = 2
-"""Largest batch of a trial on the CPU, whose time grows with the batch; set once, not tuned. The paper's batches would take
+"""Largest batch of a trial on the CPU that would take longer; set once, not tuned. The paper's batches would take
 17 GB there, and 4 samples of its UniT encoder 9 GB."""
 ACTION_SIZE = 7
 """Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
@@ -68,11 +71,14 @@ class Trial:
     """Function that returns the seconds of one step."""
     arguments: tuple[str, ...]
     """Arguments of the function."""
+    threads: int = 1
+    """Number of CPU threads of torch, which is that of the job. With more threads than idle cores, a step takes 100 times as
+    long, since they wait for each other."""
 
     @property
     def key(self) -> str:
         """Hash of what is measured and of the machine; the name under which the outcome is kept."""
-        content = json.dumps([self.measure.__name__, self.arguments, machine()], sort_keys=True)
+        content = json.dumps([self.measure.__name__, self.arguments, self.threads, machine()], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def seconds(self, root: Path) -> float:
@@ -80,9 +86,21 @@ class Trial:
         known = read_status(root / TRIALS)
         if self.key not in known:
             what = f"{self.measure.__name__}: {', '.join(self.arguments)}"
-            known[self.key] = dict(seconds=self.measure(*self.arguments), what=what)
+            with _torch_threads(self.threads):
+                seconds = self.measure(*self.arguments)
+            known[self.key] = dict(seconds=seconds, what=what)
             write_json(root / TRIALS, known)
         return known[self.key]["seconds"]
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def estimate(job: Job, root: Path, workers: int, try_out: bool = True, gpus: float = 0.0) -> CostEstimate | None:
@@ -91,7 +109,7 @@ def estimate(job: Job, root: Path, workers: int, try_out: bool = True, gpus: flo
     Args:
         job: The job.
         root: Folder of all jobs.
-        workers: Number of processes that simulate.
+        workers: Number of processes that simulate, or of threads that train.
         try_out: Whether to run trials if no job like this one was done here. The pretraining of encoders has no trials.
         gpus: Number of GPUs that the study gives the job; trials run on the CPU without one, as the job does.
     """
@@ -101,7 +119,7 @@ def estimate(job: Job, root: Path, workers: int, try_out: bool = True, gpus: flo
         return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")
     if not try_out or job.kind == "pretrain":
         return None
-    return CostEstimate(_unit_seconds(job, root, gpus) * _units(job) / parallel, "a trial")
+    return CostEstimate(_unit_seconds(job, root, workers, gpus) * _units(job) / parallel, "a trial")
 
 
 def _done(job: Job, root: Path) -> list[dict[str, Any]]:
@@ -146,11 +164,12 @@ def _demonstration_steps(env_id: str) -> float:
 # -------------------------------------------------------------------- trials
 
 
-def trials_of(job: Job, gpus: float = 0.0) -> tuple[Trial, ...]:
+def trials_of(job: Job, threads: int = 1, gpus: float = 0.0) -> tuple[Trial, ...]:
     """The trials from which the cost of a job is estimated; none for the pretraining of an encoder.
 
     Args:
         job: The job.
+        threads: Number of CPU threads of a training; the processes of other jobs have one each.
         gpus: Number of GPUs that the study gives the job.
     """
     if job.kind == "record":
@@ -162,14 +181,14 @@ def trials_of(job: Job, gpus: float = 0.0) -> tuple[Trial, ...]:
     preset, *flags = train_flags(_work(train.settings))
     network = train.settings["policy"], preset, "--device", device, *flags
     if job.kind == "train":
-        return (Trial(gradient_step, network),)
+        return (Trial(gradient_step, network, threads),)
     as_evaluated = "--device", device, "--batch-size", str(BATCH_SIZES[device])
     return _simulation_trial(train.needs[0], training_args(train).obs_mode), Trial(inference, (*network, *as_evaluated))
 
 
-def _unit_seconds(job: Job, root: Path, gpus: float) -> float:
+def _unit_seconds(job: Job, root: Path, threads: int, gpus: float) -> float:
     """Seconds of one demonstration, gradient step or episode, with one process."""
-    seconds = [trial.seconds(root) for trial in trials_of(job, gpus)]
+    seconds = [trial.seconds(root) for trial in trials_of(job, threads, gpus)]
     if job.kind == "train":
         return seconds[0]
     env_id = job.settings["env_id"]
@@ -204,8 +223,8 @@ def simulation_step(env_id: str, obs_mode: str, camera: str, env_kwargs: str) ->
 def gradient_step(policy: str, *flags: str) -> float:
     """Seconds of a gradient step of a policy on made-up observations.
 
-    On the CPU, a large batch is estimated from a small one, as the time of its gradients grows with the number of samples. The
-    time of the optimizer, which depends on the number of weights alone, is added once.
+    On the CPU, a batch that would take long is estimated from a small one, as the time of its gradients grows with the number
+    of samples. The time of the optimizer, which depends on the number of weights alone, is added once.
 
     Args:
         policy: Registered name of the policy.
@@ -213,6 +232,7 @@ def gradient_step(policy: str, *flags: str) -> float:
     """
     network, args, obs, actions = _made_up(policy, flags)
     optimizer = torch.optim.AdamW(network.parameters(), fused=True)
+    batches = args.batch_size / len(actions)
 
     def compute_gradients() -> None:
         with torch.autocast(args.device, torch.bfloat16, enabled=args.precision == "bf16"):
@@ -225,7 +245,11 @@ def gradient_step(policy: str, *flags: str) -> float:
         optimizer.step()
         next(network.parameters()).flatten()[0].item()  # waits for a GPU, as `loss.item()` does
 
-    gradients = _seconds(compute_gradients, GRADIENT_STEPS) * args.batch_size / len(actions)
+    gradients = _seconds(compute_gradients, GRADIENT_STEPS) * batches
+    if batches > 1 and gradients < QUICK_STEP:
+        rows = torch.arange(args.batch_size) % len(actions)
+        obs, actions = {key: value[rows] for key, value in obs.items()}, actions[rows]
+        gradients = _seconds(compute_gradients, GRADIENT_STEPS)
     return gradients + _seconds(update_weights, GRADIENT_STEPS)
 
 

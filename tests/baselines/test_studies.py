@@ -19,7 +19,6 @@ from baselines.common.checkpoint import as_json
 from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import observation_spec
 from baselines.common.train_args import default_steps
-from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import shell_command, training_args
@@ -93,7 +92,8 @@ def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     jobs = jobs_of(study)
     pretrained = {"pretrain"} if any(grid.pretrain for grid in study.grids) else set()
     assert {job.kind for job in jobs} == {"record", "train", "evaluate"} | pretrained
-    trials = [trial for job in jobs for trial in cost.trials_of(job, study.resources[job.kind].gpus)]
+    needs = [study.resources[job.kind] for job in jobs]
+    trials = [trial for job, own in zip(jobs, needs, strict=True) for trial in cost.trials_of(job, own.workers, own.gpus)]
     measured = {trial.key: dict(seconds=0.5) for trial in trials}  # the trials themselves: the tests below
     (tmp_path / cost.TRIALS).write_text(json.dumps(measured))
     table = study_command.plan(study, jobs, tmp_path)
@@ -106,41 +106,6 @@ def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     for job in jobs:
         if job.kind == "train":
             training_args(job)  # the trainer knows the flags
-
-
-@pytest.mark.parametrize("obs_mode", ["rgb", "rgb+tacrgb", "tacff"])
-@pytest.mark.parametrize("policy", sorted(all_policies()))
-def test_every_policy_is_tried_out(policy, obs_mode):
-    flags = ["cpu", "--obs-mode", obs_mode, "--image-size", "48", "--policy.encoder.crop", "0", "--batch-size", "2"]
-    assert 0 < cost.gradient_step(policy, *flags) < 60
-    assert 0 < cost.inference(policy, *flags, "--inference-steps", "1") < 60
-
-
-def test_a_large_batch_is_estimated_from_a_small_one(monkeypatch):
-    """A whole batch of the paper takes more memory than a laptop has; the optimizer's time does not grow with the batch."""
-    monkeypatch.setattr(cost, "_seconds", lambda do, repeats: {"compute_gradients": 1.0, "update_weights": 0.25}[do.__name__])
-    flags = ["cpu", "--obs-mode", "tacff", "--batch-size"]
-    seconds = {batch: cost.gradient_step("diffusion_policy", *flags, str(batch)) for batch in (2, 1000)}
-    assert seconds == {2: 1.25, 1000: 1000 / cost.TRIAL_BATCH + 0.25}
-
-
-def test_trials_do_not_repeat_for_what_costs_the_same():
-    jobs = jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))
-    steps = {trial.key for job in jobs if job.kind == "train" for trial in cost.trials_of(job)}
-    assert len(steps) == 3  # one network for each observation mode, whatever the task, the camera and the seed
-
-
-def test_trials_run_where_their_jobs_do(monkeypatch):
-    study = read_study(REPOSITORY / "configs/modality.yaml")
-    evaluate = next(job for job in jobs_of(study) if job.kind == "evaluate")
-    given = study.resources["evaluate"].gpus
-    assert given > 0
-    for has_gpu, gpus, device, batch in ((True, given, "cuda", "16"), (True, 0, "cpu", "1"), (False, given, "cpu", "1")):
-        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
-        _, trial = cost.trials_of(evaluate, gpus)
-        assert trial.arguments[-4:] == ("--device", device, "--batch-size", batch)
-        (training,) = cost.trials_of(evaluate.needs[0], gpus)
-        assert training.arguments[2:4] == ("--device", device)
 
 
 def test_a_table_of_the_paper_stands_for_its_tasks(study):

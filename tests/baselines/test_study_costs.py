@@ -1,0 +1,73 @@
+"""The cost of a study's jobs, from trials."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from baselines.diffusion_policy.policy import DiffusionPolicy
+from baselines.registry import all_policies
+from baselines.studies import cost
+from baselines.studies.study import jobs_of, read_study
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("obs_mode", ["rgb", "rgb+tacrgb", "tacff"])
+@pytest.mark.parametrize("policy", sorted(all_policies()))
+def test_every_policy_is_tried_out(policy, obs_mode):
+    flags = ["cpu", "--obs-mode", obs_mode, "--image-size", "48", "--policy.encoder.crop", "0", "--batch-size", "2"]
+    assert 0 < cost.gradient_step(policy, *flags) < 60
+    assert 0 < cost.inference(policy, *flags, "--inference-steps", "1") < 60
+
+
+def test_a_large_batch_is_estimated_from_a_small_one(monkeypatch):
+    """A whole batch of the paper takes more memory than a laptop has; the optimizer's time does not grow with the batch."""
+    monkeypatch.setattr(cost, "_seconds", lambda do, repeats: {"compute_gradients": 1.0, "update_weights": 0.25}[do.__name__])
+    flags = ["cpu", "--obs-mode", "tacff", "--batch-size"]
+    seconds = {batch: cost.gradient_step("diffusion_policy", *flags, str(batch)) for batch in (2, 1000)}
+    assert seconds == {2: 1.25, 1000: 1000 / cost.TRIAL_BATCH + 0.25}
+
+
+def test_a_quick_batch_is_measured_whole(monkeypatch):
+    """A small network computes many samples in little more time than two."""
+    batches = []
+
+    def forward(self, obs, actions):
+        batches.append(len(actions))
+        return sum(weights.sum() for weights in self.parameters())
+
+    monkeypatch.setattr(DiffusionPolicy, "forward", forward)
+    cost.gradient_step("diffusion_policy", "cpu", "--obs-mode", "tacff", "--batch-size", "16")
+    assert set(batches) == {cost.TRIAL_BATCH, 16}
+
+
+@pytest.mark.parametrize("cpus", [1, 2])
+def test_trials_have_as_many_threads_as_their_jobs(cpus, tmp_path):
+    """Threads that outnumber the idle cores wait for each other, and a step takes 100 times as long."""
+    train = next(job for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml")) if job.kind == "train")
+    (trial,) = cost.trials_of(train, cpus)
+    counts, before = [], torch.get_num_threads()
+    threads = replace(trial, measure=lambda *_: counts.append(torch.get_num_threads()) or 1.0)
+    assert threads.seconds(tmp_path) == 1.0
+    assert (counts, torch.get_num_threads()) == ([cpus], before)
+
+
+def test_trials_do_not_repeat_for_what_costs_the_same():
+    jobs = jobs_of(read_study(REPOSITORY / "configs/modality.yaml"))
+    steps = {trial.key for job in jobs if job.kind == "train" for trial in cost.trials_of(job)}
+    assert len(steps) == 3  # one network for each observation mode, whatever the task, the camera and the seed
+
+
+def test_trials_run_where_their_jobs_do(monkeypatch):
+    study = read_study(REPOSITORY / "configs/modality.yaml")
+    evaluate = next(job for job in jobs_of(study) if job.kind == "evaluate")
+    given = study.resources["evaluate"].gpus
+    assert given > 0
+    for has_gpu, gpus, device, batch in ((True, given, "cuda", "16"), (True, 0, "cpu", "1"), (False, given, "cpu", "1")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda has_gpu=has_gpu: has_gpu)
+        _, trial = cost.trials_of(evaluate, gpus=gpus)
+        assert trial.arguments[-4:] == ("--device", device, "--batch-size", batch)
+        (training,) = cost.trials_of(evaluate.needs[0], gpus=gpus)
+        assert training.arguments[2:4] == ("--device", device)
