@@ -1,6 +1,12 @@
 """ManiFeel for ManiSkill3: importing registers the robot and every task (`gym.make("ManiFeel-PegInsertion-v1")`)."""
 
 import gc
+import os
+
+if "OMP_WAIT_POLICY" not in os.environ:
+    # torch's threads wait for each other in a loop before they sleep: by default so long that a training step takes hundreds of
+    # times as long where other processes use the cores; a hundredth of that makes no difference where they are idle
+    os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 _collects = gc.isenabled()
 gc.disable()  # imports make many objects and no garbage: to search them again and again takes a fifth of the time

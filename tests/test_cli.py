@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import os
 import platform
 import re
 import shutil
@@ -133,6 +134,27 @@ def test_a_refusal_is_a_message_and_a_fault_keeps_its_traceback(monkeypatch, cap
     monkeypatch.setenv(TRACEBACK, "1")
     with pytest.raises(ValueError, match="fit='huge'"):
         run(refuse, None)
+
+
+@pytest.mark.parametrize(
+    ("given", "spins"), [({}, "3000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, None)]
+)
+def test_torchs_threads_do_not_wait_in_a_loop_for_long(given, spins):
+    """OpenMP reads the variable when torch is loaded."""
+    program = f"""
+import os, sys
+class Watch:
+    def find_spec(self, name, *_):
+        if name == "torch":
+            assert os.environ.get("GOMP_SPINCOUNT") == {spins!r}
+            print("loaded")
+sys.meta_path.insert(0, Watch())
+import manifeel_ms3
+"""
+    environment = {name: value for name, value in os.environ.items() if name not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment | given)
+    assert (done.returncode, done.stdout) == (0, "loaded\n"), done.stderr
 
 
 def test_importing_the_package_changes_no_global_hook():
