@@ -3,7 +3,9 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec
 
+import rich
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 REFRESH_HZ = 2
@@ -11,11 +13,12 @@ REFRESH_HZ = 2
 
 
 def progress_bar(disable: bool = False) -> Progress:
-    """A progress bar for a terminal.
+    """A progress bar for a terminal, or for a notebook with ipywidgets; without these, rich would warn at every bar.
 
     Args:
         disable: Whether nothing is shown.
     """
+    in_bare_notebook = rich.get_console().is_jupyter and find_spec("ipywidgets") is None
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -24,7 +27,7 @@ def progress_bar(disable: bool = False) -> Progress:
         TextColumn("left"),
         TimeRemainingColumn(),
         refresh_per_second=REFRESH_HZ,
-        disable=disable,
+        disable=disable or in_bare_notebook,
     )
 
 

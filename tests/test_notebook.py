@@ -23,6 +23,14 @@ def cells(kind: str) -> list[str]:
     return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
 
 
+def test_it_shows_what_it_made_and_nothing_of_the_machine():
+    notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
+    shown = {kind for cell in notebook["cells"] for out in cell.get("outputs", []) for kind in out.get("data", {})}
+    assert {"image/png", "image/webp"} <= shown
+    for sign in ("site-packages", str(Path.home()), str(NOTEBOOK.parents[1]), "Warning"):
+        assert sign not in json.dumps(notebook), sign
+
+
 def test_its_pages_are_there_and_its_code_is_python():
     for target in re.findall(r"\]\((\.\./[^)]+)\)", "".join(cells("markdown"))):
         assert (NOTEBOOK.parent / target).is_file(), target

@@ -4,8 +4,10 @@ import subprocess
 import sys
 
 import pytest
+import rich
 import torch
 
+from manifeel_ms3 import progress
 from tests.tasks_and_marks import PEG, needs_renderer
 
 STEP_WITH_IMAGES = f"""
@@ -31,3 +33,11 @@ def test_a_step_with_images_says_nothing():
     command = [sys.executable, "-W", "default", "-c", STEP_WITH_IMAGES]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (done.stderr, done.stdout) == ("", "")
+
+
+def test_a_notebook_without_widgets_shows_no_bars(monkeypatch, recwarn):
+    monkeypatch.setattr(rich.get_console(), "is_jupyter", True)
+    monkeypatch.setattr(progress, "find_spec", lambda name: None)
+    with progress.progress_bar() as bar:
+        assert list(bar.track([1, 2])) == [1, 2]
+    assert not recwarn
