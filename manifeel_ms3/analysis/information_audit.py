@@ -112,11 +112,6 @@ def image_features(image: np.ndarray) -> np.ndarray:
     return np.concatenate([pooled(image), *(pooled(band) for band in bands)])
 
 
-def _sensor(env_id: str, modality: str) -> str:
-    """The sensor of a modality: the task's policy camera, or the right pad."""
-    return task_spec(env_id).policy_camera if modality == "camera" else "tactile_right"
-
-
 def _features(episode: Episode, sensor: str, modality: str, t: int) -> np.ndarray:
     observed = episode[f"obs/sensor_data/{sensor}"]
     return observed["force_field"][t].ravel() if modality == "tacff" else image_features(observed["rgb"][t])
@@ -137,18 +132,20 @@ class _Data:
     """Features (n, d) by modality."""
 
 
-def run_probe(probe: Probe, env_id: str, path: Path) -> list[ProbeResult]:
+def run_probe(probe: Probe, env_id: str, path: Path, camera: str | None = None) -> list[ProbeResult]:
     """Ask a question of every modality.
 
     Args:
         probe: The question.
         env_id: Id of the task.
         path: Trajectory file of the task.
+        camera: Camera that is asked; the task's policy camera if not given.
 
     Raises:
         DemonstrationError: The file lacks an observation, has too few episodes to cross-validate, or always the same answer.
     """
-    data = _read(probe, env_id, path)
+    sensors = dict.fromkeys(MODALITIES, "tactile_right") | dict(camera=camera or task_spec(env_id).policy_camera)
+    data = _read(probe, path, sensors)
     numeric = bool(probe.unit)
     constant = data.truth.mean() if numeric else float(data.truth.mean() > 0.5)
     chance = _score(data.truth, np.full_like(data.truth, constant), data.episodes, numeric)[0]
@@ -156,12 +153,12 @@ def run_probe(probe: Probe, env_id: str, path: Path) -> list[ProbeResult]:
     for modality, features in data.features.items():
         predicted = cross_validated(features, data.truth, data.episodes, numeric)
         score, low, high = _score(data.truth, predicted, data.episodes, numeric)
-        counts = (len(set(data.episodes)), len(data.truth), _sensor(env_id, modality))
+        counts = (len(set(data.episodes)), len(data.truth), sensors[modality])
         results.append(ProbeResult(probe.question, env_id, modality, probe.unit, score, (low, high), chance, *counts))
     return results
 
 
-def _read(probe: Probe, env_id: str, path: Path) -> _Data:
+def _read(probe: Probe, path: Path, sensors: dict[str, str]) -> _Data:
     recorded = len(read_header(path)["episodes"])
     if recorded < FEWEST_EPISODES:
         raise DemonstrationError(f"{path} holds {recorded} episodes, at least {FEWEST_EPISODES} are needed; record more")
@@ -173,13 +170,13 @@ def _read(probe: Probe, env_id: str, path: Path) -> _Data:
                 truth.append(answer)
                 episodes.append(i)
                 for modality, rows in features.items():
-                    sensor = _sensor(env_id, modality)
+                    sensor = sensors[modality]
                     try:
                         rows.append(_features(file[f"traj_{i}"], sensor, modality, t))
                     except KeyError as error:
                         raise DemonstrationError(
-                            f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode rgb+tacrgb+tacff, the "
-                            "task's policy camera and the right pad"
+                            f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode rgb+tacrgb+tacff, this "
+                            "camera and the right pad"
                         ) from error
     if len(set(episodes)) < FEWEST_EPISODES:
         raise DemonstrationError(
@@ -318,6 +315,8 @@ class Args:
     """Folder with the recordings of `manifeel dataset`, a folder of each task with a trajectory file that has observations."""
     out: Path = Path("runs/audit")
     """Folder for audit.json, audit.md and audit.png."""
+    camera: str | None = None
+    """Camera that is asked, such as "wrist"; the policy camera of each task if not given."""
 
 
 def main(args: Args) -> list[ProbeResult]:
@@ -338,7 +337,7 @@ def main(args: Args) -> list[ProbeResult]:
     results: list[ProbeResult] = []
     with progress_bar() as bar:
         for probe, env_id, path in bar.track(asked, description="asking"):
-            results += run_probe(probe, env_id, path)
+            results += run_probe(probe, env_id, path, args.camera)
     write_json(args.out / "audit.json", [asdict(result) for result in results])
     write_text(args.out / "audit.md", audit_table(results))
     draw_figure(results, args.out / "audit.png")

@@ -102,6 +102,18 @@ def test_audit_writes_table_figure_and_numbers(recorded, tmp_path):
     assert len(json.loads((tmp_path / "out/audit.json").read_text())) == len(answers)
 
 
+def test_audit_asks_another_camera(recorded, tmp_path):
+    another = information_audit.Args(recorded, tmp_path / "out", camera="wrist")
+    with pytest.raises(DemonstrationError, match="lacks camera of wrist"):
+        information_audit.main(another)
+    with h5py.File(recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5", "r+") as file:
+        for i in range(EPISODES):
+            sensors = file[f"traj_{i}/obs/sensor_data"]
+            sensors["wrist/rgb"] = np.full_like(sensors["front/rgb"][:], 200 * (i % 2))
+    answers = [answer for answer in information_audit.main(another) if answer.modality == "camera"]
+    assert [(answer.sensor, answer.score) for answer in answers if "before" in answer.question] == [("wrist", 1.0)]
+
+
 def test_a_task_gets_another_question_with_one_decorator(recorded, tmp_path, monkeypatch):
     spec = task_spec("ManiFeel-ObjectSearch-v1")
     monkeypatch.setattr(spec, "probes", list(spec.probes))
