@@ -19,7 +19,9 @@ class _ObservationWrapper(gym.ObservationWrapper):
 
     def __init__(self, env: gym.Env):
         super().__init__(env)
-        self.base_env.update_obs_space(self.observation(self.base_env._init_raw_obs))
+        raw: Any = self.base_env._init_raw_obs  # on the CPU, unlike those that follow it
+        first = common.to_tensor(raw, self.base_env.device)
+        self.base_env.update_obs_space(common.to_cpu_tensor(self.observation(first)))
 
     @property
     def base_env(self) -> BaseEnv:

@@ -99,7 +99,7 @@ def main(args: Args) -> None:
     console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
     if args.print_commands:
         for job in jobs:
-            line = shell_command(job, args.root, study.resources[job.kind].workers)
+            line = shell_command(job, args.root, study.resources[job.kind])
             console.print(f"# {job.kind}: {job.title}\n{line}", soft_wrap=True, markup=False, highlight=False)
         return
     if args.publish:
@@ -188,7 +188,7 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
                     needs = study.resources[job.kind]
                     task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
                     needed = [results[need.key] for need in job.needs]
-                    results[job.key] = task.remote(Path.cwd(), job, root, needs.workers, *needed)
+                    results[job.key] = task.remote(Path.cwd(), job, root, needs, *needed)
                     running[results[job.key]] = job
                 if not running:
                     raise MachineError(

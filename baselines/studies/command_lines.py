@@ -8,7 +8,7 @@ from typing import Any
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.paths import CHECKPOINTS
 
-from .study import Job
+from .study import Job, Kind, Resources
 
 OBS_MODE = "rgb+tacrgb+tacff"
 """Observation mode of all recordings, which hold everything that any policy of a study observes."""
@@ -17,6 +17,16 @@ OBS_MODE = "rgb+tacrgb+tacff"
 def trajectory_of(job: Job, root: Path) -> Path:
     """File of the demonstrations that a recording writes."""
     return job.folder(root) / "trajectory.h5"
+
+
+def device_arguments(kind: Kind, gpus: float) -> list[str]:
+    """Arguments that keep a job on the CPU if the study gives it no GPU, since Ray does not hide the machine's GPUs from it.
+
+    A recording computes nothing with torch on a GPU, which may render for it.
+    """
+    if gpus or kind == "record":
+        return []
+    return ["--device", "cpu", *(["--precision", "fp32", "--no-compile"] if kind == "train" else [])]
 
 
 def record_arguments(job: Job, root: Path, workers: int) -> list[str]:
@@ -33,18 +43,20 @@ def weights_of(job: Job, root: Path) -> Path:
     return job.folder(root) / "weights.safetensors"
 
 
-def pretrain_arguments(job: Job, root: Path) -> list[str]:
+def pretrain_arguments(job: Job, root: Path, gpus: float) -> list[str]:
     """Arguments of `python -m baselines.tactile_representations.pretrain` for a job."""
     (record,) = job.needs
-    return [job.settings["encoder"], "--demos", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
+    files = ["--demos", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
+    return [job.settings["encoder"], *device_arguments(job.kind, gpus), *files]
 
 
-def train_arguments(job: Job, root: Path) -> list[str]:
-    """Arguments of `manifeel train <policy>` for a job; the first is the preset."""
+def train_arguments(job: Job, root: Path, gpus: float) -> list[str]:
+    """Arguments of `manifeel train <policy>` for a job; the first is the preset. A study's own flags come last and prevail."""
     record, *pretrained = job.needs
     preset, *flags = train_flags(job.settings)
+    files = ["--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root))]
     weights = [text for need in pretrained for text in ("--tacrgb-weights", str(weights_of(need, root)))]
-    return [preset, "--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root)), *flags, *weights]
+    return [preset, *device_arguments(job.kind, gpus), *files, *flags, *weights]
 
 
 def train_flags(settings: dict[str, Any]) -> list[str]:
@@ -55,16 +67,17 @@ def train_flags(settings: dict[str, Any]) -> list[str]:
     return flags
 
 
-def evaluate_arguments(job: Job, workers: int, checkpoint: str, out: str) -> list[str]:
+def evaluate_arguments(job: Job, needs: Resources, checkpoint: str, out: str) -> list[str]:
     """Arguments of `manifeel eval` for one checkpoint of a job."""
-    amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(workers)]
+    amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(needs.workers)]
+    amount += device_arguments(job.kind, needs.gpus)
     stop = ["--stop-at-success"] if job.settings["stop_at_success"] else []
     return ["--checkpoint", checkpoint, *amount, *stop, "--env-kwargs", job.settings["env_kwargs"], "--out", out]
 
 
-def training_args(job: Job, root: Path = Path()) -> Any:
+def training_args(job: Job, root: Path = Path(), gpus: float = 0) -> Any:
     """The `TrainArgs` of a training job, of its policy's own class."""
-    return _parsed(job.settings["policy"], *train_arguments(job, root))
+    return _parsed(job.settings["policy"], *train_arguments(job, root, gpus))
 
 
 @cache
@@ -72,17 +85,18 @@ def _parsed(policy: str, *arguments: str) -> Any:
     return preset_cli(policy_spec(policy), list(arguments))
 
 
-def shell_command(job: Job, root: Path, workers: int) -> str:
+def shell_command(job: Job, root: Path, needs: Resources) -> str:
     """One line of shell that does a job by hand; the jobs that it needs must be done before."""
     if job.kind == "record":
-        return shlex.join(["manifeel", "record", *record_arguments(job, root, workers)])
+        return shlex.join(["manifeel", "record", *record_arguments(job, root, needs.workers)])
     if job.kind == "pretrain":
-        return shlex.join(["python", "-m", "baselines.tactile_representations.pretrain", *pretrain_arguments(job, root)])
+        module = "baselines.tactile_representations.pretrain"
+        return shlex.join(["python", "-m", module, *pretrain_arguments(job, root, needs.gpus)])
     if job.kind == "train":
-        return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root)])
+        return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root, needs.gpus)])
     (train,) = job.needs
     checkpoints = shlex.quote(str(train.folder(root) / CHECKPOINTS))
     out = shlex.quote(str(job.folder(root)))
-    command = shlex.join(["manifeel", "eval", *evaluate_arguments(job, workers, "CHECKPOINT", "OUT")])
+    command = shlex.join(["manifeel", "eval", *evaluate_arguments(job, needs, "CHECKPOINT", "OUT")])
     command = command.replace("CHECKPOINT", f"{checkpoints}/$step").replace("OUT", f"{out}/$step.json")
     return f"for step in $(ls {checkpoints} | grep -x '[0-9]*' | tail -n {job.settings['checkpoints']}); do {command}; done"

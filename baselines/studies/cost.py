@@ -25,7 +25,7 @@ from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import task_spec
 
-from .command_lines import OBS_MODE, train_flags, training_args
+from .command_lines import OBS_MODE, device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
 from .study import SIMULATING, Job
 
@@ -179,7 +179,8 @@ def trials_of(job: Job, threads: int = 1, gpus: float = 0.0) -> tuple[Trial, ...
     train = job if job.kind == "train" else job.needs[0]
     device = "cuda" if gpus and torch.cuda.is_available() else "cpu"
     preset, *flags = train_flags(_work(train.settings))
-    network = train.settings["policy"], preset, "--device", device, *flags
+    where = ["--device", "cuda"] if device == "cuda" else device_arguments("train", 0)
+    network = train.settings["policy"], preset, *where, *flags
     if job.kind == "train":
         return (Trial(gradient_step, network, threads),)
     as_evaluated = "--device", device, "--batch-size", str(BATCH_SIZES[device])

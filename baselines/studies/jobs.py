@@ -32,8 +32,10 @@ from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.provenance import machine
 
 from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
-from .study import SIMULATING, Job
+from .study import SIMULATING, Job, Resources
 
+ONE_CORE = Resources()
+"""What a job has that is run by hand."""
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
 """Names of the files in a job's folder that hold its status."""
 
@@ -53,20 +55,20 @@ def is_running(job: Job, root: Path) -> bool:
     return isinstance(process, int) and (host != socket.gethostname() or psutil.pid_exists(process))
 
 
-def perform_in(working_folder: Path, job: Job, root: Path, workers: int, *needed: None) -> None:
+def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *needed: None) -> None:
     """Do what `perform` does in a working folder, to which relative paths in the study's file belong."""
     if working_folder.is_dir():  # a machine of a cluster may lack it
         os.chdir(working_folder)
-    perform(job, root, workers, *needed)
+    perform(job, root, needs, *needed)
 
 
-def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
+def perform(job: Job, root: Path, needs: Resources = ONE_CORE, *_needed: None) -> None:
     """Run a job unless it is done, and write down what it cost.
 
     Args:
         job: The job.
         root: Folder of all jobs.
-        workers: Number of processes that simulate.
+        needs: What the study gives the job.
         _needed: Return values of the jobs that this one needs; Ray waits for them.
 
     Raises:
@@ -76,10 +78,10 @@ def perform(job: Job, root: Path, workers: int = 1, *_needed: None) -> None:
     restore_child_signals()
     with owned(job.folder(root) / STARTED):  # the folder itself is owned by the training that runs in it
         if not is_done(job, root):
-            _perform(job, root, workers)
+            _perform(job, root, needs)
 
 
-def _perform(job: Job, root: Path, workers: int) -> None:
+def _perform(job: Job, root: Path, needs: Resources) -> None:
     folder = job.folder(root)
     attempts = read_status(folder / STARTED).get("attempts", 0) + 1
     started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=job.title, settings=job.settings)
@@ -87,12 +89,12 @@ def _perform(job: Job, root: Path, workers: int) -> None:
     (folder / FAILED).unlink(missing_ok=True)
     begin = time.time()
     try:
-        units = WORK[job.kind](job, root, workers)
+        units = WORK[job.kind](job, root, needs)
     except Exception as error:
         with suppress(FileWriteError):  # on a full disk, the error of the job is raised
             write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
-    parallel = workers if job.kind in SIMULATING else 1
+    parallel = needs.workers if job.kind in SIMULATING else 1
     cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
 
@@ -106,26 +108,26 @@ def restore_child_signals() -> None:
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
 
 
-def _record(job: Job, root: Path, workers: int) -> int:
+def _record(job: Job, root: Path, needs: Resources) -> int:
     """Record demonstrations with everything that any policy observes, and return their number."""
-    record.main(tyro.cli(record.Args, args=record_arguments(job, root, workers)), on_episode=lambda: None)
+    record.main(tyro.cli(record.Args, args=record_arguments(job, root, needs.workers)), on_episode=lambda: None)
     return len(read_header(trajectory_of(job, root))["episodes"])
 
 
-def _pretrain(job: Job, root: Path, _workers: int) -> int:
+def _pretrain(job: Job, root: Path, needs: Resources) -> int:
     """Train an encoder of TacRGB, and return 1, because only the cost of the whole training is known."""
-    pretrain.main(tyro.cli(pretrain.Args, args=pretrain_arguments(job, root)))
+    pretrain.main(tyro.cli(pretrain.Args, args=pretrain_arguments(job, root, needs.gpus)))
     return 1
 
 
-def _train(job: Job, root: Path, _workers: int) -> int:
+def _train(job: Job, root: Path, needs: Resources) -> int:
     """Train a policy, and return the number of its gradient steps."""
     resume = bool(saved_checkpoints(job.folder(root) / CHECKPOINTS))
-    last = policy_spec(job.settings["policy"]).train(replace(training_args(job, root), resume=resume))
+    last = policy_spec(job.settings["policy"]).train(replace(training_args(job, root, needs.gpus), resume=resume))
     return checkpoint_config(last)["step"]
 
 
-def _evaluate(job: Job, root: Path, workers: int) -> int:
+def _evaluate(job: Job, root: Path, needs: Resources) -> int:
     """Write one result file for each checkpoint, and return the number of episodes."""
     settings, (train,) = job.settings, job.needs
     chosen = saved_checkpoints(train.folder(root) / CHECKPOINTS)[-settings["checkpoints"] :]
@@ -134,7 +136,7 @@ def _evaluate(job: Job, root: Path, workers: int) -> int:
     for checkpoint in chosen:
         out = job.folder(root) / f"{checkpoint.name}.json"
         if not is_result_of(checkpoint, out):
-            args = tyro.cli(evaluate.Args, args=evaluate_arguments(job, workers, str(checkpoint), str(out)))
+            args = tyro.cli(evaluate.Args, args=evaluate_arguments(job, needs, str(checkpoint), str(out)))
             try:
                 evaluate.main(args)
             except OtherEvaluationError:  # begun on another machine or with other versions, so its episodes cannot be kept

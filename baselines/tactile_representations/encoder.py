@@ -32,6 +32,8 @@ class RepresentationEncoder(PretrainedEncoder):
         require_size(representation, size)
         self.representation, self.frozen = representation, False
         self.out = representation.head(features)
+        for part in representation.unused_parts():
+            part.requires_grad_(False)
 
     def freeze(self) -> None:
         self.representation.requires_grad_(False)

@@ -37,6 +37,10 @@ class Representation(nn.Module):
         """The weights of a checkpoint that the authors released, under the names of this module."""
         raise NotImplementedError
 
+    def unused_parts(self) -> Iterable[nn.Module]:
+        """Parts that only pretraining uses. A policy does not train them; in several processes it could not."""
+        return ()
+
     def head(self, features: int) -> nn.Module:
         """The layers from the output to `features` numbers (B, features), which each policy trains anew."""
         return nn.Linear(self.out_features, features)

@@ -61,6 +61,9 @@ class UniT(Representation):
     def forward(self, image):
         return self.vqgan.encode(in_unit_range(image)).latents
 
+    def unused_parts(self):
+        return self.vqgan.quantize, self.vqgan.post_quant_conv, self.vqgan.decoder
+
     def head(self, features):
         layers: list[nn.Module] = []
         for inputs, outputs in pairwise((LATENT_CHANNELS, *HEAD_CHANNELS)):

@@ -64,19 +64,20 @@ def solve_ik(kinematics: Kinematics, pose: Pose, q0: torch.Tensor, iterations: i
         iterations: Number of steps on a GPU.
     """
     joints = kinematics.active_joint_indices
+    lowest, highest = kinematics.articulation.get_qlimits()[:, joints].unbind(-1)
     if kinematics.use_gpu_ik:
         q = q0.clone()
         for _ in range(iterations):
             q[:, joints] = kinematics.compute_ik(pose, q)
+            q[:, joints] = q[:, joints].clamp(lowest, highest)
         return q[:, joints]
     start = q0[0, kinematics.pmodel_active_joint_indices].cpu().numpy()
     # dt = 1 makes the damped iteration Gauss-Newton; with ManiSkill's 0.1, it stops 0.1 mm short
     solution, _, _ = kinematics.pmodel.compute_inverse_kinematics(
         kinematics.end_link_idx, pose.sp, start, kinematics.qmask, eps=IK_TOLERANCE, max_iterations=IK_ITERATIONS, dt=1.0
     )
-    limits = kinematics.articulation.get_qlimits()[0, joints]
     q = common.to_tensor(solution[kinematics.pmodel_controlled_joint_indices], device=kinematics.device).float()
-    return q.clamp(limits[:, 0], limits[:, 1])[None]
+    return q[None].clamp(lowest, highest)
 
 
 class LimitedLeadEEPoseController(PDEEPoseController):

@@ -82,8 +82,8 @@ class SensingEnv(BaseEnv):
         return observed | {name: sensor.get_obs() for name, sensor in self._tactile_sensors.items()}
 
     def _on_device(self, images: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The images on the environment's device; a GPU that renders for a simulation on the CPU leaves them in its memory."""
-        return {name: image.to(self.device) for name, image in images.items()}
+        """The images on the environment's device, copied from a GPU's buffers, in which the next images will be drawn."""
+        return {name: image.to(self.device, copy=image.is_cuda) for name, image in images.items()}
 
     def _read_pads(self) -> None:
         """Read the pads whose readings are stale, and no others."""

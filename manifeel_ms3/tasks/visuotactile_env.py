@@ -288,6 +288,8 @@ class VisuotactileEnv(SceneryEnv):
         if seed is not None and self.num_envs == 1:
             options["reconfigure"] = True
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
+        if "env_idx" in options:
+            options["env_idx"] = env_idx  # a list is accepted, too
         with self._others_unchanged(env_idx):
             obs, info = super().reset(seed=seed, options=options)
             if "reset_to_env_states" in options:

@@ -152,6 +152,17 @@ def test_settings_that_do_not_fit_are_named(tmp_path):
         load_pretrained(ObservationEncoder(EncoderConfig(), SPEC, 1), tmp_path / "weights.safetensors")
 
 
+@pytest.mark.parametrize("make", [small_t3, small_anytouch, small_sparsh, small_unit])
+def test_all_that_a_policy_trains_has_a_gradient(make):
+    """Several processes that train one policy wait for the gradient of every parameter."""
+    network = make()
+    encoder = RepresentationEncoder(network, network.size, 8)
+    encoder(torch.rand(2, 3, network.size, network.size)).sum().backward()
+    trained = {name: parameter.grad for name, parameter in encoder.named_parameters() if parameter.requires_grad}
+    assert len(trained) > 4
+    assert [name for name, gradient in trained.items() if gradient is None] == []
+
+
 def test_a_frozen_unit_trains_its_head():
     encoder = RepresentationEncoder(SMALL["unit"][0](), 32, features=24)
     encoder.freeze()

@@ -23,7 +23,7 @@ from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.jobs import is_done, perform
-from baselines.studies.study import Job, StudyError, jobs_of, read_study
+from baselines.studies.study import Job, Resources, StudyError, jobs_of, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
@@ -156,12 +156,26 @@ def test_an_encoder_is_pretrained_once_and_the_policies_start_from_it(tmp_path):
     for job in trained:
         assert pretrain in job.needs
         assert training_args(job, tmp_path).tacrgb_weights == tmp_path / f"pretrain/{pretrain.key}/weights.safetensors"
-    words = shlex.split(shell_command(pretrain, tmp_path, 1))
+    words = shlex.split(shell_command(pretrain, tmp_path, Resources()))
     assert words[:4] == ["python", "-m", "baselines.tactile_representations.pretrain", "unit"]
     args = tyro.cli(PretrainArgs, args=words[3:])
     assert args.demos == (record.folder(tmp_path) / "trajectory.h5",)
     assert cost.estimate(pretrain, tmp_path, 1) is None
     assert jobs.index(record) < jobs.index(pretrain) < min(map(jobs.index, trained))
+
+
+@pytest.mark.parametrize("gpus", [0, 0.5])
+def test_a_job_without_a_gpu_stays_on_the_cpu_of_a_machine_with_one(gpus, tmp_path):
+    """Ray hides GPUs only from jobs that ask for a share of them."""
+    jobs = jobs_of(read_study(REPOSITORY / "configs/representation.yaml"))
+    for job in jobs:
+        words = shlex.split(shell_command(job, tmp_path, Resources(gpus=gpus)))
+        told = "--device" in words
+        assert told == (gpus == 0 and job.kind != "record"), words
+        assert not told or words[words.index("--device") + 1] == "cpu"
+        if job.kind == "train" and not gpus:
+            args = training_args(job, tmp_path)
+            assert (args.device, args.precision, args.compile) == ("cpu", "fp32", False)
 
 
 def test_encoders_of_table_three_have_equal_demonstrations():
@@ -178,7 +192,7 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
     jobs = jobs_of(read_study(study))
     study_command.main(study_command.Args(study, tmp_path, print_commands=True))
     lines = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("#")]
-    assert lines == [shell_command(job, tmp_path, 1) for job in jobs]
+    assert lines == [shell_command(job, tmp_path, Resources()) for job in jobs]
     record, train = (shlex.split(line) for line in lines[:2])
     assert record[:2] == ["manifeel", "record"]
     recording = tyro.cli(cli.command_module("record").Args, args=record[2:])

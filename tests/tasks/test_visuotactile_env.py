@@ -169,6 +169,13 @@ def test_episode_is_a_function_of_its_seed_bit_for_bit(make_env):
             assert torch.equal(first[key], third[key])
 
 
+def test_environments_to_reset_can_be_listed(make_env):
+    env = make_env(obs_mode="state", render_backend="none")
+    first = env.reset(seed=1)[0]
+    env.step(env.action_space.sample())
+    assert env.reset(seed=1, options=dict(env_idx=[0]))[0].equal(first)
+
+
 def test_looking_twice_changes_nothing(make_env):
     env = make_env(obs_mode="tacff", render_backend="none")
     env.reset(seed=0)

@@ -37,7 +37,7 @@ class CameraDepth:
         pad: Link that carries the pad.
 
     Raises:
-        MachineError: The scene has no renderer.
+        MachineError: The scene has no renderer, or is simulated on a GPU, where ManiSkill reads only its own cameras.
         InvalidArgumentError: The force field's units need velocities, which a camera does not measure.
     """
 
@@ -48,6 +48,11 @@ class CameraDepth:
             raise MachineError(
                 f"tactile sensor {sensor.uid!r} has backend='sapien', which needs a renderer, and this scene has none; "
                 "use backend='raycast', or give gym.make a render_backend"
+            )
+        if scene.gpu_sim_enabled:
+            raise MachineError(
+                f"tactile sensor {sensor.uid!r} has backend='sapien', which does not work where a GPU simulates; use "
+                "backend='raycast'"
             )
         pixel, self._start = sensor.pixel_size, START + sensor.gel.max_sag
         rows, cols = (2 * math.ceil(extent / 2 / pixel) for extent in sensor.gel.size)
