@@ -106,7 +106,7 @@ class TactileSensor(BaseSensor):
         self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
 
     def forget_readings(self, env_idx: torch.Tensor) -> None:
-        """Let the next observation of these environments be the first one that imperfections remember."""
+        """Let the next observation of these environments be the first one that shear and imperfections remember."""
         self.model.forget_readings(env_idx)
 
     def wrench(self) -> torch.Tensor:

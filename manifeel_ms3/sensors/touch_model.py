@@ -98,7 +98,8 @@ class TouchModel:
             self._imperfections.reset(pads, seeds)
 
     def forget_readings(self, pads: torch.Tensor) -> None:
-        """Let the next observation of these pads be the first one that imperfections remember."""
+        """Let the next observation of these pads be the first one that shear and imperfections remember."""
+        self._bristle[pads] = 0.0
         if self._imperfections is not None:
             self._imperfections.forget(pads)
 
