@@ -21,7 +21,8 @@ class Processes:
         gpu = None
         if "LOCAL_RANK" in os.environ and device == "cuda":
             self.device = gpu = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-            torch.cuda.set_device(gpu)  # or what names no GPU, such as the noise, would be on the first one in every process
+        if self.device.type == "cuda" and self.device.index is not None:
+            torch.cuda.set_device(self.device)  # or what names no GPU, such as the noise, would be on the first one
         if self.count > 1:
             dist.init_process_group("nccl" if self.device.type == "cuda" else "gloo", device_id=gpu)
 
