@@ -165,7 +165,7 @@ def _results(spec: TaskSpec) -> str:
         return f"## Results\n\nNo policy has been evaluated on revision {spec.revision} of this task yet.\n"
     names, rows = found
     filled = [k for k in range(1, len(names)) if names[k] not in NOT_ON_CARDS and any(row[k] for row in rows)]
-    table = markdown_table([names[k] for k in filled], ([row[k].replace("](../", "](../../") for k in filled] for row in rows))
+    table = markdown_table([names[k] for k in filled], ([row[k].replace("](", "](../") for k in filled] for row in rows))
     source = "From [results](../results.md), which says what the columns mean and how episodes fail.\n"
     return f"## Results\n\n{source}\n{table}"
 

@@ -21,10 +21,11 @@ TEXT = """
 
 Each cell has our success with its 95 % interval and, after the slash, the paper's. Our rate links to its result file; the
 number after ± is the standard deviation over training seeds, where there are several. Only conditions with the paper's number
-of demonstrations appear, and each set-up has its own tables. "Floor" is the highest success of policies that have learnt
-nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts itself on ball sorting: its list of
-set-ups has only dim light, but its Tables I and II report different rates for the same policies. Here, Tables II and III are
-therefore run in both lights.
+of demonstrations appear, and each set-up has its own tables. The interval of a rate with one training seed says nothing about
+how much training itself varies; where there are several seeds, the interval covers that, too. "Floor" is the highest success of
+policies that have learnt nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts itself on
+ball sorting: its list of set-ups has only dim light, but its Tables I and II report different rates for the same policies.
+Here, Tables II and III are therefore run in both lights.
 """
 NOT_RUN = """
 Not run: {what}. `manifeel study configs/paper.yaml` runs them, on a GPU; with `--dry-run` it estimates the hours on your
@@ -56,15 +57,15 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
         files: Links to the result files of conditions.
     """
     yield TEXT
-    all_settings, by_other_policies, by_encoder = _all_settings(found), False, False
+    all_settings, with_other_policies, by_encoder = _all_settings(found), set[str](), False
     for settings in all_settings:
         if rows := list(_rows_by_sensing(found, files, settings, {(task, DP): rates for task, rates in MODALITIES.items()})):
             yield f"\n### Table I, what touch adds: Diffusion Policy, {settings}\n\n"
             yield _with_floors(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
         by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
         rows = list(_rows_by_sensing(found, files, settings, by_policy))
-        if {policy for (_, policy), _ in rows} - {DP}:
-            by_other_policies = True
+        if others := {task for (task, policy), _ in rows if policy != DP}:
+            with_other_policies |= others
             yield f"\n### Table II, three policies: {settings}\n\n"
             yield _with_floors(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
         if rows := list(_rows_by_encoder(found, files, settings)):
@@ -73,8 +74,9 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
             names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
             yield _with_floors(("task", *names), rows)
     missing = [] if any(settings.preset == PAPER for settings in all_settings) else ["the networks of the paper (ResNet-18)"]
-    if not by_other_policies:
-        missing.append("Table II, the Equivariant Diffusion Policy and Flow Matching")
+    if left := [task for task in POLICIES if task not in with_other_policies]:
+        where = f", on {', '.join(left)}" if with_other_policies else ""
+        missing.append(f"Table II, the Equivariant Diffusion Policy and Flow Matching{where}")
     if not by_encoder:
         missing.append("Table III, the encoders with published weights")
     if missing:
