@@ -134,9 +134,10 @@ def evaluate_without_simulator(out: Path, seeds: list[int], report: int) -> None
 def test_kills_at_random_moments_lose_no_episode(kills, tmp_path, figure):
     seeds, chance, interrupted = evaluation_seeds(50), random.Random(0), 0
     undisturbed = tmp_path / "undisturbed.json"
-    begun = time.perf_counter()
-    evaluate_without_simulator(undisturbed, seeds, os.open(os.devnull, os.O_WRONLY))
-    duration = time.perf_counter() - begun  # a machine with a fast disk ends within milliseconds
+    for path in (tmp_path / "first.json", undisturbed):  # the first run takes longer than all others
+        begun = time.perf_counter()
+        evaluate_without_simulator(path, seeds, os.open(os.devnull, os.O_WRONLY))
+        duration = time.perf_counter() - begun  # a machine with a fast disk ends within milliseconds
     for number in range(kills):
         out = tmp_path / f"{number}.json"
         reader, writer = os.pipe()
