@@ -139,7 +139,9 @@ def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) ->
     for _ in islice(steps, args.steps):
         pass
     synchronise()
-    return (time.perf_counter() - start) / args.steps
+    seconds = (time.perf_counter() - start) / args.steps
+    print(f"{loop.__name__}, {tacrgb}: {1000 * seconds:.1f} ms a gradient step", flush=True)
+    return seconds
 
 
 def main(args: Args) -> None:

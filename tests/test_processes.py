@@ -12,6 +12,7 @@ import torch
 
 from manifeel_ms3.rendering import backend
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
+from tests.command_process import run_code
 from tests.tasks_and_marks import PEG, needs_renderer
 
 STEPS = 8
@@ -85,12 +86,25 @@ def _use_cuda_as_after_a_fork() -> None:
         raise RuntimeError("Cannot re-initialize CUDA in forked subprocess")
 
     torch.cuda.is_available, torch.cuda.device_count = lambda: True, lambda: 1
-    torch.cuda.init = torch.cuda.get_rng_state = refuse
+    torch.cuda._is_in_bad_fork, torch.cuda.get_rng_state = lambda: True, refuse
 
 
 def test_in_a_process_that_was_forked_from_one_with_cuda():
     bare = dict(obs_mode="tacff", render_backend="none")
     assert len(_in_process("fork", bare, _use_cuda_as_after_a_fork)) == 2
+
+
+IMPORTED_AFTER_THE_FORK = """
+from tests.test_processes import _use_cuda_as_after_a_fork
+_use_cuda_as_after_a_fork()
+import gymnasium
+print(gymnasium.make("ManiFeel-PegInsertion-v1", obs_mode="tacff", render_backend="none").reset(seed=0)[1])
+"""
+
+
+def test_the_package_is_imported_in_a_process_that_was_forked_from_one_with_cuda(tmp_path):
+    done = run_code(IMPORTED_AFTER_THE_FORK, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_process_keeps_its_renderer(monkeypatch):

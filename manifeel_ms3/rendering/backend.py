@@ -66,14 +66,10 @@ def restrict_torch_after_fork() -> None:
     It would wait for ever for OpenMP's other threads. ManiSkill saves the random state of every GPU that torch counts when it
     builds a scene, which torch refuses in a process that was forked from one that has used CUDA.
     """
-    if os.getpid() == _IMPORTED_IN:
-        return
-    torch.set_num_threads(1)
-    if torch.cuda.is_available():
-        try:
-            torch.cuda.init()
-        except RuntimeError:
-            torch.cuda.device_count = lambda: 0
+    if os.getpid() != _IMPORTED_IN:
+        torch.set_num_threads(1)
+    if torch.cuda._is_in_bad_fork():  # also where this package was imported after the fork
+        torch.cuda.device_count = lambda: 0
 
 
 @functools.cache

@@ -164,7 +164,7 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
 
 
 @needs_renderer
-@pytest.mark.parametrize("render_backend", ["cpu", "none"])
+@pytest.mark.parametrize("render_backend", ["auto", "none"])
 def test_what_is_drawn_but_collides_with_nothing_is_not_felt(render_backend):
     """ManiSkill marks goals with such bodies."""
 
@@ -185,7 +185,7 @@ def test_what_is_drawn_but_collides_with_nothing_is_not_felt(render_backend):
 
 @needs_renderer
 @pytest.mark.parametrize("front_drawn", [True, False])
-@pytest.mark.parametrize("render_backend", ["cpu", "none"])
+@pytest.mark.parametrize("render_backend", ["auto", "none"])
 def test_a_front_that_is_left_out_is_not_felt(render_backend, front_drawn):
     env = PadBench(
         lambda env: [container(front_drawn).build(env.scene, "kinematic", sapien.Pose([0, 0, 2]))],
