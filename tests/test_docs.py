@@ -18,6 +18,7 @@ import tyro
 
 from baselines.diffusion_policy import train as diffusion
 from baselines.tactile_representations.t3 import T3
+from docs import make_readme_results
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
 from tests.links import dead_links, missing_targets
@@ -82,6 +83,11 @@ def test_no_command_that_is_shown_writes_or_seeks_observations_in_a_file_of_stat
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.stem}")
 def test_a_page_links_files_that_exist(page):
     assert not missing_targets(page)
+
+
+def test_readme_has_the_published_results():
+    readme = make_readme_results.README.read_text()
+    assert make_readme_results.block() in readme, "run `python -m docs.make_readme_results`"
 
 
 def test_the_site_builds_without_a_warning(tmp_path):

@@ -1,0 +1,106 @@
+"""README's table of results, made anew: `python -m docs.make_readme_results` in the repository's root.
+
+It shows Table I in the set-up in which most of it was run, with the results of the folder leaderboard/cpu. A test fails where
+README does not have what this makes.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+from manifeel_ms3.analysis.answers import SIGNIFICANCE
+from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.estimates import difference
+from manifeel_ms3.analysis.markdown import markdown_table
+from manifeel_ms3.analysis.paper import MODALITIES, MODES, VISION
+from manifeel_ms3.analysis.paper_tables import HEADINGS, table_one
+from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
+from manifeel_ms3.evaluation.result import results_by_file
+from manifeel_ms3.files import write_text
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
+RESULTS = ROOT / "leaderboard" / "cpu"
+BLOCK = re.compile(r"(<!-- --8<-- \[start:results\] -->\n).*(?=<!-- --8<-- \[end:results\] -->)", re.DOTALL)
+"""README's part between the marks with which the home page of the documentation includes it."""
+ROWS = {
+    "ObjectSearch": "ObjectSearch, a battery in a box that hides it",
+    "BallSortingDim": "BallSortingDim, a golf ball in dim light",
+    "PowerPlugInsertion": "PowerPlugInsertion",
+    "GearAssembly": "GearAssembly, 0.5 mm of play on each side",
+    "PegInsertion": "PegInsertion, 0.5 mm of play on each side",
+    "USBInsertion": "USBInsertion",
+    "NutBoltAssembly": "NutBoltAssembly",
+    "BulbInstallation": "BulbInstallation",
+    "PegReorientation": "PegReorientation, a peg turned in the hand",
+}
+"""First cells of the rows, in the order of the table."""
+TEXT = """
+**What touch adds, in numbers:** success rates of Diffusion Policy with small networks (the preset `{preset}`), each trained
+in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the paper's number of demonstrations, over {episodes} initial
+states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds; rows without it
+have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are significantly
+above those of vision alone (p < {p}). The paper's rates, in brackets, come from much larger networks.
+"""
+"""35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
+seeds by 12 points, as those of PegInsertion with touch do."""
+WIDTH = 140
+"""Width of README's lines, in characters."""
+
+
+def block() -> str:
+    """README's text on the results.
+
+    Raises:
+        ResultError: There is no result, or one is broken.
+    """
+    results = list(results_by_file(RESULTS).values())
+    found = of_the_protocol(collect(results))
+    if not (most := table_one(found)):
+        raise SystemExit(f"{RESULTS} has no result of the paper's Table I")
+    settings, conditions = most
+    minutes = [seconds / 60 for seconds in _training_seconds(results, set(conditions.values()))]
+    text = TEXT.format(
+        preset=settings.preset,
+        fastest=min(minutes),
+        slowest=max(minutes),
+        episodes=min(len(found[condition].episode_seeds) for condition in conditions.values()),
+        seeds=max(len(found[condition].success) for condition in conditions.values()),
+        p=SIGNIFICANCE,
+    )
+    here = {place: found[condition] for place, condition in conditions.items()}
+    rows = [(label, *_cells(task, here)) for task, label in ROWS.items()]
+    return f"{fill(text.strip(), WIDTH)}\n\n{markdown_table(('', *HEADINGS.values()), rows)}"
+
+
+def _training_seconds(results: list[dict[str, Any]], conditions: set[Condition]) -> list[float]:
+    configs = [result["config"] for result in results if condition_of(result) in conditions]
+    return [config["training_seconds"] for config in configs if "training_seconds" in config]
+
+
+def _cells(task: str, results: dict[tuple[str, str], ConditionResults]) -> Iterator[str]:
+    """A rate for each sensing, with the paper's in brackets."""
+    for mode, paper in zip(MODES, MODALITIES[task], strict=True):
+        ours = results.get((task, mode))
+        yield f"{'not run' if ours is None else _rate(ours, results.get((task, VISION)))} ({100 * paper.mean:.0f})"
+
+
+def _rate(ours: ConditionResults, vision: ConditionResults | None) -> str:
+    """A rate, in bold letters if it is significantly above that of vision alone."""
+    spread = "" if ours.seed_deviation is None else f" ± {100 * ours.seed_deviation:.0f}"
+    rate = f"{100 * ours.success.mean():.0f}{spread} %"
+    if vision is None:
+        return rate
+    gain, p_value = difference(ours, vision)
+    return f"**{rate}**" if gain.value > 0 and p_value < SIGNIFICANCE else rate
+
+
+def main() -> None:
+    text = README.read_text(encoding="utf-8")
+    write_text(README, BLOCK.sub(lambda found: found[1] + block(), text))
+
+
+if __name__ == "__main__":
+    main()
