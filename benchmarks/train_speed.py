@@ -140,7 +140,7 @@ def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) ->
         pass
     synchronise()
     seconds = (time.perf_counter() - start) / args.steps
-    print(f"{loop.__name__}, {tacrgb}: {1000 * seconds:.1f} ms a gradient step", flush=True)
+    Console().print(f"{loop.__name__}, {tacrgb}: {1000 * seconds:.1f} ms a gradient step")
     return seconds
 
 

@@ -10,9 +10,8 @@ from pathlib import Path
 from textwrap import fill
 from typing import Any
 
-from manifeel_ms3.analysis.answers import SIGNIFICANCE
 from manifeel_ms3.analysis.condition import Condition, condition_of
-from manifeel_ms3.analysis.estimates import difference
+from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import MODALITIES, MODES, VISION
 from manifeel_ms3.analysis.paper_tables import HEADINGS, table_one
@@ -68,7 +67,7 @@ def block() -> str:
         slowest=max(minutes),
         episodes=min(len(found[condition].episode_seeds) for condition in conditions.values()),
         seeds=max(len(found[condition].success) for condition in conditions.values()),
-        p=SIGNIFICANCE,
+        p=SIGNIFICANT,
     )
     here = {place: found[condition] for place, condition in conditions.items()}
     rows = [(label, *_cells(task, here)) for task, label in ROWS.items()]
@@ -88,13 +87,13 @@ def _cells(task: str, results: dict[tuple[str, str], ConditionResults]) -> Itera
 
 
 def _rate(ours: ConditionResults, vision: ConditionResults | None) -> str:
-    """A rate, in bold letters if it is significantly above that of vision alone."""
+    """A rate, in bold letters if it is significantly above vision alone, and both have enough training seeds to tell."""
     spread = "" if ours.seed_deviation is None else f" ± {100 * ours.seed_deviation:.0f}"
     rate = f"{100 * ours.success.mean():.0f}{spread} %"
-    if vision is None:
+    if vision is None or not has_enough_seeds(ours, vision):
         return rate
     gain, p_value = difference(ours, vision)
-    return f"**{rate}**" if gain.value > 0 and p_value < SIGNIFICANCE else rate
+    return f"**{rate}**" if gain.value > 0 and p_value < SIGNIFICANT else rate
 
 
 def main() -> None:

@@ -7,19 +7,18 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .census import endings_of
 from .condition import Condition
-from .estimates import difference
+from .estimates import SIGNIFICANT, difference, has_enough_seeds
 from .matching import Found, answering
 from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
 from .presets import TrainingSettings
 
-SIGNIFICANCE = 0.05
-"""Value of p below which a gain is called significant; the field's convention, like the 95 % intervals."""
-
 TEXT = """
 ## What touch adds, and how episodes fail
 
-Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. How an episode fails is
-determined by a rule of its task. The [audit](audit.md) shows how much the camera and touch can reveal at all.
+Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. Where a condition has
+fewer than three training seeds, the interval covers the initial states only and says nothing about how much training varies.
+How an episode fails is determined by a rule of its task. The [audit](audit.md) shows how much the camera and touch can reveal
+at all.
 
 """
 NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
@@ -54,13 +53,16 @@ def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterat
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
     rates: dict[str, Rate] = dict(zip(MODES, MODALITIES[task], strict=True))
-    papers = f"the paper: {rates[mode].mean - rates[VISION].mean:+.0%}"
+    papers = f"the paper: {100 * (rates[mode].mean - rates[VISION].mean):+.0f}"
+    touched, seen = found[conditions[mode]], found[conditions[VISION]]
     try:
-        gain, p_value = difference(found[conditions[mode]], found[conditions[VISION]])
+        gain, p_value = difference(touched, seen)
     except ResultError:  # evaluated on other initial states
         return f"{NAMES[mode]} cannot be compared"
-    verdict = "" if p_value < SIGNIFICANCE else "not significant; "
-    return f"{NAMES[mode]} changes success by {gain.signed} ({verdict}{papers})"
+    verdict = "not significant; " if p_value >= SIGNIFICANT else ""
+    if not has_enough_seeds(touched, seen):
+        verdict = "too few training seeds to tell; "
+    return f"{NAMES[mode]} changes success by {gain.signed} points ({verdict}{papers})"
 
 
 def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> str:

@@ -1,11 +1,12 @@
 """Test the paper's claims on results: `python -m manifeel_ms3.analysis.claims --results runs --out claims.md`.
 
 Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
-holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. Both
-conditions have the same settings and the paper's number of demonstrations, except in the claim about that number.
+holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. With
+fewer than three training seeds, there is no verdict. Both conditions have the same preset of their policies and the paper's
+number of demonstrations, except in the claim about that number.
 
 Interval and verdict are those of a single comparison. Of many comparisons without any difference, 5 % exclude zero by chance;
-the p-values after Holm's correction for all comparisons that were run say which differences remain.
+the p-values after Holm's correction for all comparisons with a verdict say which differences remain.
 """
 
 import logging
@@ -22,7 +23,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition
 from .encoder_ranking import ranking_tables
-from .estimates import SIGNIFICANT, Estimate, difference, holm
+from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, mean_success, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper_claims import Comparison, comparisons
@@ -30,13 +31,16 @@ from .presets import TrainingSettings
 from .protocol import collect, of_the_protocol
 
 log = logging.getLogger(__name__)
-Verdict = Literal["holds", "does not hold", "undecided"]
+Verdict = Literal["holds", "does not hold", "undecided", "too few seeds"]
 MARGIN = 0.05
 """Largest gain in success that counts as none where a claim says that there is no gain: five points, our choice."""
-
-MANY_TESTS = """Interval, p and verdict are each of one comparison alone. The table compares {count} pairs of conditions, some
-of them for several claims, and of many tests, 5 % find a difference where there is none. The column "p, Holm" is corrected for
-all tests of the table (Holm 1979): {remaining} of the {count} differences have a corrected p below 0.05.
+NEAR_NO_SUCCESS = 0.1
+"""Success below which two conditions decide nothing about a claim that there is no gain: both hardly learn the task."""
+MANY_TESTS = """Differences are in percentage points. Interval, p and verdict are each of one comparison alone. A pair of which
+a condition has fewer than {seeds} training seeds has no verdict ("too few seeds"), since two runs that differ in their seed
+alone often differ as much; its interval is of these runs only. The table tests {count} pairs of conditions, some of them for
+several claims, and of many tests, 5 % find a difference where there is none. The column "p, Holm" is corrected for all of them
+(Holm 1979): {remaining} of the {count} differences have a corrected p below 0.05.
 """
 
 
@@ -46,10 +50,10 @@ class ClaimResult:
 
     difference: Estimate
     """How much more often the first condition succeeds."""
-    p_value: float
-    """Probability of so large a difference if both conditions succeed equally often."""
-    p_holm: float
-    """The p-value after Holm's correction for all pairs of conditions that were compared."""
+    p_value: float | None
+    """P-value of the hypothesis that both conditions succeed equally often; None with too few training seeds."""
+    p_holm: float | None
+    """The p-value after Holm's correction for all pairs of conditions that have one."""
     verdict: Verdict
     """Whether the claim holds, by this comparison alone."""
     settings: TrainingSettings
@@ -73,20 +77,28 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
         for settings, (first, second) in answering_all([comparison.first, comparison.second], found).items()
     }
     differences = {(first, second): difference(found[first], found[second]) for first, second in pairs.values()}
-    tests = {frozenset(pair): p_value for pair, (_, p_value) in differences.items()}  # several claims may rest on one test
+    tests = {  # several claims may rest on one test
+        frozenset(pair): p_value
+        for pair, (_, p_value) in differences.items()
+        if has_enough_seeds(*(found[condition] for condition in pair))
+    }
     corrected = dict(zip(tests, holm(list(tests.values())), strict=True))
     outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
     for (comparison, settings), pair in pairs.items():
         (gap, _), test = differences[pair], frozenset(pair)
-        verdict = _verdict(comparison, gap)
-        outcomes[comparison].append(ClaimResult(gap, tests[test], corrected[test], verdict, settings, test))
+        best = max(mean_success(found[condition]).value for condition in pair)
+        verdict = _verdict(comparison, gap, best) if test in tests else "too few seeds"
+        outcomes[comparison].append(ClaimResult(gap, tests.get(test), corrected.get(test), verdict, settings, test))
     return outcomes
 
 
-def _verdict(comparison: Comparison, gap: Estimate) -> Verdict:
+def _verdict(comparison: Comparison, gap: Estimate, best: float) -> Verdict:
+    """The verdict on a claim, given the difference and the higher success of the two conditions."""
     if comparison.gain:
         return "holds" if gap.low > 0 else "does not hold" if gap.high < 0 else "undecided"
-    return "holds" if gap.high < MARGIN else "does not hold" if gap.low > 0 else "undecided"
+    if gap.low > 0:
+        return "does not hold"
+    return "holds" if gap.high < MARGIN and best >= NEAR_NO_SUCCESS else "undecided"
 
 
 def claims_page(found: Found) -> str:
@@ -100,13 +112,12 @@ def claims_page(found: Found) -> str:
     rows, answered = [], results_of_claims(found)
     for comparison, outcomes in answered.items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
-        ran = [
-            (one.difference.signed, f"{one.p_value:.3f}", f"{one.p_holm:.3f}", one.verdict, one.settings) for one in outcomes
-        ]
+        ran = [(one.difference.signed, p_text(one.p_value), p_text(one.p_holm), one.verdict, one.settings) for one in outcomes]
         rows += [(*what, *cells) for cells in ran or [(None, None, None, "not run", None)]]
     table = markdown_table(("claim", "task", "compared", "difference", "p", "p, Holm", "verdict", "settings"), rows)
-    tests = {one.conditions: one.p_holm for outcomes in answered.values() for one in outcomes}
-    note = MANY_TESTS.format(count=len(tests), remaining=sum(p_holm < SIGNIFICANT for p_holm in tests.values()))
+    tests = {one.conditions: one.p_holm for outcomes in answered.values() for one in outcomes if one.p_holm is not None}
+    remaining = sum(p_holm < SIGNIFICANT for p_holm in tests.values())
+    note = MANY_TESTS.format(seeds=FEWEST_SEEDS, count=len(tests), remaining=remaining)
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
-from .estimates import SIGNIFICANT, Estimate, difference, holm, mean_success
+from .estimates import SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, mean_success, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper import ENCODERS, TACRGB, paper_condition, tasks_in_table
@@ -34,7 +34,8 @@ class EncoderRanking:
     gaps: dict[tuple[str, str], Estimate]
     """How much more often the first of two encoders succeeds than the second; for every two, the better one first."""
     p_values: dict[tuple[str, str], float]
-    """P-values of `gaps`, after Holm's correction for every two encoders on all tasks of the set-up."""
+    """P-values of `gaps`, after Holm's correction for every two encoders on all tasks of the set-up; none of pairs that have
+    too few training seeds."""
 
     @property
     def best_over_second(self) -> Estimate:
@@ -71,14 +72,15 @@ def _rankings(of_tasks: dict[str, dict[str, ConditionResults]]) -> list[EncoderR
         for task, names in order.items()
         for pair in combinations(names, 2)
     }
-    corrected = dict(zip(compared, holm([p_value for _, p_value in compared.values()]), strict=True))
+    tested = [of for of in compared if has_enough_seeds(*(of_tasks[of[0]][name] for name in of[1]))]
+    corrected = dict(zip(tested, holm([compared[of][1] for of in tested]), strict=True))
     return [
         EncoderRanking(
             task,
             tuple(names),
             tuple(success[task][name] for name in names),
             {pair: compared[task, pair][0] for pair in combinations(names, 2)},
-            {pair: corrected[task, pair] for pair in combinations(names, 2)},
+            {pair: corrected[task, pair] for pair in combinations(names, 2) if (task, pair) in corrected},
         )
         for task, names in order.items()
     ]
@@ -107,12 +109,12 @@ def ranking_tables(found: Found) -> Iterator[str]:
         yield f"not run. It needs {', '.join(ENCODERS['GearAssembly'])} on a task of Table III.\n"
     for settings, with_settings in ranked.items():
         yield f"{verdict_on(with_settings)} (settings: {settings}).\n\n"
-        names = ("task", "best", "success", "second", "success", "best over second", "p, Holm")
+        names = ("task", "best", "success", "second", "success", "best over second, points", "p, Holm")
         yield markdown_table(names, (_row(ranking) for ranking in with_settings))
         yield f"\n{CHOSEN_AFTERWARDS}"
 
 
 def _row(ranking: EncoderRanking) -> tuple[object, ...]:
     (best, second, *_), (of_best, of_second, *_) = ranking.encoders, ranking.success
-    p_value = f"{ranking.p_values[best, second]:.3f}"
+    p_value = p_text(ranking.p_values.get((best, second)))
     return ranking.task, best, of_best, second, of_second, ranking.best_over_second.signed, p_value

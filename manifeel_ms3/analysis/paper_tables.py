@@ -15,22 +15,26 @@ from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import DP, ENCODERS, MODALITIES, MODES, POLICIES, Rate, paper_condition, tasks_in_table
 from .presets import PAPER, TrainingSettings
+from .protocol import ConditionResults
 
 TEXT = """
 ## The paper's tables
 
-Each cell has our success with its 95 % interval and, after the slash, the paper's. Our rate links to its result file; the
-number after ± is the standard deviation over training seeds, where there are several. Only conditions with the paper's number
-of demonstrations appear, and each set-up has its own tables. The interval of a rate with one training seed says nothing about
-how much training itself varies; where there are several seeds, the interval covers that, too. "Floor" is the highest success of
-policies that have learnt nothing, where it was measured ([failure floors](#failure-floors)). The paper contradicts itself on
-ball sorting: its list of set-ups has only dim light, but its Tables I and II report different rates for the same policies.
-Here, Tables II and III are therefore run in both lights.
+Each cell has our success with its 95 % interval and, after the slash, the paper's. A rate links to its result file; where there
+are several training seeds, the mean is followed by the rate of each seed. Only conditions with the paper's number of
+demonstrations appear, and each set-up has its own tables. The interval of a rate with one training seed says nothing about how
+much training itself varies; where there are several seeds, the interval covers that, too. "Floor" is the highest success of
+policies that have learnt nothing, where it was measured ([failure floors](#failure-floors)). The presets of the three policies
+differ in more than the policy ([how](policies.md)). The paper contradicts itself on ball sorting: its list of set-ups has only
+dim light, but its Tables I and II report different rates for the same policies. The studies of Tables II and III therefore have
+both lights.
 """
 NOT_RUN = """
 Not run: {what}. `manifeel study configs/paper.yaml` runs them, on a GPU; with `--dry-run` it estimates the hours on your
 machine.
 """
+Files = Mapping[Condition, Sequence[str]]
+"""Links to result files of conditions: the last checkpoint's of each training seed, in the order of `ConditionResults`."""
 HEADINGS: dict[str, str] = dict(zip(MODES, ("vision", "vision + TacRGB", "vision + TacFF"), strict=True))
 """Headings of the tables' columns, by observation mode."""
 PANEL = (11.0, 4.2)
@@ -49,7 +53,7 @@ BAR = 0.27
 """Width of a bar; tasks are 1 apart."""
 
 
-def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterator[str]:
+def tables_of_the_paper(found: Found, files: Files) -> Iterator[str]:
     """Markdown of Tables I to III, part by part.
 
     Args:
@@ -67,7 +71,8 @@ def tables_of_the_paper(found: Found, files: Mapping[Condition, str]) -> Iterato
         if others := {task for (task, policy), _ in rows if policy != DP}:
             with_other_policies |= others
             yield f"\n### Table II, three policies: {settings}\n\n"
-            yield _with_floors(("task", "policy", *HEADINGS.values()), [(*what, *cells) for what, cells in rows])
+            compared = [(*what, *cells) for what, cells in rows if what[0] in others]
+            yield _with_floors(("task", "policy", *HEADINGS.values()), compared)
         if rows := list(_rows_by_encoder(found, files, settings)):
             by_encoder = True
             yield f"\n### Table III, encoders of TacRGB: {settings}\n\n"
@@ -104,7 +109,7 @@ Rows = Mapping[tuple[str, str], tuple[Rate, ...]]
 
 
 def _rows_by_sensing(
-    found: Found, files: Mapping[Condition, str], settings: TrainingSettings, rows: Rows
+    found: Found, files: Files, settings: TrainingSettings, rows: Rows
 ) -> Iterator[tuple[tuple[str, str], list[str]]]:
     """Task and policy, and a cell for each observation mode; only rows of which some condition was run."""
     for (task, policy), rates in rows.items():
@@ -114,7 +119,7 @@ def _rows_by_sensing(
             yield (task, policy), cells
 
 
-def _rows_by_encoder(found: Found, files: Mapping[Condition, str], settings: TrainingSettings) -> Iterator[list[str]]:
+def _rows_by_encoder(found: Found, files: Files, settings: TrainingSettings) -> Iterator[list[str]]:
     for task in tasks_in_table("III"):
         wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
         answers = {name: answering(condition, found).get(settings) for name, condition in wanted.items()}
@@ -122,12 +127,25 @@ def _rows_by_encoder(found: Found, files: Mapping[Condition, str], settings: Tra
             yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
 
 
-def _cell(found: Found, files: Mapping[Condition, str], condition: Condition | None, rate: Rate) -> str:
+def _cell(found: Found, files: Files, condition: Condition | None, rate: Rate) -> str:
     if condition is None:
         return f"not run / {rate}"
-    results = found[condition]
-    spread = "" if results.seed_deviation is None else f" ± {results.seed_deviation:.0%}"
-    return f"{linked(mean_success(results), files.get(condition))}{spread} / {rate}"
+    return f"{success_with_links(found[condition], files.get(condition, ()))} / {rate}"
+
+
+def success_with_links(results: ConditionResults, files: Sequence[str]) -> str:
+    """The success of a condition, as text, such as "40% [25%, 56%] (34%, 54%, 32%)": the rates of the runs link to their files.
+
+    Args:
+        results: Success of the condition in every episode.
+        files: Links to a result file of each training seed, in their order; no links if empty.
+    """
+    success = mean_success(results)
+    if len(results.success) == 1:
+        return linked(success, files[0] if files else None)
+    rates = [f"{rate:.0%}" for rate in results.success.mean((1, 2))]
+    runs = [f"[{rate}]({file})" for rate, file in zip(rates, files, strict=True)] if files else rates
+    return f"{success} ({', '.join(runs)})"
 
 
 def linked(success: Estimate, file: str | None) -> str:

@@ -55,6 +55,12 @@ class ConditionResults:
         return ""
 
     @property
+    def success_at_end(self) -> float | None:
+        """Share of the episodes in which the task is solved at the last step; None where some ended at success."""
+        solved = [episode.get("success_at_end") for episode in self.episodes]
+        return None if not solved or None in solved else float(np.array(solved, float).mean())
+
+    @property
     def seed_deviation(self) -> float | None:
         """Standard deviation of the success over the training seeds; None for a single one."""
         rates = self.success.mean((1, 2))

@@ -26,12 +26,12 @@ from .answers import answers
 from .census import census_table
 from .claims import claims_page
 from .condition import Condition, condition_of
-from .estimates import difference, mean_success
+from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
 from .paper_beside import runtime_table, similarity_table
-from .paper_tables import draw_sensing_by_task, linked, tables_of_the_paper
+from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
 from .presets import training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
 from .rank_agreement import rank_table
@@ -47,25 +47,27 @@ HEAD = """# Results
 *Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is written by hand.*
 
 An episode is a success if the task was solved at any step. A rate is the mean over training seeds, the last checkpoints (at
-most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states; "of" gives the number
-of each. "Std" is the standard deviation over training seeds. "Gentle success" counts the episodes that succeed before the
+most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states, or over initial
+states alone where there is one seed; "of" gives the number of each. "Std" is the standard deviation over training seeds. "At
+the end" is the share of the episodes in which the task is solved at the last step, too. It is lower, since demonstrations end
+soon after success, and policies have not learnt to stay there. "Gentle success" counts the episodes that succeed before the
 contact force exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor"
 is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "By the
-paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)); results of
-before it was measured lack it. "TacRGB encoder" is the network for tactile images: `fine_cnn` is the small one of the preset
-`cpu`, trained from scratch. "Settings" names the preset of the policy and what differs from it, and "id" is a hash of
-everything that defines the condition. "Cost" is the time of training, summed over the seeds, and "on" the machine, of which
-each job used one core.
+paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)); older results
+lack it. "TacRGB encoder" is the network for tactile images: `fine_cnn` is the small one of the preset `cpu`, trained from
+scratch. "Settings" names the preset of the policy and what differs from it, and "id" is a hash of everything that defines the
+condition. "Cost" is the time of training, summed over the seeds, and "on" the machine, of which each job used one core.
 """
 CHART = """
 ![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})
 
-Success in the tasks of the paper's Table I by what the policy senses. Black lines are the paper's rates, which come from larger
+Success in the tasks of the paper's Table I by what the policy senses. The thin lines are 95 % intervals, which cover the
+variation over training only in tasks with several training seeds. Black lines are the paper's rates, which come from larger
 networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
 """
 AGAIN = """
-Each success rate links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is beside
-it, and `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree. `manifeel study
+The success rate of each run links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is
+beside it, and `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree. `manifeel study
 configs/tables_cpu.yaml` produces all results of the small networks.
 """
 CURVES = """
@@ -99,7 +101,9 @@ CLAIMS = """
 
 Each claim is tested as the difference between two conditions on the same initial states, with its 95 % interval
 ([method](evaluation.md#the-papers-protocol-and-claims)). Except for what the claim compares, both conditions have the same
-settings and the paper's number of demonstrations. Claim 4 may be an artefact of the public code, which trains Flow Matching
+preset and the paper's number of demonstrations. A preset is not the same for all policies: that of the small networks gives the
+Equivariant Diffusion Policy smaller images and half as many gradient steps ([policies](policies.md)), so that claim 5 compares
+these networks, too. Claim 4 may be an artefact of the public code, which trains Flow Matching
 on Gaussian noise but starts generation from uniform noise ([fidelity](fidelity.md)).
 """
 
@@ -124,9 +128,7 @@ def main(args: Args) -> Path:
     """
     by_file = results_by_file(*args.results)
     results = list(by_file.values())
-    files: dict[Condition, str] = {}
-    for path, result in by_file.items():  # the first seed's, beside which its checkpoint lies
-        files.setdefault(condition_of(result), os.path.relpath(path, args.out.parent))
+    files = _links(by_file, args.out.parent)
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     figure = args.out.parent / f"images/{args.out.stem}.png"
     has_figure = training_curves(args.results, figure) or figure.is_file()
@@ -142,6 +144,16 @@ def main(args: Args) -> Path:
     gentle = forces.relative_to(args.out.parent) if has_forces else None
     write_text(args.out, "".join(page(results, loss, similarities, curves, files, chart, gentle)))
     return args.out
+
+
+def _links(by_file: Mapping[Path, dict[str, Any]], folder: Path) -> Files:
+    """Links from a folder to the last checkpoint's result of each run."""
+    last: dict[Condition, dict[int | None, tuple[int, str]]] = {}
+    for path, result in by_file.items():
+        runs, seed = last.setdefault(condition_of(result), {}), result["training_seed"]
+        here = (result["config"].get("step", 0), os.path.relpath(path, folder))
+        runs[seed] = max(here, runs.get(seed, here))
+    return {condition: [link for _, link in runs.values()] for condition, runs in last.items()}
 
 
 def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
@@ -186,7 +198,7 @@ def page(
     loss: Path | None = None,
     similarities: Sequence[Path] = (),
     success: Path | None = None,
-    files: Mapping[Condition, str] | None = None,
+    files: Files | None = None,
     chart: Path | None = None,
     gentle: Path | None = None,
 ) -> Iterator[str]:
@@ -224,7 +236,7 @@ def page(
     if rows := list(_gains_over_references(found)):
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
-        yield markdown_table(("task", "sensing", "policy", "over", "gain", "p"), rows)
+        yield markdown_table(("task", "sensing", "policy", "over", "gain, points", "p"), rows)
     yield _table_of_floors()
     yield census_table(results, [condition for condition, _ in _sorted(found)])
     yield rank_table(found)
@@ -234,18 +246,24 @@ def page(
     yield similarity_table(similarities)
 
 
-def _table_of_conditions(
-    found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Mapping[Condition, str]
-) -> str:
+def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Files) -> str:
     rows = []
     for condition, here in _sorted(found):
         cost, machines = _cost([result for result in results if condition_of(result) == condition])
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
-        success = linked(mean_success(here), files.get(condition))
-        measured = (success, _floor(condition), gentle_cell(here), _by_the_paper(here), _deviation(here), here.size, note)
+        success = success_with_links(here, files.get(condition, ())), _percent(here.success_at_end)
+        measured = (
+            *success,
+            _floor(condition),
+            gentle_cell(here),
+            _by_the_paper(here),
+            _percent(here.seed_deviation),
+            here.size,
+            note,
+        )
         of = (condition.policy, condition.encoder, condition.num_demos, training_settings_of(condition), f"`{condition.key}`")
         rows.append((_task(condition), condition.sensing, *measured, *of, cost, machines))
-    measures = ("success", "floor", "gentle success", "by the paper's threshold", "std", "of", "note")
+    measures = ("success", "at the end", "floor", "gentle success", "by the paper's threshold", "std", "of", "note")
     settings = ("policy", "TacRGB encoder", "demonstrations", "settings", "id")
     return markdown_table(("task", "sensing", *measures, *settings, "cost", "on"), rows)
 
@@ -253,7 +271,7 @@ def _table_of_conditions(
 def _by_the_paper(results: ConditionResults) -> str | None:
     """Share of the episodes that met the threshold of the paper's public code; None where some were not measured."""
     successes = successes_by_the_paper(results.episodes)
-    return None if successes is None else f"{np.mean(successes):.0%}"
+    return _percent(None if successes is None else float(np.mean(successes)))
 
 
 def _floor(condition: Condition) -> str | None:
@@ -273,8 +291,8 @@ def _table_of_floors() -> str:
     return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 
-def _deviation(results: ConditionResults) -> str | None:
-    return None if results.seed_deviation is None else f"{results.seed_deviation:.0%}"
+def _percent(rate: float | None) -> str | None:
+    return None if rate is None else f"{rate:.0%}"
 
 
 def _sorted(found: dict[Condition, ConditionResults]) -> list[tuple[Condition, ConditionResults]]:
@@ -292,7 +310,7 @@ def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator
         comparable = same_task and other.obs_mode in ("none", condition.obs_mode)
         if comparable and other.policy in REFERENCES and condition.policy not in REFERENCES:
             gain, p_value = difference(results, learnt_nothing)
-            yield _task(condition), condition.sensing, condition.policy, other.policy, gain.signed, f"{p_value:.1g}"
+            yield _task(condition), condition.sensing, condition.policy, other.policy, gain.signed, p_text(p_value) or ""
 
 
 def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:

@@ -129,7 +129,8 @@ def leaderboard_table(rows: list[Row]) -> str:
         f"# Leaderboard\n\n`python -m manifeel_ms3.leaderboard build` writes this table, and `{PAGE}`, which shows the "
         f"same with filters, learning curves and videos. Success is the mean over {FULL[0]} training seeds, the last {FULL[1]} "
         f"checkpoints and {FULL[2]} evaluation episodes, with its 95 % interval; where there are fewer, "
-        '"of" gives their numbers. A success is gentle if the contact force stays within the limit of the task until then '
+        '"of" gives their numbers. "At the end" is the share of the episodes in which the task is solved at the last step. '
+        "A success is gentle if the contact force stays within the limit of the task until then "
         '([limits](../docs/evaluation.md#what-is-measured)). "Std" is the standard deviation over training seeds; "floor" is '
         'the success of policies that have learnt nothing, where it was measured. "Run again" is the number of episodes that '
         "the leaderboard ran again with the same outcome "
@@ -140,13 +141,14 @@ def leaderboard_table(rows: list[Row]) -> str:
         about, condition = row.submission.about, row.condition
         name = markdown_text(about.name)
         task = f"{condition.task} {condition.variant}".strip()
-        gentle = "" if row.gentle is None else f"{row.gentle:.0%}"
+        gentle, at_end = ("" if rate is None else f"{rate:.0%}" for rate in (row.gentle, row.results.success_at_end))
         what = (task, condition.sensing, condition.policy, str(training_settings_of(condition)), condition.encoder)
-        success = (row.success, row.deviation_text, row.floor or "", gentle)
+        success = (row.success, at_end, row.deviation_text, row.floor or "", gentle)
         numbers = (condition.num_demos, *success, row.results.size, row.rerun_text)
         cells.append((*map(markdown_text, what), *numbers, f"[{name}]({about.link})" if about.link else name))
     what = ("task", "sensing", "policy", "settings", "TacRGB encoder", "demonstrations")
-    return head + markdown_table((*what, "success", "std", "floor", "gentle success", "of", "run again", "submission"), cells)
+    measured = ("success", "at the end", "std", "floor", "gentle success", "of", "run again", "submission")
+    return head + markdown_table((*what, *measured), cells)
 
 
 def write_page(rows: list[Row], board: Path) -> Path:
@@ -176,6 +178,7 @@ def _for_page(row: Row) -> dict[str, Any]:
     return {name: one_line(text) for name, text in texts.items()} | dict(
         demos=condition.num_demos or "",
         success=row.success,
+        at_end=row.results.success_at_end,
         deviation=row.deviation_text,
         floor=row.floor,
         size=row.results.size,

@@ -1,13 +1,14 @@
 """Means and intervals of the protocol, against cases whose answer is known."""
 
 import json
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from manifeel_ms3.analysis.census import census_table
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
-from manifeel_ms3.analysis.estimates import difference, holm, mean_success
+from manifeel_ms3.analysis.estimates import _weights, difference, holm, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.tasks.registry import task_spec
@@ -182,6 +183,32 @@ def test_a_difference_is_found_where_there_is_one(rng):
     none, p = difference(runs(rng, 0.5), runs(rng, 0.5))
     assert none.low < 0 < none.high
     assert p > 0.05
+
+
+def test_two_single_runs_are_compared_by_mcnemars_exact_test():
+    """Of 50 episodes, the first run alone solves 8, the second alone 1: the p-value is 2 (1 + 9) / 2^9."""
+    first, second = np.zeros((2, 1, 1, 50))
+    first[..., :20], second[..., 8:21] = 1.0, 1.0
+    found, p = difference(*(ConditionResults(side, list(range(50))) for side in (first, second)))
+    assert found.value == pytest.approx(0.14)
+    assert p == pytest.approx(20 / 512)
+
+
+def test_few_seeds_have_as_much_spread_as_their_deviation_says():
+    """Three seeds without any variation over starts: the resampled means deviate by the standard error, s / sqrt(3)."""
+    rates = np.array([0.2, 0.3, 0.7])
+    weights = _weights(np.random.default_rng(0), 3)
+    assert weights.sum(1) == pytest.approx(1.0)
+    assert (weights @ rates).std() == pytest.approx(rates.std(ddof=1) / np.sqrt(3), rel=0.05)
+
+
+def test_success_at_the_end_is_not_known_of_episodes_that_end_at_success():
+    success = np.array([[[1.0, 1.0]]])
+    episodes = [made_up(1, True, at_end=False), made_up(2, True)]
+    results = ConditionResults(success, [1, 2], episodes=[asdict(episode) for episode in episodes])
+    assert results.success_at_end == 0.5
+    results.episodes[0]["success_at_end"] = None
+    assert results.success_at_end is None
 
 
 def test_p_values_are_corrected_as_holm_does():
