@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import gymnasium as gym
-from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from mani_skill.utils.wrappers import CPUGymWrapper, FrameStack, RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
@@ -52,7 +52,10 @@ def make_eval_envs(
             partial(_make_on_cpu, env_id, kwargs, wrappers, str(video_dir) if video_dir and index == 0 else None)
             for index in range(num_envs)
         ]
-        return SyncVectorEnv(made) if num_envs == 1 else AsyncVectorEnv(made, context="spawn")
+        # an episode that ends is followed by a reset in the same step, as in ManiSkill's vector environments
+        if num_envs == 1:
+            return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
+        return AsyncVectorEnv(made, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
     env = make_env(env_id, num_envs=num_envs, sim_backend=sim_backend, reconfiguration_freq=1, **kwargs)
     env = _wrapped(env, wrappers, video_dir and str(video_dir))
     return ManiSkillVectorEnv(env, ignore_terminations=True, record_metrics=True)

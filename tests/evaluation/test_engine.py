@@ -285,18 +285,25 @@ def test_ctrl_c_ends_an_evaluation_and_the_policys_process_at_once(checkpoint, t
 # ------------------------------------------------------------------------------- vectorised environments
 
 
-def test_evaluation_environments_are_made_as_in_maniskills_baselines():
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_evaluation_environments_are_made_as_in_maniskills_baselines(num_envs):
     kwargs = dict(obs_mode="state", render_backend="none", max_episode_steps=2)
-    envs = make_eval_envs(PEG, 2, env_kwargs=kwargs, other_kwargs=dict(obs_horizon=2))
-    obs, _ = envs.reset(seed=[1, 2])
-    assert obs.shape[:2] == (2, 2)
+    envs = make_eval_envs(PEG, num_envs, env_kwargs=kwargs, other_kwargs=dict(obs_horizon=2))
+    first, _ = envs.reset(seed=[1, 2][:num_envs])
+    assert first.shape[:2] == (num_envs, 2)
     for _ in range(2):
-        *_, truncated, info = envs.step(np.zeros((2, 6), np.float32))
+        obs, *_, truncated, info = envs.step(np.zeros((num_envs, 6), np.float32))
+    after, *_, info_after = envs.step(np.zeros((num_envs, 6), np.float32))
     envs.close()
     assert truncated.all()
-    assert info["episode"]["episode_len"].tolist() == [2, 2]
-    assert info["episode"]["success_at_end"].tolist() == [False, False]
-    assert {"success_once", "fail_once", "fail_at_end", "return", "reward"} <= set(info["episode"])
+    episode = info["final_info"]["episode"]
+    assert episode["episode_len"].tolist() == [2] * num_envs
+    assert episode["success_at_end"].tolist() == [False] * num_envs
+    assert {"success_once", "fail_once", "fail_at_end", "return", "reward"} <= set(episode)
+    # the step that ends an episode begins the next one, and so none is without an action
+    assert np.array_equal(obs[:, 0], obs[:, 1])
+    assert not np.array_equal(after[:, 0], after[:, 1])
+    assert info_after["elapsed_steps"].tolist() == [1] * num_envs
 
 
 @pytest.mark.parametrize("wrappers", [[], [CPUGymWrapper]], ids=["plain", "CPUGymWrapper"])
