@@ -129,7 +129,7 @@ class PadsAsCamerasWrapper(_ObservationWrapper):
                 f"the pads {list(pads_with_images)} have rgb alone, the cameras {sorted(textures)}; leave 'tacrgb' out of the "
                 "obs_mode, or use FlattenVisuotactileObservationWrapper"
             )
-        size = next((data["rgb"].shape[1:3] for data in cameras.values()), None)
+        size = next((data["rgb"].shape[1:3] for data in cameras.values() if "rgb" in data), None)
         images = {name: dict(rgb=resized(data["rgb"], size)) for name, data in pads.items() if "rgb" in data}
         fields = {f"{name}_force_field": data["force_field"].flatten(1) for name, data in pads.items() if "force_field" in data}
         kept = {name: data for name, data in observation.items() if name not in ("sensor_data", "sensor_param", "extra")}

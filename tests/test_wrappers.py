@@ -57,14 +57,16 @@ def test_touch_joins_the_state_in_one_vector(make_env):
 
 
 @needs_renderer
-@pytest.mark.parametrize("mode", ["rgb+tacff", "rgb+tacrgb", "rgb+depth+tacff", "rgb+tacrgb+tacff"])
+@pytest.mark.parametrize("mode", ["rgb+tacff", "rgb+tacrgb", "rgb+depth+tacff", "rgb+tacrgb+tacff", "depth+tacff"])
 def test_maniskills_flattening_runs_over_touch(make_env, mode):
     env = FlattenRGBDObservationWrapper(PadsAsCamerasWrapper(make_env(obs_mode=mode, **SMALL)))
     obs, _ = env.reset(seed=0)
-    assert obs["rgb"].shape[-1] == (6 if "tacrgb" in mode else 3)
-    assert ("depth" in obs) == ("depth" in mode)
+    images = set(mode.split("+")) & {"rgb", "depth"}
+    assert set(obs) == {"state"} | images
+    assert "rgb" not in obs or obs["rgb"].shape[-1] == (6 if "tacrgb" in mode else 3)
     assert obs["state"].shape[1] == 25 + (420 if "tacff" in mode else 0)
-    assert FrameStack(env, num_stack=2).reset(seed=0)[0]["rgb"].shape == (1, 2, *obs["rgb"].shape[1:])
+    stacked, _ = FrameStack(env, num_stack=2).reset(seed=0)
+    assert all(stacked[image].shape == (1, 2, *obs[image].shape[1:]) for image in images)
 
 
 @needs_renderer
