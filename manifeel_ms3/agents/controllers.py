@@ -9,7 +9,7 @@ the contact force by that limit times the joint stiffness, whatever the policy a
 # (ManiSkill annotates actions and joint positions as unions of arrays, sequences and dicts; here they are tensors)
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -144,13 +144,13 @@ class LimitedLeadEEPoseController(PDEEPoseController):
 
 @dataclass
 class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
-    """Configuration of `LimitedLeadEEPoseController`."""
+    """Configuration of `LimitedLeadEEPoseController`. Ranges are symmetric: their lower ends follow from the upper ones."""
 
-    pos_lower: float = -0.01
+    pos_lower: float = field(init=False)
     """Translation of a delta action of -1, in m; lowest coordinate of an absolute action."""
     pos_upper: float = 0.01
     """Translation of a delta action of 1, in m (public code of the paper); highest coordinate of an absolute action."""
-    rot_lower: float = -0.05
+    rot_lower: float = field(init=False)
     """Rotation of a delta action of -1, in rad; lowest angle of an absolute action."""
     rot_upper: float = 0.05
     """Rotation of a delta action of 1, in rad (public code of the paper); highest angle of an absolute action."""
@@ -167,6 +167,9 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     use_target: bool = True
     """Whether delta actions are relative to the last target, and not to the tool's pose."""
     controller_cls = LimitedLeadEEPoseController
+
+    def __post_init__(self):
+        self.pos_lower, self.rot_lower = -self.pos_upper, -self.rot_upper
 
 
 class HoldGripperController(PDJointPosController):

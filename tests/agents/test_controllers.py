@@ -163,6 +163,15 @@ def test_an_absolute_pose_is_reached_and_never_far_ahead(make_env):
     assert 0.01 < reached[2] - fallen[2] < 0.024  # at most the lead that an absolute target may have
 
 
+def test_lower_ends_of_the_ranges_are_those_of_the_actions(make_env):
+    env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_pose_fixed_gripper")
+    config = env.unwrapped.agent.controller.controllers["arm"].config
+    assert env.action_space.low == pytest.approx([config.pos_lower] * 3 + [config.rot_lower] * 3)
+    assert env.action_space.high == pytest.approx([config.pos_upper] * 3 + [config.rot_upper] * 3)
+    with pytest.raises(TypeError, match="pos_lower"):
+        type(config)(config.joint_names, stiffness=1.0, damping=1.0, pos_lower=-0.5)
+
+
 def test_joint_targets_are_reached(make_env):
     env = make_env(obs_mode="none", render_backend="none", control_mode="pd_joint_pos_fixed_gripper")
     env.reset(seed=0)
