@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from pathlib import Path
 
 import torch
@@ -14,7 +15,7 @@ import warp as wp
 STDERR = 2  # number of the file descriptor of the standard error
 MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since that would take longer (chosen)
 
-_threads = 1  # that `launch_split` may use, changed by `use_torch_threads_for_warp`
+_threads = ContextVar("threads that `launch_split` may use", default=1)
 
 
 @functools.cache
@@ -46,16 +47,17 @@ def warp_device(device: torch.device):
 def use_torch_threads_for_warp() -> Iterator[None]:
     """Let `launch_split` use as many CPU threads as torch has, and torch only one.
 
-    Torch's own threads keep spinning for a while after an operation and would compete with warp's for the cores.
+    Torch's own threads keep spinning for a while after an operation and would compete with warp's for the cores. Uses may be
+    nested, and those of several threads may overlap; torch counts its threads for each thread that calls it.
     """
-    global _threads
-    _threads = torch.get_num_threads()
+    before = torch.get_num_threads()
+    token = _threads.set(max(before, _threads.get()))
     torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(_threads)
-        _threads = 1
+        torch.set_num_threads(before)
+        _threads.reset(token)
 
 
 def launch_split(kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs: list, device: torch.device) -> None:
@@ -76,7 +78,7 @@ def launch_split(kernel: wp.Kernel, dim: tuple[int, ...], inputs: list, outputs:
     def launch(start: int, stop: int) -> None:
         wp.launch(kernel, dim=(dim[0], stop - start, *dim[2:]), inputs=[start, *inputs], outputs=outputs, device=on)
 
-    threads = 1 if on.is_cuda or math.prod(dim) < MIN_SPLIT_SIZE else min(_threads, dim[1])
+    threads = 1 if on.is_cuda or math.prod(dim) < MIN_SPLIT_SIZE else min(_threads.get(), dim[1])
     kernel.module.load(on)
     bounds = [dim[1] * k // threads for k in range(threads + 1)]
     others = [_pool(threads - 1).submit(launch, *bounds[k : k + 2]) for k in range(1, threads)]
