@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.errors import InvalidArgumentError
@@ -57,7 +58,7 @@ class LeRobotEnv(gym.Env):
         spec = registry.task_spec(env_id)
         self.task = spec.name
         self.task_description = spec.instruction
-        self._max_episode_steps = spec.max_episode_steps
+        self._max_episode_steps = find_max_episode_steps_value(self._env)  # that of the task, or the one given
         self.action_space = self._env.action_space
         first, _ = self._env.reset()
         self.observation_space = _space_of(_as_lerobot(first))

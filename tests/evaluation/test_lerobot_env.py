@@ -45,6 +45,7 @@ def test_an_episode_depends_on_its_seed_and_ends_at_the_time_limit(env):
     assert np.array_equal(first["agent_pos"], again["agent_pos"])
     assert not np.array_equal(first["agent_pos"], other["agent_pos"])
     short = LeRobotEnv(PEG, "tacff", dict(render_backend="none", max_episode_steps=2))
+    assert short._max_episode_steps == 2
     short.reset(seed=1)
     still = np.zeros(short.action_space.shape, np.float32)
     assert [short.step(still)[2:4] for _ in range(2)] == [(False, False), (False, True)]
