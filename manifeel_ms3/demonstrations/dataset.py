@@ -138,13 +138,14 @@ def write_manifest(folder: Path) -> None:
 
 
 def describe(path: Path) -> dict[str, Any]:
-    """A trajectory file's entry in the manifest."""
+    """A trajectory file's entry in the manifest; what a file of another program does not say is None."""
     header = read_header(path)
     episodes = header["episodes"]
+    forces = [episode["peak_contact_force"] for episode in episodes if "peak_contact_force" in episode]
     return dict(
         env_id=task_of(header),
         env_kwargs=header["env_info"]["env_kwargs"],
-        versions=header["versions"],
+        versions=header.get("versions"),
         revision=header.get("revision"),
         sha256=file_hash(path),
         json_sha256=file_hash(path.with_suffix(".json")),
@@ -153,7 +154,7 @@ def describe(path: Path) -> dict[str, Any]:
         failed_seeds=header.get("failed_seeds", []),
         success=sum(bool(episode["success"]) for episode in episodes),
         mean_steps=round(sum(episode["elapsed_steps"] for episode in episodes) / max(len(episodes), 1), 1),
-        peak_contact_force=max((episode["peak_contact_force"] for episode in episodes), default=0.0),
+        peak_contact_force=max(forces, default=0.0) if len(forces) == len(episodes) else None,
     )
 
 

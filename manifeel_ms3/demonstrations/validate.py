@@ -68,14 +68,13 @@ def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> li
     replays = []
     try:
         episodes = read_header(path)["episodes"]
-        found = describe(path) if entry else {}
-        problems = [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in entry if found[key] != entry[key]]
+        problems = _manifest_problems(describe(path), entry) if entry else []
         with open_trajectories(path) as file:
             for episode in episodes:
                 problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
         if num_replays:
             replays = replay(path, num_replays)
-    except (ManifeelError, KeyError, OSError) as error:
+    except (ManifeelError, OSError) as error:
         return [str(error)]
     seeds = [episode["episode_seed"] for episode in episodes]
     if shared := [seed for seed in seeds if seed >= FIRST_EVALUATION_SEED]:
@@ -84,6 +83,13 @@ def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> li
         problems.append("a seed occurs twice")
     moved = [replayed for replayed in replays if replayed.deviation > 0]
     return problems + [f"seed {other.seed} does not come out as recorded (off by {other.deviation})" for other in moved]
+
+
+def _manifest_problems(found: dict[str, Any], entry: dict[str, Any]) -> list[str]:
+    """Where a manifest's entry says something else of a file than what was found in it."""
+    unknown = [f"the manifest has the unknown key {key!r}; a key is one of {list(found)}" for key in entry.keys() - found]
+    differing = [key for key in found if key in entry and found[key] != entry[key]]
+    return unknown + [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in differing]
 
 
 def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:

@@ -150,6 +150,27 @@ def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
     assert any(OBSERVED in problem and "does not exist" in problem for problem in problems)
 
 
+def test_an_unknown_key_of_a_manifest_is_named_and_hides_no_other_fault(folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["files"][f"{PEG}/{STATES}"] |= dict(licence="MIT", success=1)
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    unknown, differing = validate(copy)
+    assert unknown.startswith(f"{PEG}/{STATES}: the manifest has the unknown key 'licence'")
+    assert differing == f"{PEG}/{STATES}: success is 2, the manifest says 1"
+
+
+def test_a_set_may_hold_files_that_do_not_say_versions_and_forces(folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    header = json.loads((copy / PEG / STATES).with_suffix(".json").read_text())
+    del header["versions"], header["episodes"][0]["peak_contact_force"]
+    (copy / PEG / STATES).with_suffix(".json").write_text(json.dumps(header))
+    dataset.write_manifest(copy)
+    entry = json.loads((copy / "manifest.json").read_text())["files"][f"{PEG}/{STATES}"]
+    assert (entry["versions"], entry["peak_contact_force"]) == (None, None)
+    assert validate(copy) == []
+
+
 def test_set_without_manifest_says_what_writes_one(tmp_path):
     with pytest.raises(DemonstrationError, match="manifeel dataset"):
         validate(tmp_path)
