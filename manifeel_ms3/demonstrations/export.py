@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import tyro
@@ -46,8 +46,8 @@ def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     for i, episode in enumerate(each_demonstration(path, observation_keys(path), progress)):
-        arrays = {key.replace("/", "."): values for key, values in episode.items()}
-        np.savez_compressed(folder / f"episode_{i:05d}.npz", allow_pickle=False, **arrays)
+        arrays: dict[str, Any] = {key.replace("/", "."): values for key, values in episode.items()}
+        np.savez_compressed(folder / f"episode_{i:05d}.npz", **arrays)
 
 
 WRITERS: dict[str, Callable[[Path, Path, Progress], None]] = {

@@ -158,6 +158,15 @@ def test_npz(tmp_path):
     require_same(read, last_is_repeated=False)
 
 
+def test_npz_holds_the_arrays_of_an_episode_alone(tmp_path, monkeypatch):
+    """NumPy 1.26 saves every keyword as an array."""
+    keywords = []
+    monkeypatch.setattr(export.np, "savez_compressed", lambda file, **arrays: keywords.append(set(arrays)))
+    exported("npz", tmp_path)
+    expected = {"actions"} | {key.replace("/", ".") for key in observation_keys(SAMPLE)}
+    assert keywords == [expected] * len(keywords) != []
+
+
 @pytest.mark.parametrize("kind", ["lerobot", "zarr"])
 def test_baselines_train_on_it(kind, tmp_path):
     folder = exported(kind, tmp_path)
