@@ -11,6 +11,7 @@ from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation import evaluate, report
 from manifeel_ms3.evaluation.result import ResultError
+from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 from tests.tasks_and_marks import PEG, needs_renderer
 
 TASK_ARGS = json.dumps(dict(fit="paper", randomization=dict(socket_xy=0.01), max_episode_steps=75))
@@ -48,6 +49,15 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     for needed in ("data:video/mp4;base64,", "data:image/png;base64,", "Wilson", "socket_xy", "TacFF", "plotly"):
         assert needed in page
     assert 'src="http' not in page
+
+
+def test_the_reports_randomization_needs_no_simulation(monkeypatch):
+    monkeypatch.setattr(VisuotactileEnv, "__init__", lambda *_args, **_kwargs: pytest.fail("a simulation is built"))
+    ranges = report.randomization_of(dict(env_id=PEG, env_kwargs=dict(randomization=dict(start_z=0.0))))
+    assert ranges["start_z"] == (0.0, 0.05)
+    plain = report.randomization_of(dict(env_id=PEG, env_kwargs={}))
+    assert all(used == default for used, default in plain.values())
+    assert set(plain) == set(ranges)
 
 
 def test_report_without_an_evaluation(tmp_path):

@@ -17,7 +17,7 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import read_json_lines, write_text
-from manifeel_ms3.tasks.registry import make_env
+from manifeel_ms3.tasks.registry import task_spec
 
 from .checkpoint_config import TRAINING_LOSS
 from .floors import floors_of
@@ -117,11 +117,8 @@ def training_curve(log_file: Path) -> str:
 
 def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     """The task's randomization in an evaluation: pairs of the value there and the task's default, by the field's name."""
-    kwargs: dict[str, Any] = result["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    env = make_env(result["env_id"], **kwargs)
-    task: Any = env.unwrapped
-    used, default = task.randomization, task.Randomization()
-    env.close()
+    kind: Any = task_spec(result["env_id"]).env_class.Randomization
+    used, default = kind(**result["env_kwargs"].get("randomization") or {}), kind()
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
