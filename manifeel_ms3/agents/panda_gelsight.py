@@ -20,6 +20,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Actor, Pose
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
@@ -135,16 +136,17 @@ class PandaGelSight(BaseAgent):
     def set_action(self, action: torch.Tensor) -> None:
         """Pass an action on to the controller.
 
-        ManiSkill's own method does the same, but causes a warning of NumPy 2 when it looks for NaN in a tensor.
+        ManiSkill's own method does the same, but causes a warning of NumPy 2 when it looks for NaN in a tensor. The tasks of
+        this package have checked their actions before; those of ManiSkill, which can have this robot, have not.
 
         Args:
             action: Actions (N, D) of the control mode.
 
         Raises:
-            ValueError: The action has a NaN, in a simulation on the CPU.
+            InvalidArgumentError: The action has a NaN, in a simulation on the CPU.
         """
-        if not self.scene.gpu_sim_enabled and torch.isnan(torch.as_tensor(action)).any():
-            raise ValueError("Action cannot be NaN. Environment received:", action)
+        if not self.scene.gpu_sim_enabled and torch.isnan(given := torch.as_tensor(action)).any():
+            raise InvalidArgumentError(f"the action holds NaN: {given.tolist()}; give finite numbers")
         self.controller.set_action(action)
 
     @property

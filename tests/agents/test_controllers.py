@@ -5,6 +5,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.errors import InvalidArgumentError
+
 ACTION_DIMS = {
     "pd_ee_delta_pose_fixed_gripper": 6,
     "pd_ee_delta_pose": 7,
@@ -131,6 +133,12 @@ def test_nan_and_infinity_are_refused_before_anything_moves(env, bad):
     with pytest.raises(ValueError, match="NaN or infinity"):
         env.step(action)
     assert torch.equal(env.unwrapped.get_state(), before)
+
+
+def test_the_robot_refuses_nan_also_in_tasks_that_do_not(env):
+    env.reset(seed=0)
+    with pytest.raises(InvalidArgumentError, match=r"^the action holds NaN: \[\[nan, 0.5\]\]; give finite numbers$"):
+        env.unwrapped.agent.set_action(torch.tensor([[np.nan, 0.5]]))
 
 
 def test_wrong_shape_is_refused(env):
