@@ -54,8 +54,7 @@ class Imperfections:
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
         self._held = torch.zeros(num_pads, *config.taxel_shape, device=device)  # normal reading of the play operator
         self._surface: torch.Tensor | None = None  # (N, H, W), m
-        self._past: dict[str, torch.Tensor] = {}  # by output: (N, steps + 1, ...)
-        self._head = torch.zeros(num_pads, dtype=torch.int64, device=device)  # place of the last step in `_past`
+        self._past: dict[str, torch.Tensor] = {}  # by output: (N, steps + 1, ...), steps in turn
 
     @property
     def drawn(self) -> dict[str, torch.Tensor]:
@@ -65,7 +64,7 @@ class Imperfections:
     @property
     def memory(self) -> dict[str, torch.Tensor]:
         """What the next observation depends on besides the present state, (N, ...) each; not copies."""
-        own = dict(frame=self._frame, held=self._held, head=self._head)
+        own = dict(frame=self._frame, held=self._held)
         surface = {} if self._surface is None else dict(surface=self._surface)
         return own | surface | {f"past_{name}": values for name, values in self._past.items()}
 
@@ -133,19 +132,21 @@ class Imperfections:
         optics.noise.copy_((self.config.optics.noise**2 + read**2).sqrt())
 
     def delayed(self, obs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Observation of `delay` steps ago, or the episode's first one; call it once, at the end of every step."""
+        """Observation of `delay` steps ago, or the episode's first one; `obs` is that of this step."""
         slots = int(self.config.imperfections.delay[1]) + 1
-        first = self._frame == 0
-        self._frame += 1
         if slots == 1:
             return obs
-        self._head = (self._head + 1) % slots
-        then = (self._head - self._drawn["delay"]) % slots
+        first, now = self._frame == 0, self._frame.long()
+        then = now - self._drawn["delay"]
         pads = torch.arange(len(then), device=self.device)
         for name, values in obs.items():
             if name not in self._past:
                 self._past[name] = values[:, None].repeat(1, slots, *[1] * (values.ndim - 1))
             past = self._past[name]
             past.copy_(torch.where(first.view(-1, *[1] * values.ndim), values[:, None], past))
-            past[pads, self._head] = values
-        return {name: self._past[name][pads, then] for name in obs}
+            past[pads, now % slots] = values
+        return {name: self._past[name][pads, then % slots] for name in obs}
+
+    def end_step(self) -> None:
+        """Let the next observation be that of the next step, on which drift, noise and delay depend."""
+        self._frame += 1

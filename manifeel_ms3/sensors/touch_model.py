@@ -166,7 +166,10 @@ class TouchModel:
             obs["penetration"] = self._imperfections.sense_penetration(obs["penetration"])
         if self.optics is not None:
             obs["rgb"] = self._image(self.optics, self._pixel_penetration(depth, plane, below), bristle)
-        return obs if self._imperfections is None else self._imperfections.delayed(obs)
+        if self._imperfections is not None:
+            obs = self._imperfections.delayed(obs)
+            self._imperfections.end_step()
+        return obs
 
     def _image(self, optics: Optics, penetration: torch.Tensor, bristle: torch.Tensor | None) -> torch.Tensor:
         """TacRGB (N, H, W, 3) of the penetration (N, H, W), m."""

@@ -8,6 +8,7 @@ from scipy.integrate import trapezoid
 
 from manifeel_ms3.sensors import ImperfectionConfig, sensor_config
 from manifeel_ms3.sensors.depth.raycast import MeshRays
+from manifeel_ms3.sensors.imperfections import Imperfections
 from manifeel_ms3.sensors.touch_model import OUTPUTS, TouchModel
 
 CPU = torch.device("cpu")
@@ -74,6 +75,21 @@ def test_delay_in_steps_for_all_outputs():
     for t in range(len(loads)):
         for name, value in late[t].items():
             assert torch.equal(value, now[max(t - 3, 0)][name]), (name, t)
+
+
+def test_drift_and_delay_count_the_ends_of_steps():
+    """However often the observation of a step is asked for."""
+    config = sensor_config("gelsight_r15", "a", "b", imperfections=ImperfectionConfig(delay=1, drift=0.2))
+    sensed, nothing = Imperfections(config, 1, CPU), torch.zeros(1, *TAXELS, 3)
+    for _ in range(3):
+        assert not sensed.sense_forces(nothing).any()
+        sensed.delayed(dict(force_field=nothing))
+    sensed.end_step()
+    for _ in range(3):
+        assert sensed.sense_forces(nothing).any()
+        assert not sensed.delayed(dict(force_field=nothing + 1.0))["force_field"].any()
+    sensed.end_step()
+    assert sensed.delayed(dict(force_field=nothing))["force_field"].eq(1.0).all()
 
 
 def test_delay_may_differ_from_pad_to_pad():
