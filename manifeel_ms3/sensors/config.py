@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import sapien
@@ -17,8 +17,8 @@ from .config_fields import check_bounds, positive, within
 from .draws import uniform_draws
 from .imperfection_config import ImperfectionConfig
 
-DEPTH_BACKENDS = ("auto", "raycast", "sapien")
-UNITS = ("newton", "tacsl")
+DepthBackend = Literal["raycast", "sapien"]
+Units = Literal["newton", "tacsl"]
 ROUNDING = 1e-9  # m: an extent may exceed the gel's by this much, which is a rounding error
 
 
@@ -186,9 +186,9 @@ class TactileSensorConfig(BaseSensorConfig):
     """Optics, which make the image from the gel's surface."""
     housing: HousingConfig = field(default_factory=HousingConfig)
     """Finger that carries the gel on this package's robot."""
-    backend: Literal["auto", "raycast", "sapien"] = "auto"
-    """Source of depth: rays against the meshes, which need no renderer ("raycast", "auto"), or a SAPIEN camera in the pad."""
-    units: Literal["newton", "tacsl"] = "newton"
+    backend: DepthBackend = "raycast"
+    """Source of depth: rays against the meshes, which need no renderer, or a SAPIEN camera in the pad ("sapien")."""
+    units: Units = "newton"
     """Quantity of the force field: N per taxel, or the paper's own, penetration and 0.1 |v_t| (see `taxels.tacsl_field`)."""
     randomization: TouchRandomization = field(default_factory=TouchRandomization)
     """Differences between episodes."""
@@ -197,8 +197,8 @@ class TactileSensorConfig(BaseSensorConfig):
 
     def __post_init__(self):
         check_bounds(self, self.uid)
-        one_of("units", self.units, UNITS)
-        one_of("backend", self.backend, DEPTH_BACKENDS)
+        one_of("units", self.units, get_args(Units))
+        one_of("backend", self.backend, get_args(DepthBackend))
         self._check_extent("taxel_shape x taxel_pitch", self.taxel_shape, self.taxel_pitch)
         self._check_extent("image_shape x pixel_size", self.image_shape, self.pixel_size)
         self._check_dome()

@@ -74,7 +74,6 @@ class TactileSensor(BaseSensor):
         config = self.config
         if config.backend == "sapien":
             return CameraDepth(config, self.scene, self.pad)
-        # "auto": rays are faster than the camera on the CPU, and need no renderer
         gel = config.gel
         return RaycastDepth(self.scene, self.pad, config.pad_pose, gel.size, self._unfelt_links(), gel.max_sag)
 

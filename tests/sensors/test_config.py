@@ -31,6 +31,7 @@ from manifeel_ms3.sensors.registry import task_sensor
         (dict(taxel_pitch=5e-3), "taxel_shape x taxel_pitch"),
         (dict(image_shape=(480, 640)), "image_shape x pixel_size"),
         (dict(backend="magic"), "raycast"),
+        (dict(backend="auto"), r"\['raycast', 'sapien'\]"),
         (dict(units="pound"), "tacsl"),
         (dict(optics=OpticsConfig(shadow=1.5)), "optics.shadow"),
         (dict(optics=OpticsConfig(noise=-1.0)), "optics.noise"),
