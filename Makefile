@@ -4,7 +4,8 @@
 # make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
 # make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
 # make lock             Pin the newest versions that pyproject.toml allows in requirements.lock.
-# Every target first installs what is missing, and makes again only what is out of date.
+# Every target first installs what is missing. Demonstrations and a trained policy that are there are kept, also after a change
+# of TASK_ARGS or of the code: delete runs/demo to begin anew.
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 RUN := runs/demo

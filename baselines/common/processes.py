@@ -12,7 +12,8 @@ class Processes:
     """This process among those of a training run; the only one if `torchrun` did not start it.
 
     Args:
-        device: Type of the device, "cuda" or "cpu".
+        device: "cpu", "cuda", or one GPU by its number, such as "cuda:1". With `torchrun`, "cuda" gives each process a GPU of
+            its own; a GPU that has a number would be shared by all of them.
     """
 
     def __init__(self, device: str):

@@ -15,6 +15,7 @@ import hashlib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import fast_simplification
@@ -26,6 +27,7 @@ from trimesh.exchange.gltf import export_glb
 
 from manifeel_ms3.files import FileWriteError, atomic_folder
 from manifeel_ms3.paths import cache_dir, writable_cache
+from manifeel_ms3.sensors import config
 
 from . import fingers
 from .fingers import GEL_CENTRE, Finger, gel_pad, replace_finger
@@ -38,6 +40,7 @@ FEWEST_TRIANGLES = 24  # triangles of a small part of a mesh, which would vanish
 SMOOTH_ANGLE = np.deg2rad(35)  # rad: sharper edges stay sharp; chosen by eye
 NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; chosen by eye
 ROUGHNESS = 0.35  # roughness of the arm's painted and plastic surfaces; chosen by eye
+LIBRARIES = ("mani-skill", "trimesh", "fast-simplification", "scipy", "numpy")  # that the meshes come from, or are made by
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
@@ -52,9 +55,11 @@ def panda_gelsight_urdf(visuals: bool = True, finger: Finger | None = None) -> s
         finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
     """
     finger = finger or Finger()
-    # the key covers everything the files are made from: the modules, the finger, the package's URDF, and where it lies
-    modules = Path(__file__).read_bytes() + Path(fingers.__file__).read_bytes()
-    recipe = modules + repr(finger).encode() + (_SOURCE / "panda_v2.urdf").read_bytes() + str(_SOURCE).encode()
+    # the key covers everything the files are made from: the modules (that of the gel has the shape of its face), the libraries
+    # (ManiSkill's holds the meshes), the finger, the package's URDF, and where it lies
+    modules = b"".join(Path(file).read_bytes() for file in (__file__, fingers.__file__, config.__file__))
+    given = [*map(version, LIBRARIES), repr(finger), str(_SOURCE)]
+    recipe = modules + "\n".join(given).encode() + (_SOURCE / "panda_v2.urdf").read_bytes()
     folder = cache_dir() / f"panda_gelsight-{hashlib.sha256(recipe).hexdigest()[:12]}"
     if not (folder / "panda.urdf").is_file():
         _build_into(folder, finger)

@@ -9,7 +9,9 @@ import trimesh
 from mani_skill import PACKAGE_ASSET_DIR
 from scipy.spatial import KDTree
 
+from manifeel_ms3.agents import panda_gelsight_urdf as derived
 from manifeel_ms3.agents.panda_gelsight_urdf import panda_gelsight_urdf
+from manifeel_ms3.sensors import config
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +52,16 @@ def test_normals_are_those_of_the_full_mesh(low_poly):
             _, nearest = KDTree(points).query(vertices, k=min(16, len(points)))
             cosine = np.einsum("nkd,nd->nk", full[nearest], normals).max(axis=1)
             assert np.quantile(cosine, 0.02) > np.cos(np.deg2rad(1)), name
+
+
+def test_another_shape_of_the_gel_or_another_library_makes_files_of_its_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(derived, "_build_into", lambda folder, finger: None)
+    present = panda_gelsight_urdf()
+    assert panda_gelsight_urdf() == present
+    with monkeypatch.context() as changed:
+        changed.setattr(derived, "version", lambda name: "of another day")
+        assert panda_gelsight_urdf() != present
+    steeper = tmp_path / "config.py"
+    steeper.write_text(Path(config.__file__).read_text().replace("(1.0 + root)", "(0.9 + root)"))
+    monkeypatch.setattr(config, "__file__", str(steeper))
+    assert panda_gelsight_urdf() != present
