@@ -70,7 +70,7 @@ def edison(major_radius: float, pitch: float, arc: float, points: int = 4) -> Th
     return Thread(pitch, (*crest, *list(root)[1:-1]))
 
 
-def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: int = BOLT_COLUMNS) -> trimesh.Trimesh:
+def external_mesh(thread: Thread, length: float, tip_radius: float) -> trimesh.Trimesh:
     """Closed surface of an external thread from z = 0 to `length`, its crest at z = 0 at angle 0.
 
     Its top is chamfered by 45 degrees.
@@ -79,21 +79,20 @@ def external_mesh(thread: Thread, length: float, tip_radius: float, per_turn: in
         thread: The thread.
         length: Length along z, in m.
         tip_radius: Radius of the flat end that the chamfer leaves, in m.
-        per_turn: Number of columns of vertices around the axis.
     """
-    rim = _helix(thread, length, per_turn)
+    rim = _helix(thread, length, BOLT_COLUMNS)
     chamfer = tip_radius + length - rim[..., 1]
     rim[..., 0] = np.minimum(rim[..., 0], np.maximum(chamfer, tip_radius))
     vertices, faces = _skin(rim, len(thread.profile))
     count = rim.shape[1]
     bottom, top = len(vertices), len(vertices) + 1
-    for k in range(per_turn):
-        ahead = (k + 1) % per_turn * count
+    for k in range(BOLT_COLUMNS):
+        ahead = (k + 1) % BOLT_COLUMNS * count
         faces += [[k * count, bottom, ahead], [(k + 1) * count - 1, ahead + count - 1, top]]
     return _clean(np.r_[vertices, [[0, 0, 0], [0, 0, length]]], faces)
 
 
-def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: int = BORE_COLUMNS) -> trimesh.Trimesh:
+def internal_mesh(thread: Thread, length: float, mouth_radius: float) -> trimesh.Trimesh:
     """Surface of a bore with this thread from z = 0 to `length`, facing its axis; it is open at its ends and has no back.
 
     Its mouth, at the top, is chamfered by 45 degrees.
@@ -102,9 +101,8 @@ def internal_mesh(thread: Thread, length: float, mouth_radius: float, per_turn: 
         thread: The thread.
         length: Length along z, in m.
         mouth_radius: Radius of the mouth, in m.
-        per_turn: Number of columns of vertices around the axis.
     """
-    rim = _helix(thread, length, per_turn)
+    rim = _helix(thread, length, BORE_COLUMNS)
     rim[..., 0] = np.maximum(rim[..., 0], mouth_radius - (length - rim[..., 1]))
     vertices, faces = _skin(rim, len(thread.profile))
     return _clean(vertices, np.fliplr(faces))
