@@ -50,6 +50,20 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def require_positive(**flags: int | None) -> None:
+    """Check that whole numbers of a command line are at least 1.
+
+    Args:
+        **flags: Numbers by the names of their flags, with underscores; None if a flag was not given.
+
+    Raises:
+        InvalidArgumentError: A number is less than 1.
+    """
+    for name, given in flags.items():
+        if given is not None and given < 1:
+            raise InvalidArgumentError(f"--{name.replace('_', '-')} {given} must be at least 1; give a larger number")
+
+
 def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch.device | str = "cpu") -> torch.Tensor:
     """Return an action as a float32 tensor.
 

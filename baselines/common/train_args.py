@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import torch
 from tyro.conf import arg
 
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
@@ -137,16 +138,27 @@ FREE_ON_RESUME = {
 
 
 def check_run(args: TrainArgs) -> None:
-    """Check that the settings of a run do not contradict each other.
+    """Check that the numbers of a run can be met, and that its settings do not contradict each other.
 
     Raises:
-        InvalidArgumentError: The run to resume is not named, or is to be overwritten, or evaluations fall between checkpoints.
+        InvalidArgumentError: A number is too small, the run to resume is not named, or is to be overwritten, or evaluations
+            fall between checkpoints.
     """
-    if args.resume and (args.run_dir is args.exp_name is None or args.overwrite):
+    require_positive(
+        num_demos=args.num_demos,
+        batch_size=args.batch_size,
+        total_iters=args.steps,
+        save_freq=args.save_freq,
+        keep=args.keep,
+        eval_freq=args.eval_freq,
+        num_eval_envs=args.num_eval_envs,
+        log_freq=args.log_freq,
+    )
+    if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):
         raise InvalidArgumentError(
             "--resume needs --run-dir or --exp-name, the folder or the name of the run to continue, and excludes --overwrite"
         )
-    if args.eval_freq is not None and (args.eval_freq < 1 or args.eval_freq % args.save_freq):
+    if args.eval_freq is not None and args.eval_freq % args.save_freq:
         raise InvalidArgumentError(
             f"--eval-freq {args.eval_freq} must be a multiple of --save-freq {args.save_freq}, as checkpoints are evaluated"
         )

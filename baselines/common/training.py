@@ -69,7 +69,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         policy_class: Class of the policy.
 
     Raises:
-        InvalidArgumentError: The settings contradict each other (`check_run`).
+        InvalidArgumentError: A number is too small, or the settings contradict each other (`check_run`).
         FileExistsAlreadyError: The folder of the run has checkpoints, and is neither to be resumed nor to be overwritten.
         InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
@@ -120,7 +120,8 @@ class Trainer:
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
         self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
-        self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
+        usual = default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
+        self.total_steps = usual if args.steps is None else args.steps
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
         self.config = run_config(args, policy_class, self.dataset) | amount
 

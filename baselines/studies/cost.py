@@ -150,10 +150,10 @@ def _units(job: Job) -> int:
     if job.kind == "evaluate":
         return settings["episodes"] * settings["checkpoints"]
     args, record = training_args(job), job.needs[0]
-    demos = args.num_demos or record.settings["num"]
+    demos = record.settings["num"] if args.num_demos is None else args.num_demos
     steps = _demonstration_steps(record.settings["env_id"])
     samples = demos * max(steps - args.policy.action_horizon + 1, 1)  # as `SequenceDataset` counts them
-    return args.steps or default_steps(demos, samples, args.batch_size)
+    return default_steps(demos, samples, args.batch_size) if args.steps is None else args.steps
 
 
 def _demonstration_steps(env_id: str) -> float:

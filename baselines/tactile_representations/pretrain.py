@@ -24,6 +24,7 @@ from tyro.conf import arg
 from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header, task_of
@@ -89,11 +90,12 @@ def main(args: Args) -> list[float]:
     """Train, write the weights, and return every `log_freq`-th loss.
 
     Raises:
-        InvalidArgumentError: The representation does not take images of this size.
+        InvalidArgumentError: A number is too small, or the representation does not take images of this size.
         DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
         FileWriteError: The weights cannot be written.
         InUseError: Another process trains into the same file.
     """
+    require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
     with owned(args.out):
         return _pretrain(args)
 
@@ -110,7 +112,7 @@ def _pretrain(args: Args) -> list[float]:
         training = VqganTraining(representation, args)
     else:
         training = MaeTraining(representation, args, size)
-    losses, steps = [], args.steps or math.ceil(EPOCHS * len(images) / args.batch_size)
+    losses, steps = [], math.ceil(EPOCHS * len(images) / args.batch_size) if args.steps is None else args.steps
     with progress_bar() as bar:
         task = bar.add_task("training", total=steps)
         for step in range(steps):

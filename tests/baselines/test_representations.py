@@ -106,6 +106,8 @@ def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
         trained("t3", pictures, out, env_id="ManiFeel-NutBoltAssembly-v1")
     with pytest.raises(InvalidArgumentError, match="a multiple of 16, not 250; give --image-size 224"):
         trained("t3", pictures, out, image_size=250)
+    with pytest.raises(InvalidArgumentError, match="--total-iters 0 must be at least 1"):
+        trained("t3", pictures, out, steps=0)
     assert not out.exists()
 
 

@@ -15,7 +15,7 @@ from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
-from baselines.common.train_args import PAPER_EPOCHS, default_steps
+from baselines.common.train_args import PAPER_EPOCHS, TrainArgs, check_run, default_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.registry import PolicySpec, require_distinct
@@ -32,6 +32,25 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
     assert default_steps(num_demos, num_samples, batch_size) == steps
     epochs = steps / -(-num_samples // batch_size)
     assert epochs * num_demos == PAPER_EPOCHS
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (dict(num_demos=-1), "--num-demos -1 must be at least 1"),
+        (dict(batch_size=0), "--batch-size 0 must be at least 1"),
+        (dict(steps=0), "--total-iters 0 must be at least 1"),  # not the paper's number of steps
+        (dict(save_freq=0, eval_freq=5), "--save-freq 0 must be at least 1"),
+        (dict(keep=-2), "--keep -2 must be at least 1"),
+        (dict(eval_freq=0), "--eval-freq 0 must be at least 1"),
+        (dict(num_eval_envs=0), "--num-eval-envs 0 must be at least 1"),
+        (dict(log_freq=0), "--log-freq 0 must be at least 1"),
+        (dict(save_freq=4, eval_freq=6), "--eval-freq 6 must be a multiple of --save-freq 4"),
+    ],
+)
+def test_numbers_that_no_run_can_meet_are_refused(settings, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        check_run(TrainArgs((), **settings))
 
 
 def test_each_epoch_holds_every_sample_once():
