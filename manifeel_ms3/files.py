@@ -38,18 +38,37 @@ class FileWriteError(ManifeelError, OSError):
 
 
 @contextmanager
-def failures_named(path: Path) -> Iterator[None]:
+def failures_named(path: Path, inside: Path | None = None) -> Iterator[None]:
     """Turn a failure of the file system into an error that names the path that was to be written.
+
+    An error that already says what to do, which is a `ManifeelError`, stays as it is.
+
+    Args:
+        path: Path that was to be written.
+        inside: Path to which the context writes, if it also does other work, such as reading files. Errors that name another
+            path then stay as they are.
 
     Raises:
         FileWriteError: The context raised an `OSError`.
     """
     try:
         yield
+    except ManifeelError:
+        raise
     except OSError as error:
+        if inside and not _may_be_about(error, inside):
+            raise
         raise FileWriteError(
             f"{path} cannot be written ({error}); make room or get the permission, or give another path"
         ) from error
+
+
+def _may_be_about(error: OSError, path: Path) -> bool:
+    """Whether an error names a path or something in it, or names no path, as that of a full disk does."""
+    named = error.filename
+    if not isinstance(named, str | bytes | os.PathLike):
+        return True
+    return Path(os.fsdecode(named)).absolute().is_relative_to(path.absolute())
 
 
 @contextmanager
@@ -71,7 +90,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
         with failures_named(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             _delete_abandoned(path)
+        with failures_named(path, inside=partial):
             yield partial
+        with failures_named(path):
             flush(partial)
             partial.replace(path)
             flush(path.parent)
@@ -99,7 +120,9 @@ def atomic_folder(path: Path, replace: bool = False) -> Iterator[Path]:
         with failures_named(path):
             partial.mkdir(parents=True)
             _delete_abandoned(path)
+        with failures_named(path, inside=partial):
             yield partial
+        with failures_named(path):
             for entry in (*partial.rglob("*"), partial):
                 flush(entry)
             if replace and path.exists():

@@ -8,7 +8,7 @@ from pathlib import Path
 import platformdirs
 
 from .errors import MachineError
-from .files import atomic_write
+from .files import FileWriteError, atomic_write, failures_named
 
 CACHE_DIR = "MANIFEEL_CACHE_DIR"
 """Environment variable that names the folder of derived assets."""
@@ -57,11 +57,13 @@ def writable_cache() -> Iterator[Path]:
     """
     folder = cache_dir()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        yield folder
-    except OSError as error:
+        with failures_named(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        with failures_named(folder, inside=folder):
+            yield folder
+    except FileWriteError as error:
         raise MachineError(
-            f"derived files cannot be kept in {folder} ({error}); set {CACHE_DIR} to a folder that can be written"
+            f"derived files cannot be kept in {folder} ({error.__cause__}); set {CACHE_DIR} to a folder that can be written"
         ) from error
 
 

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.errors import InvalidFileError, ManifeelError
+from manifeel_ms3.errors import InvalidFileError, MachineError, ManifeelError, ServerError
 from manifeel_ms3.files import (
     MOST_UNPACKED,
+    FileWriteError,
     atomic_folder,
     atomic_write,
     read_json,
@@ -21,6 +22,7 @@ from manifeel_ms3.files import (
     write_json,
     write_text,
 )
+from manifeel_ms3.paths import derived_file
 from tests.trust.kills import forked
 
 SCHEMA = {"type": "object", "required": ["count"], "properties": {"count": {"type": "integer"}}}
@@ -53,6 +55,36 @@ def test_what_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ManifeelError, match=r"file/page.html cannot be written \(.*exists"):
         write_text(tmp_path / "file/page.html", "")
+
+
+@pytest.mark.parametrize("make", [atomic_write, atomic_folder])
+def test_only_what_is_about_the_output_is_said_of_it(tmp_path, make):
+    missing = tmp_path / "input.h5"
+
+    def fail_with(fail) -> None:
+        with make(tmp_path / "out") as partial:
+            fail(partial)
+
+    def reach_no_server(_partial: Path) -> None:
+        raise ServerError("no server answers; start it")
+
+    with pytest.raises(FileNotFoundError) as raised:
+        fail_with(lambda _partial: missing.read_bytes())
+    assert (raised.type, raised.value.filename) == (FileNotFoundError, str(missing))
+    with pytest.raises(ServerError, match=r"^no server answers; start it$"):
+        fail_with(reach_no_server)
+    with pytest.raises(FileWriteError, match="out cannot be written"):
+        fail_with(lambda partial: (partial / "folder/file").write_text(""))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_derived_file_whose_source_is_missing_is_no_matter_of_the_cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("MANIFEEL_CACHE_DIR", str(tmp_path))
+    with pytest.raises(FileNotFoundError, match=r"source\.stl"):
+        derived_file("mesh.obj", (tmp_path.parent / "source.stl").read_bytes)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MachineError, match=r"derived files cannot be kept in .*\(.*file.*\); set MANIFEEL_CACHE_DIR"):
+        derived_file("file/mesh.obj", lambda: "")
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         FileExistsAlreadyError: The folder exists and is not a submission, or results of another set-up have the place of new
             ones.
         ResultError: A result is broken.
+        CheckpointError: A checkpoint is missing or broken.
         FileWriteError: The folder cannot be written.
     """
     done = [job for job in jobs if job.kind == "evaluate" and job.settings["half_precision"] and is_done(job, root)]
@@ -104,8 +105,8 @@ def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
     hashes = {}
     for path in results:
         checkpoint = path.parent / CHECKPOINTS / path.stem
-        copied = _publish_result(path, checkpoint, folder)
-        hashes[copied.relative_to(folder).as_posix()] = checkpoint_sha256(checkpoint)
+        sha256 = checkpoint_sha256(checkpoint)
+        hashes[_publish_result(path, checkpoint, folder).relative_to(folder).as_posix()] = sha256
     return hashes
 
 
