@@ -17,6 +17,7 @@ import jsonschema
 import numpy as np
 
 from .errors import InvalidFileError, ManifeelError
+from .processes import process_exists
 
 PARTIAL = ".partial"
 """End of the name of a file or folder while it is written or deleted."""
@@ -335,23 +336,8 @@ def _delete_abandoned(path: Path) -> None:
     """Delete what earlier writers of a file or folder left when they were killed."""
     for old in path.parent.glob(f".{escape(path.name)}.*-*{PARTIAL}"):
         writer = old.name.removeprefix(f".{path.name}.").partition("-")[0]
-        if writer.isdigit() and not is_running(int(writer)):
+        if writer.isdigit() and not process_exists(int(writer)):
             _delete(old)
-
-
-def is_running(process: int) -> bool:
-    """Whether a process with a given number (PID) runs on this machine.
-
-    Args:
-        process: Number of the process.
-    """
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:  # the process belongs to another user
-        pass
-    return True
 
 
 def _not(path: Path, kind: str, reason: str) -> str:

@@ -16,7 +16,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from .errors import InUseError, MachineError
-from .files import is_running
+from .processes import process_exists
 
 
 @contextmanager
@@ -59,8 +59,8 @@ def _write_holder(path: Path) -> None:
 def _described(path: Path) -> str:
     try:
         holder = json.loads(path.read_text(encoding="utf-8"))
-        if holder["host"] != socket.gethostname() or is_running(holder["pid"]):
+        if holder["host"] != socket.gethostname() or process_exists(holder["pid"]):
             return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
-    except (OSError, ValueError, KeyError, TypeError, OverflowError):  # the other process has just begun, or has just ended
+    except (OSError, ValueError, KeyError, TypeError):  # the other process has just begun, or has just ended
         pass
     return "another process"

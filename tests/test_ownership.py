@@ -1,5 +1,6 @@
 """One process at a time owns a file; whoever comes second is told who does, and a killed process leaves nothing that blocks."""
 
+import os
 import subprocess
 import sys
 import time
@@ -8,6 +9,7 @@ import pytest
 
 from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.processes import process_exists
 
 HOLD = """
 import sys, time
@@ -55,3 +57,14 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(MachineError, match="file cannot be written"), owned(tmp_path / "file/inside.h5"):
         pass
+
+
+def test_a_process_exists_until_it_has_ended():
+    process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    assert process_exists(process.pid)
+    process.kill()
+    process.wait(PATIENCE)
+    assert not process_exists(process.pid)
+    assert process_exists(os.getpid())
+    assert process_exists(1)  # perhaps another user's
+    assert not any(map(process_exists, (0, -1, -os.getpgrp(), 10**30)))  # a damaged file of status may hold them

@@ -14,7 +14,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import psutil
 import tyro
 
 from baselines.common.checkpoint import save_in_half_precision, saved_checkpoints
@@ -29,6 +28,7 @@ from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
+from manifeel_ms3.processes import process_exists
 from manifeel_ms3.provenance import machine
 
 from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
@@ -52,7 +52,7 @@ def is_running(job: Job, root: Path) -> bool:
     if not started or is_done(job, root) or (folder / FAILED).is_file():
         return False
     host, process = started.get("host"), started.get("pid")
-    return isinstance(process, int) and (host != socket.gethostname() or psutil.pid_exists(process))
+    return isinstance(process, int) and (host != socket.gethostname() or process_exists(process))
 
 
 def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *needed: None) -> None:
