@@ -3,7 +3,10 @@
 import hashlib
 import json
 import os
+import re
 import shutil
+import socket
+import time
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -30,6 +33,9 @@ NOT_NPZ = (
     *(zipfile.BadZipFile, zlib.error),
 )
 """What numpy raises for a file that is no npz file, is damaged, or holds objects, which it would have to unpickle."""
+ABANDONED_AFTER = 24 * 3600
+"""Time in s after which what another machine has not finished writing counts as left by a process that was killed; set once,
+not tuned."""
 HASH_BLOCK = 2**20
 """Number of bytes that are read at a time for a hash; set once, not tuned."""
 
@@ -158,8 +164,13 @@ def _replaced(path: Path) -> Path:
 
 
 def _temporary(path: Path) -> Path:
-    """Path of a file or folder while it is written or deleted, which no other process uses."""
-    return path.with_name(f".{path.name}.{os.getpid()}-{uuid4().hex}{PARTIAL}")
+    """Path of a file or folder while it is written or deleted, which no other process on any machine uses."""
+    return path.with_name(f".{path.name}.{_this_machine()}-{os.getpid()}-{uuid4().hex[:8]}{PARTIAL}")
+
+
+def _this_machine() -> str:
+    """Name of this machine in the names of its temporary files."""
+    return re.sub(r"\W", "_", socket.gethostname())
 
 
 def write_text(path: Path, text: str) -> None:
@@ -310,7 +321,7 @@ def remove_folder(folder: Path) -> None:
     """
     if folder.exists():
         move(folder, _temporary(folder))
-    _delete_all(folder.parent, f".{folder.name}.*{PARTIAL}")
+    _delete_all(folder.parent, f".{escape(folder.name)}.*{PARTIAL}")
 
 
 def remove_leftovers(folder: Path) -> None:
@@ -334,10 +345,19 @@ def _delete(path: Path) -> None:
 
 def _delete_abandoned(path: Path) -> None:
     """Delete what earlier writers of a file or folder left when they were killed."""
-    for old in path.parent.glob(f".{escape(path.name)}.*-*{PARTIAL}"):
-        writer = old.name.removeprefix(f".{path.name}.").partition("-")[0]
-        if writer.isdigit() and not process_exists(int(writer)):
-            _delete(old)
+    for old in path.parent.glob(f".{escape(path.name)}.*{PARTIAL}"):
+        writer = re.fullmatch(r"(\w+)-(\d+)-\w+", old.name.removeprefix(f".{path.name}.").removesuffix(PARTIAL))
+        with suppress(FileNotFoundError):  # its writer ends at this moment
+            if writer and _was_abandoned(old, writer[1], int(writer[2])):
+                _delete(old)
+
+
+def _was_abandoned(partial: Path, machine: str, process: int) -> bool:
+    """Whether the process that wrote a temporary file or folder has ended, which shows only slowly on another machine."""
+    if machine == _this_machine():
+        return not process_exists(process)
+    written = max(path.lstat().st_mtime for path in (partial, *partial.rglob("*")))
+    return time.time() - written > ABANDONED_AFTER
 
 
 def _not(path: Path, kind: str, reason: str) -> str:

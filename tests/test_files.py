@@ -2,7 +2,10 @@
 
 import json
 import os
+import shutil
 import signal
+import socket
+import time
 import zipfile
 from pathlib import Path
 
@@ -11,6 +14,7 @@ import pytest
 
 from manifeel_ms3.errors import InvalidFileError, MachineError, ManifeelError, ServerError
 from manifeel_ms3.files import (
+    ABANDONED_AFTER,
     MOST_UNPACKED,
     FileWriteError,
     atomic_folder,
@@ -18,6 +22,7 @@ from manifeel_ms3.files import (
     read_json,
     read_json_lines,
     read_npz,
+    remove_folder,
     restore_folder,
     write_json,
     write_text,
@@ -125,6 +130,33 @@ def test_what_a_killed_writer_left_is_deleted_by_the_next(tmp_path, make, is_lin
     with make(tmp_path / "x") as partial:
         (partial / "whole" if partial.is_dir() else partial).write_text("whole")
     assert list(tmp_path.iterdir()) == [tmp_path / "x"]
+
+
+@pytest.mark.parametrize("make", [atomic_write, atomic_folder])
+def test_what_another_machine_writes_is_deleted_only_when_it_is_old(tmp_path, make, monkeypatch):
+    """The number of its process says nothing here."""
+    with monkeypatch.context() as there:
+        there.setattr(os, "getpid", lambda: 2**22 + 1)  # a number that no process has
+        there.setattr(socket, "gethostname", lambda: "another-machine.lab")
+        writer = make(tmp_path / "x")
+        partial = writer.__enter__()
+    half = partial / "file" if partial.is_dir() else partial
+    half.write_text("half")
+    old = time.time() - ABANDONED_AFTER - 60
+    for written, is_kept in ((old + 120, True), (old, False)):
+        os.utime(partial, (old, old))
+        os.utime(half, (written, written))
+        with make(tmp_path / "x") as own:
+            (own / "file" if own.is_dir() else own).write_text("whole")
+        assert half.exists() is is_kept
+        shutil.rmtree(tmp_path / "x") if make is atomic_folder else (tmp_path / "x").unlink()
+
+
+def test_the_next_removal_of_a_folder_completes_one_that_was_killed(tmp_path):
+    for name in ("x[1]", ".x[1].machine-123-abc.partial"):
+        (tmp_path / name).mkdir()
+    remove_folder(tmp_path / "x[1]")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_takes_the_place_of_another_only_where_it_may(tmp_path):
