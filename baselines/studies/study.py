@@ -3,16 +3,17 @@
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cache, cached_property
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
 from baselines.common.checkpoint import as_json
+from baselines.common.train_args import TrainArgs
 from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.command_line import PACKAGE
@@ -27,6 +28,18 @@ SIMULATING: tuple[Kind, ...] = ("record", "evaluate")
 """Kinds of jobs that simulate, in several processes at once."""
 OF_THE_MACHINE = ("device", "precision", "compile")
 """Settings of a preset that depend on the machine on which it is read."""
+OF_THE_STUDY = {
+    "env-id": "`tasks`",
+    "obs-mode": "`obs_modes`",
+    "cameras": "`cameras`",
+    "policy.encoder.tacrgb": "`encoders`",
+    "num-demos": "`num_demos`",
+    "seed": "`seeds`",
+    "keep": "`checkpoints`",
+    "demos": "`demos`",
+    "run-dir": "--root",
+}
+"""Flags of `manifeel train` that a study sets itself, and what it takes them from."""
 MOST_VALUES = 10_000
 """Largest number of values in a study's file with its aliases expanded; set once, not tuned."""
 TABLE = "table "
@@ -213,13 +226,45 @@ def _grid(entry: Any, place: str) -> Grid:
             task_spec(task)
         for policy in grid.policies:
             policy_spec(policy)
+        train = _train_flags(grid.train, f"{place}: train")
+        of_encoders = {
+            name: _train_flags(flags, f"{place}: encoder_flags/{name}") for name, flags in grid.encoder_flags.items()
+        }
     except UnknownNameError as error:
         raise StudyError(f"{place}: {error}") from error
     if unknown := set(grid.pretrain) - set(get_args(Representation)):
         raise StudyError(f"{place}: pretrain {sorted(unknown)} cannot be pretrained; choose from {get_args(Representation)}")
     if too_many := [count for count in grid.num_demos if count and count > max(recorded, default=0)]:
         raise StudyError(f"{place}: num_demos {too_many} are more than the {max(recorded)} recorded; raise `demos`")
-    return grid
+    return replace(grid, train=train, encoder_flags=of_encoders)
+
+
+def _train_flags(given: dict[str, Any], place: str) -> dict[str, Any]:
+    """Flags of `manifeel train` with one spelling each, so that the same run is the same job however its flags are written.
+
+    Raises:
+        StudyError: A flag is given twice, or is one that the study sets itself.
+    """
+    flags: dict[str, Any] = {}
+    for name, value in given.items():
+        spelt = name.replace("_", "-")
+        spelt = _short_names().get(spelt, spelt)
+        if spelt in OF_THE_STUDY:
+            raise StudyError(f"{place}: {name!r} is set by the study itself; leave it out, and use {OF_THE_STUDY[spelt]}")
+        if spelt in flags:
+            raise StudyError(f"{place}: {name!r} is given twice, since {spelt!r} is the same flag; leave one out")
+        flags[spelt] = value
+    return flags
+
+
+@cache
+def _short_names() -> dict[str, str]:
+    """Second names of the flags of `manifeel train` that have two, by the first."""
+    names = {}
+    for name, hint in get_type_hints(TrainArgs, include_extras=True).items():
+        for flag in getattr(hint, "__metadata__", ()):
+            names[(flag.name or name).replace("_", "-")] = flag.aliases[0].removeprefix("--")
+    return names
 
 
 def _section(kind: type, entry: Any, place: str) -> Any:

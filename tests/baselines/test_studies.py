@@ -86,6 +86,13 @@ def test_a_job_is_named_by_all_that_it_depends_on(study):
     assert [keys[kind] == other[kind] for kind in ("record", "train", "evaluate")] == [True, True, False]
 
 
+def test_a_run_is_the_same_job_however_its_flags_are_written(study):
+    keys = [job.key for job in jobs_of(read_study(study))]
+    for short, long in ((" {steps", " {total-iters"), ("save-every", "save_freq"), ("batch-size", "batch_size")):
+        study.write_text(TINY.replace(short, long))
+        assert [job.key for job in jobs_of(read_study(study))] == keys
+
+
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     study = read_study(path)
@@ -245,6 +252,20 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
             r"pretrain \['resnet18'\] cannot be pre",
         ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1]}]\nresources: {training: {}}", "'training'.* are not known"),
+        (
+            "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {seed: 5}}]",
+            "grids/0: train: 'seed' is set by the study itself; leave it out, and use `seeds`",
+        ),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {num_demos: 5}}]", "'num_demos' is set by .* use `num_demos`"),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {demo-path: x.h5}}]", "'demo-path' is set by .* use `demos`"),
+        (
+            "grids: [{tasks: [ManiFeel-PegInsertion-v1], encoder_flags: {t3: {obs-mode: rgb}}}]",
+            "encoder_flags/t3: 'obs-mode' is set by the study itself",
+        ),
+        (
+            "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {steps: 6, total-iters: 6}}]",
+            "'total-iters' is given twice, since 'steps' is the same flag",
+        ),
     ],
 )
 def test_what_is_wrong_with_a_study_is_said(study, content, word):
