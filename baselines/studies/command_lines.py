@@ -12,6 +12,8 @@ from .study import Job, Kind, Resources
 
 OBS_MODE = "rgb+tacrgb+tacff"
 """Observation mode of all recordings, which hold everything that any policy of a study observes."""
+STEP = "$step"
+"""Variable of the shell that holds the name of a checkpoint."""
 
 
 def trajectory_of(job: Job, root: Path) -> Path:
@@ -67,6 +69,11 @@ def train_flags(settings: dict[str, Any]) -> list[str]:
     return flags
 
 
+def half_precision_arguments(checkpoint: str, copy: str) -> list[str]:
+    """Arguments of `python -m baselines.studies.half_precision` for one checkpoint, whose copy is then evaluated."""
+    return [checkpoint, "--out", copy]
+
+
 def evaluate_arguments(job: Job, needs: Resources, checkpoint: str, out: str) -> list[str]:
     """Arguments of `manifeel eval` for one checkpoint of a job."""
     amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(needs.workers)]
@@ -94,9 +101,24 @@ def shell_command(job: Job, root: Path, needs: Resources) -> str:
         return shlex.join(["python", "-m", module, *pretrain_arguments(job, root, needs.gpus)])
     if job.kind == "train":
         return shlex.join(["manifeel", "train", job.settings["policy"], *train_arguments(job, root, needs.gpus)])
+    return _shell_evaluation(job, root, needs)
+
+
+def _shell_evaluation(job: Job, root: Path, needs: Resources) -> str:
+    """One line of shell that evaluates the last checkpoints of a training, in half precision if the job does so."""
     (train,) = job.needs
-    checkpoints = shlex.quote(str(train.folder(root) / CHECKPOINTS))
-    out = shlex.quote(str(job.folder(root)))
-    command = shlex.join(["manifeel", "eval", *evaluate_arguments(job, needs, "CHECKPOINT", "OUT")])
-    command = command.replace("CHECKPOINT", f"{checkpoints}/$step").replace("OUT", f"{out}/$step.json")
-    return f"for step in $(ls {checkpoints} | grep -x '[0-9]*' | tail -n {job.settings['checkpoints']}); do {command}; done"
+    trained, folder = train.folder(root) / CHECKPOINTS, job.folder(root)
+    checkpoint, command = str(trained / STEP), ""
+    if job.settings["half_precision"]:
+        copy = str(folder / CHECKPOINTS / STEP)
+        rounding = ["python", "-m", "baselines.studies.half_precision", *half_precision_arguments(checkpoint, copy)]
+        checkpoint, command = copy, f"{_joined(rounding)} && "
+    command += _joined(["manifeel", "eval", *evaluate_arguments(job, needs, checkpoint, str(folder / f"{STEP}.json"))])
+    steps = f"ls {shlex.quote(str(trained))} | grep -x '[0-9]*' | tail -n {job.settings['checkpoints']}"
+    return f"for step in $({steps}); do {command}; done"
+
+
+def _joined(arguments: list[str]) -> str:
+    """A command whose arguments are quoted, apart from the variable `STEP` of the shell in them."""
+    parts = ([shlex.quote(part) if part else "" for part in argument.split(STEP)] for argument in arguments)
+    return " ".join(STEP.join(quoted) for quoted in parts)

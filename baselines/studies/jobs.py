@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from baselines.common.checkpoint import save_in_half_precision, saved_checkpoints
+from baselines.common.checkpoint import saved_checkpoints
 from baselines.registry import policy_spec
 from baselines.tactile_representations import pretrain
 from manifeel_ms3.demonstrations import record
@@ -31,7 +31,15 @@ from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.processes import process_exists
 from manifeel_ms3.provenance import machine
 
-from .command_lines import evaluate_arguments, pretrain_arguments, record_arguments, training_args, trajectory_of
+from . import half_precision
+from .command_lines import (
+    evaluate_arguments,
+    half_precision_arguments,
+    pretrain_arguments,
+    record_arguments,
+    training_args,
+    trajectory_of,
+)
 from .study import SIMULATING, Job, Resources
 
 ONE_CORE = Resources()
@@ -132,7 +140,7 @@ def _evaluate(job: Job, root: Path, needs: Resources) -> int:
     settings, (train,) = job.settings, job.needs
     chosen = saved_checkpoints(train.folder(root) / CHECKPOINTS)[-settings["checkpoints"] :]
     if settings["half_precision"]:
-        chosen = [_rounded(checkpoint, job.folder(root) / CHECKPOINTS) for checkpoint in chosen]
+        chosen = [_rounded(checkpoint, job.folder(root) / CHECKPOINTS / checkpoint.name) for checkpoint in chosen]
     for checkpoint in chosen:
         out = job.folder(root) / f"{checkpoint.name}.json"
         if not is_result_of(checkpoint, out):
@@ -144,12 +152,9 @@ def _evaluate(job: Job, root: Path, needs: Resources) -> int:
     return len(chosen) * settings["episodes"]
 
 
-def _rounded(checkpoint: Path, folder: Path) -> Path:
-    """The copy of a checkpoint in half precision, which is made in a folder where it is missing."""
-    copy = folder / checkpoint.name
-    if not copy.is_dir():
-        save_in_half_precision(checkpoint, copy)
-    return copy
+def _rounded(checkpoint: Path, copy: Path) -> Path:
+    """The copy of a checkpoint in half precision, which is made where it is missing."""
+    return half_precision.main(tyro.cli(half_precision.Args, args=half_precision_arguments(str(checkpoint), str(copy))))
 
 
 def is_result_of(checkpoint: Path, path: Path) -> bool:

@@ -208,16 +208,36 @@ def test_the_printed_commands_do_the_same(study, tmp_path, capsys):
     training = tyro.cli(cli.command_module("train").Args, args=train[2:])
     assert training == training_args(jobs[1], tmp_path)
     assert training.demos == (recording.out,)
-    (tmp_path / "train" / jobs[1].key / "checkpoints/00000006").mkdir(parents=True)
-    (tmp_path / "train" / jobs[1].key / "checkpoints/last").mkdir()
-    shown = lines[2].replace("do manifeel", "do printf '%s\\n'")  # the words of each command, one a line
-    name, *words = subprocess.run(["bash", "-c", shown], capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+@pytest.mark.parametrize("half_precision", [False, True])
+def test_the_printed_evaluation_does_the_same(study, tmp_path, half_precision):
+    study.write_text(TINY.replace("half_precision: true", f"half_precision: {half_precision}"))
+    root = tmp_path / "root of a study"
+    *_, train, evaluate = jobs_of(read_study(study))
+    (root / "train" / train.key / "checkpoints/00000006").mkdir(parents=True)
+    (root / "train" / train.key / "checkpoints/last").mkdir()  # not a checkpoint of its own
+    printed = 'printf "%s\\n" "$#" "$@"'  # the words of each command, one a line
+    shown = f"manifeel() {{ {printed}; }}; python() {{ {printed}; }}; {shell_command(evaluate, root, Resources())}"
+    lines = subprocess.run(["bash", "-c", shown], capture_output=True, text=True, check=True).stdout.splitlines()
+    commands = []
+    while lines:
+        count = int(lines[0])
+        commands.append(lines[1 : 1 + count])
+        lines = lines[1 + count :]
+    *before, (name, *words) = commands
     assert name == "eval"
-    assert "eval" not in words  # one command: "last" is not a checkpoint of its own
+    checkpoint = trained = root / "train" / train.key / "checkpoints/00000006"
+    if half_precision:
+        ((*module, source, out, checkpoint),) = before
+        assert (module, source, out) == (["-m", "baselines.studies.half_precision"], str(trained), "--out")
+        assert Path(checkpoint) == root / "evaluate" / evaluate.key / "checkpoints/00000006"
+    else:
+        assert before == []
     evaluation = tyro.cli(cli.command_module("eval").Args, args=words)
     assert json.loads(evaluation.env_kwargs)["fit"] == "paper"
-    assert evaluation.out == tmp_path / "evaluate" / jobs[2].key / "00000006.json"
-    assert evaluation.checkpoint == tmp_path / "train" / jobs[1].key / "checkpoints/00000006"
+    assert evaluation.out == root / "evaluate" / evaluate.key / "00000006.json"
+    assert evaluation.checkpoint == Path(checkpoint)
 
 
 @pytest.mark.parametrize(
