@@ -11,6 +11,7 @@ import os
 import secrets
 import sys
 import time
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -32,9 +33,9 @@ from manifeel_ms3.network import LOOPBACK
 
 from . import cost
 from .command_lines import shell_command
-from .jobs import FAILED, STARTED, is_done, is_running, perform_in, read_status, restore_child_signals
+from .jobs import FAILED, STARTED, Status, is_done, perform_in, read_status, restore_child_signals, status_of
 from .publish import publish
-from .study import KINDS, Job, Kind, Study, jobs_of, read_study
+from .study import KINDS, Job, Kind, Resources, Study, jobs_of, read_study
 
 log = logging.getLogger(__name__)
 RETRIES = 3
@@ -257,29 +258,37 @@ def _reason(job: Job, root: Path, errors: dict[str, str]) -> str:
 
 
 def progress(study: Study, jobs: list[Job], root: Path) -> Group:
-    """A table with the numbers of jobs by their status, and one of the jobs that are running."""
-    running = [job for job in jobs if is_running(job, root)]
+    """A table with the numbers of jobs by their status, and one of the jobs that are running.
+
+    Every status and every cost is read once, because the table is made anew every few seconds while jobs run.
+    """
+    statuses: dict[str, Status] = {job.key: status_of(job, root) for job in jobs}
+    runs = cost.seconds_of_runs(root)
     counts = Table("job", "done", "running", "failed", "all", "CPU hours left")
     kinds: list[Kind] = [kind for kind in KINDS if any(job.kind == kind for job in jobs)]
     for kind in kinds:
-        counts.add_row(kind, *_counts(study, kind, jobs, running, root))
+        counts.add_row(kind, *_counts([job for job in jobs if job.kind == kind], statuses, runs, study.resources[kind]))
     names = Table("running", "for, min")
-    for job in running[:SHOWN]:
+    for job in [job for job in jobs if statuses[job.key] == "running"][:SHOWN]:
         since = time.time() - (job.folder(root) / STARTED).stat().st_mtime
         names.add_row(f"{job.kind}: {job.title}", f"{since / 60:.1f}")
     return Group(counts, names)
 
 
-def _counts(study: Study, kind: Kind, jobs: list[Job], running: list[Job], root: Path) -> list[str]:
-    """A row of the table of progress."""
-    of_kind = [job for job in jobs if job.kind == kind]
-    left = [job for job in of_kind if not is_done(job, root)]
-    failed = [job for job in of_kind if (job.folder(root) / FAILED).is_file()]
-    now = [job for job in running if job.kind == kind]
-    needs = study.resources[kind]
-    costs = [cost.estimate(job, root, needs.workers, try_out=False) for job in left]
+def _counts(jobs: list[Job], statuses: dict[str, Status], runs: dict[str, float], needs: Resources) -> list[str]:
+    """A row of the table of progress.
+
+    Args:
+        jobs: The jobs of one kind.
+        statuses: Statuses of all jobs, by their keys.
+        runs: What jobs cost here (`cost.seconds_of_runs`).
+        needs: What the study gives each of the jobs.
+    """
+    of_kind = Counter(statuses[job.key] for job in jobs)
+    left = [job for job in jobs if statuses[job.key] != "done"]
+    costs = [cost.estimate_from_runs(job, runs, needs.workers) for job in left]
     hours = "?" if None in costs else f"{sum(one.seconds for one in costs if one) / 3600 * needs.cpus:.2f}"
-    return [*map(str, (len(of_kind) - len(left), len(now), len(failed), len(of_kind))), hours]
+    return [*map(str, (of_kind["done"], of_kind["running"], of_kind["failed"], len(jobs))), hours]
 
 
 def plan(study: Study, jobs: list[Job], root: Path) -> Table:

@@ -27,7 +27,7 @@ from manifeel_ms3.tasks.registry import task_spec
 
 from .command_lines import OBS_MODE, device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
-from .study import SIMULATING, Job
+from .study import KINDS, SIMULATING, Job, Kind
 
 TRIALS = "trials.json"
 """Name of the file of measured trials, in the folder of all jobs."""
@@ -101,35 +101,67 @@ def _torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def estimate(job: Job, root: Path, workers: int, try_out: bool = True, gpus: float = 0.0) -> CostEstimate | None:
-    """How long a job will take; None if that is not known.
+def estimate(job: Job, root: Path, workers: int, gpus: float = 0.0) -> CostEstimate | None:
+    """How long a job will take, from runs or else from trials; None for the pretraining of an encoder, which has no trials.
 
     Args:
         job: The job.
         root: Folder of all jobs.
         workers: Number of processes that simulate, or of threads that train.
-        try_out: Whether to run trials if no job like this one was done here. The pretraining of encoders has no trials.
         gpus: Number of GPUs that the study gives the job; trials run on the CPU without one, as the job does.
     """
-    parallel = workers if job.kind in SIMULATING else 1
-    took = [status["seconds"] / max(status["units"], 1) * status["parallel"] for status in _done(job, root)]
-    if took:
-        return CostEstimate(float(np.median(took)) * _units(job) / parallel, "runs here")
-    if not try_out or job.kind == "pretrain":
-        return None
-    return CostEstimate(_unit_seconds(job, root, workers, gpus) * _units(job) / parallel, "a trial")
+    known = estimate_from_runs(job, seconds_of_runs(root), workers)
+    if known or job.kind == "pretrain":
+        return known
+    return CostEstimate(_unit_seconds(job, root, workers, gpus) * _units(job) / _parallel(job, workers), "a trial")
 
 
-def _done(job: Job, root: Path) -> list[dict[str, Any]]:
-    """Status files of jobs that were done on a machine like this one and differ from `job` in amounts and seeds alone."""
-    here = machine()
-    found = [_status(path, path.stat().st_mtime) for path in root.glob(f"{job.kind}/*/{DONE}")]
-    return [status for status in found if status.get("machine") == here and _work(status["settings"]) == _work(job.settings)]
+def estimate_from_runs(job: Job, runs: dict[str, float], workers: int) -> CostEstimate | None:
+    """How long a job will take if jobs like it were done here; None if there were none.
+
+    Args:
+        job: The job.
+        runs: What `seconds_of_runs` gives.
+        workers: Number of processes that simulate.
+    """
+    seconds = runs.get(_work_key(job.kind, job.settings))
+    return None if seconds is None else CostEstimate(seconds * _units(job) / _parallel(job, workers), "runs here")
+
+
+def seconds_of_runs(root: Path) -> dict[str, float]:
+    """Median seconds of one demonstration, gradient step or episode with one process, by the work that was done.
+
+    Jobs count that were done on a machine like this one; those that differ in amounts and seeds alone are the same work.
+
+    Args:
+        root: Folder of all jobs.
+    """
+    here, seconds = machine(), dict[str, list[float]]()
+    for kind in KINDS:
+        for path in root.glob(f"{kind}/*/{DONE}"):
+            ran_on, work, took = _run(kind, path, path.stat().st_mtime)
+            if ran_on == here:
+                seconds.setdefault(work, []).append(took)
+    return {work: float(np.median(took)) for work, took in seconds.items()}
 
 
 @cache
-def _status(path: Path, _changed: float) -> dict[str, Any]:
-    return read_status(path)
+def _run(kind: Kind, path: Path, _changed: float) -> tuple[Any, str, float]:
+    """Machine, work and seconds of a unit of a job that was done; no machine if its status file was cut off."""
+    status = read_status(path)
+    if "machine" not in status:
+        return None, "", 0.0
+    took = status["seconds"] / max(status["units"], 1) * status["parallel"]
+    return status["machine"], _work_key(kind, status["settings"]), took
+
+
+def _parallel(job: Job, workers: int) -> int:
+    """Number of processes that share the work of a job."""
+    return workers if job.kind in SIMULATING else 1
+
+
+def _work_key(kind: Kind, settings: dict[str, Any]) -> str:
+    return json.dumps([kind, _work(settings)], sort_keys=True)
 
 
 def _work(settings: dict[str, Any]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import traceback
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
@@ -44,6 +44,7 @@ from .study import SIMULATING, Job, Resources
 
 ONE_CORE = Resources()
 """What a job has that is run by hand."""
+Status = Literal["waiting", "running", "failed", "done"]
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
 """Names of the files in a job's folder that hold its status."""
 
@@ -53,14 +54,17 @@ def is_done(job: Job, root: Path) -> bool:
     return bool(read_status(job.folder(root) / DONE))
 
 
-def is_running(job: Job, root: Path) -> bool:
-    """Whether a worker has started a job and not ended it; a worker of this machine must also be alive."""
+def status_of(job: Job, root: Path) -> Status:
+    """What became of a job so far; it waits again if its worker on this machine is not alive."""
     folder = job.folder(root)
+    if is_done(job, root):
+        return "done"
+    if (folder / FAILED).is_file():
+        return "failed"
     started = read_status(folder / STARTED)
-    if not started or is_done(job, root) or (folder / FAILED).is_file():
-        return False
     host, process = started.get("host"), started.get("pid")
-    return isinstance(process, int) and (host != socket.gethostname() or process_exists(process))
+    is_alive = isinstance(process, int) and (host != socket.gethostname() or process_exists(process))
+    return "running" if is_alive else "waiting"
 
 
 def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *needed: None) -> None:

@@ -1,5 +1,7 @@
 """The cost of a study's jobs, from trials."""
 
+import json
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,8 +10,11 @@ import torch
 
 from baselines.diffusion_policy.policy import DiffusionPolicy
 from baselines.registry import all_policies
-from baselines.studies import cost
+from baselines.studies import __main__ as study_command
+from baselines.studies import cost, jobs
 from baselines.studies.study import jobs_of, read_study
+from manifeel_ms3.provenance import machine
+from tests.tiny_study import TINY
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -71,3 +76,34 @@ def test_trials_run_where_their_jobs_do(monkeypatch):
         assert trial.arguments[-4:] == ("--device", device, "--batch-size", batch)
         (training,) = cost.trials_of(evaluate.needs[0], gpus=gpus)
         assert training.arguments[2:4] == ("--device", device)
+
+
+@pytest.mark.parametrize("num_seeds", [10, 40])
+def test_a_table_of_progress_reads_each_job_once(num_seeds, tmp_path, monkeypatch):
+    """It is made every few seconds by the process that also hands out the jobs."""
+    path = tmp_path / "study.yaml"
+    path.write_text(TINY.replace("seeds: [0]", f"seeds: {list(range(num_seeds))}"))
+    study = read_study(path)
+    planned = jobs_of(study)
+    record, trained = planned[0], [job for job in planned if job.kind == "train"]
+    for job, seconds in [(record, 1.0), *((job, 36.0 + 3.6 * k) for k, job in enumerate(trained[:5]))]:
+        folder = job.folder(tmp_path)
+        folder.mkdir(parents=True)
+        done = dict(settings=job.settings, seconds=seconds, units=12, parallel=1, machine=machine())
+        (folder / jobs.DONE).write_text(json.dumps(done))
+    calls = Counter()
+    for module, name in ((jobs, "read_status"), (cost, "_work"), (cost, "_units")):
+        original = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *given, of=original, name=name: calls.update([name]) or of(*given))
+    columns = [list(column.cells) for column in study_command.progress(study, planned, tmp_path).renderables[0].columns]
+    assert columns[:5] == [
+        ["record", "train", "evaluate"],
+        ["1", "5", "0"],
+        ["0", "0", "0"],
+        ["0", "0", "0"],
+        ["1", str(num_seeds), str(num_seeds)],
+    ]
+    assert columns[5] == ["0.00", f"{0.012 * (num_seeds - 5):.2f}", "?"]  # the median of those that were done: 43.2 s
+    assert calls["read_status"] <= 2 * len(planned)
+    assert calls["_work"] <= len(planned) + 6
+    assert calls["_units"] <= len(planned)
