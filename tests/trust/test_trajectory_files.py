@@ -109,3 +109,20 @@ def test_a25_an_episode_of_an_index_is_checked_too(tmp_path, secret):
         open_trajectories(tmp_path / "trajectory.h5") as file,
     ):
         file["traj_0/actions"][()]
+
+
+@pytest.mark.parametrize("fault", [KeyError, TypeError, ValueError, RuntimeError, OSError, MemoryError])
+def test_a_fault_of_the_code_that_reads_is_not_said_of_the_file(fault):
+    def read(compute) -> None:
+        with open_trajectories(SAMPLE) as file:
+            compute(file["traj_0/actions"][()])
+            file["traj_0/knitting"][()]
+
+    def fail(_actions: np.ndarray) -> None:
+        raise fault("a fault of this program")
+
+    with pytest.raises(fault, match="a fault of this program") as raised:
+        read(fail)
+    assert raised.type is fault
+    with pytest.raises(DemonstrationError, match=r"cannot be read as a trajectory .*'knitting' doesn't exist"):
+        read(len)

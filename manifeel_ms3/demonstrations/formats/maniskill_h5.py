@@ -4,6 +4,7 @@ While a file is recorded, it is an index of links to the files of its episodes i
 like the finished file; `maniskill_h5_writing` has the two forms.
 """
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -84,7 +85,7 @@ def open_trajectories(path: Path) -> Iterator[Any]:
     """Open a trajectory file, to read from it within the context.
 
     Its structure is checked before anything is read, so that a file from anywhere can be opened (`h5_checks`). The h5py.File is
-    typed as Any, because h5py's types cannot tell groups from data sets.
+    typed as Any, because h5py's types cannot tell groups from data sets. What the context itself raises stays as it is.
 
     Raises:
         DemonstrationError: The file is truncated, is not HDF5, lacks what is read, names other files, or declares more numbers
@@ -98,9 +99,17 @@ def open_trajectories(path: Path) -> Iterator[Any]:
     except ManifeelError:
         raise
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError) as error:  # h5py raises all of these
+        if not _is_of_h5py(error):
+            raise
         raise DemonstrationError(
             f"{path} cannot be read as a trajectory ({error}); it is truncated or of another kind: copy or record it again"
         ) from error
+
+
+def _is_of_h5py(error: Exception) -> bool:
+    """Whether h5py raised an error, as it does for damaged files, and not the code that works with what it read."""
+    *_, (frame, _line) = traceback.walk_tb(error.__traceback__)
+    return frame.f_globals.get("__name__", "").partition(".")[0] == h5py.__name__
 
 
 def count_episodes(path: Path) -> int:
