@@ -42,8 +42,6 @@ from .command_lines import (
 )
 from .study import SIMULATING, Job, Resources
 
-ONE_CORE = Resources()
-"""What a job has that is run by hand."""
 Status = Literal["waiting", "running", "failed", "done"]
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
 """Names of the files in a job's folder that hold its status."""
@@ -74,7 +72,7 @@ def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *ne
     perform(job, root, needs, *needed)
 
 
-def perform(job: Job, root: Path, needs: Resources = ONE_CORE, *_needed: None) -> None:
+def perform(job: Job, root: Path, needs: Resources, *_needed: None) -> None:
     """Run a job unless it is done, and write down what it cost.
 
     Args:

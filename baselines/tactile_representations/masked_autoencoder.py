@@ -10,6 +10,8 @@ from .vit import EPS, POSITION_STD, Block
 WIDTH, DEPTH, HEADS = 256, 2, 8
 """Number of features, of layers and of attention heads of the decoder, which only pretraining needs; smaller than that of He et
 al. (2022), and not tuned."""
+MASKED = 0.75
+"""Share of the patches that is hidden, as in the paper."""
 VARIANCE_EPS = 1e-4
 """Number that is added to the variance of a patch before the division by it, so that uniform patches stay small; set once, not
 tuned."""
@@ -21,14 +23,13 @@ class MaskedAutoencoder(nn.Module):
     Args:
         representation: The transformer that is trained.
         size: Side of the images, pixels.
-        masked: Share of the patches that is hidden; 0.75 as in the paper.
     """
 
     mask_token: torch.Tensor
 
-    def __init__(self, representation: TokenRepresentation, size: int, masked: float = 0.75):
+    def __init__(self, representation: TokenRepresentation, size: int):
         super().__init__()
-        self.representation, self.masked = representation, masked
+        self.representation = representation
         patches = (size // representation.patch) ** 2
         self.narrow, self.mask_token = nn.Linear(representation.width, WIDTH), nn.Parameter(torch.zeros(1, 1, WIDTH))
         self.pos_embed = nn.Parameter(POSITION_STD * torch.randn(1, patches, WIDTH))
@@ -40,7 +41,7 @@ class MaskedAutoencoder(nn.Module):
         prepared = self.representation.prepare(image)
         tokens = self.representation.embed(prepared)
         order = torch.rand(tokens.shape[:2], device=image.device).argsort(1)
-        kept = order[:, : round((1 - self.masked) * tokens.shape[1])]
+        kept = order[:, : round((1 - MASKED) * tokens.shape[1])]
         seen = self.representation.encode(_pick(tokens, kept))[:, self.representation.leading :]
         predicted = self._decoded(seen, kept, tokens.shape[1])
         patch = self.representation.patch

@@ -113,15 +113,14 @@ def record_episode(
         return outcome, [Frame(observation_images(obs)) for obs in replayed(env, actions, seed)]
 
 
-def encode_video(frames: list[Frame], fps: int = CONTROL_FREQ) -> bytes:
-    """An MP4 file with the images of each step side by side.
+def encode_video(frames: list[Frame]) -> bytes:
+    """An MP4 file with the images of each step side by side, as fast as the steps are.
 
     Args:
         frames: Images of every step.
-        fps: Frames per second.
     """
     tiled = (np.concatenate([_tile(image) for image in frame.images.values()], axis=1) for frame in frames)
-    return encode_mp4(tiled, fps, BLOCK)
+    return encode_mp4(tiled, CONTROL_FREQ, BLOCK)
 
 
 def encode_mp4(images: Iterable[np.ndarray], fps: int, block: int) -> bytes:

@@ -171,13 +171,6 @@ class Press:
                 self.sensor.capture()
         self.sensor.capture()
 
-    def hold(self, seconds: float) -> None:
-        """Go on with the present load, sensing at the control rate."""
-        for step in range(round(seconds * self.env._sim_freq)):
-            self._step()
-            if (step + 1) % self.env._sim_steps_per_control == 0:
-                self.sensor.capture()
-
     def _step(self) -> None:
         normal, rows, cols, twist = self.load
         rotation = self.env.agent.gels["right"].pose.sp.to_transformation_matrix()[:3, :3]

@@ -1,7 +1,6 @@
 """Similarity of a sensor's images with those of the published calibration of the GelSight R1.5, read with interpolation."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -59,9 +58,9 @@ class PressedShapes:
 PRESSED = PressedShapes()
 
 
-def published_table(path: Path = CALIBRATION) -> np.ndarray:
+def published_table() -> np.ndarray:
     """The published table (3, bins, bins, 6) in Taxim's format; its slope bins beyond 1.2 rad are zero."""
-    with np.load(path) as stored:
+    with np.load(CALIBRATION) as stored:
         kept, bins = stored["coefficients"] * stored["scale"], int(stored["bins"])
     table = np.zeros((3, bins, *kept.shape[2:]))
     table[:, : kept.shape[1]] = kept

@@ -402,15 +402,15 @@ def test_what_fails_is_told_and_tried_again(study, tmp_path):
     (record.folder(root)).mkdir(parents=True)
     (record.folder(root) / "done.json").write_text(json.dumps(dict(settings=record.settings)))
     with pytest.raises(Exception, match=r"trajectory\.h5"):  # what it needs is said to be done, and is not there
-        perform(train, root)
+        perform(train, root, Resources())
     failed = json.loads((train.folder(root) / "failed.json").read_text())
     assert "trajectory.h5" in failed["error"]
     assert not is_done(train, root)
     assert "trajectory.h5" in study_command._reason(train, root, {})
     (record.folder(root) / "done.json").unlink()
-    perform(record, root)
+    perform(record, root, Resources())
     with pytest.raises(ValueError, match="nonsense"):
-        perform(train, root)
+        perform(train, root, Resources())
     assert json.loads((train.folder(root) / "started.json").read_text())["attempts"] == 2
 
 

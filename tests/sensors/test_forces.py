@@ -173,7 +173,7 @@ def test_held_shear_does_not_drift_and_unloading_dissipates(ball, figure):
         ball.push(8.0, shear, seconds=0.1)
         path.append(ball.field[..., 1].copy())
     held = ball.field.copy()
-    ball.hold(10.0)
+    ball.push(8.0, 4.0, seconds=10.0)
     figure("drift of a shear held for 10 s, share", np.abs(ball.field - held).max() / np.abs(held).max(), at_most=0.01)
     for shear in (3.0, 2.0, 1.0, 0.0):
         ball.push(8.0, shear, seconds=0.1)

@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 
 from baselines.studies import __main__ as study_command
 from baselines.studies.jobs import DONE, FAILED, STARTED, is_done, perform
-from baselines.studies.study import Job, StudyError, jobs_of, read_study
+from baselines.studies.study import Job, Resources, StudyError, jobs_of, read_study
 from manifeel_ms3.command_line import INTERRUPTED, PACKAGE
 from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.evaluation.result import read_result
@@ -47,7 +47,7 @@ def test_a04_a_result_counts_only_if_it_is_whole_and_of_this_checkpoint(tmp_path
 
     def again() -> float:
         (job.folder(tmp_path) / DONE).unlink(missing_ok=True)
-        perform(job, tmp_path)
+        perform(job, tmp_path, Resources())
         return read_result(out)["config"]["training_seconds"]
 
     again()
@@ -82,7 +82,7 @@ def test_a03_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
     assert all("a job that it needs is not done" in line for line in further)
     assert not (record.folder(tmp_path) / FAILED).exists()
     with owned(record.folder(tmp_path) / STARTED), pytest.raises(InUseError):
-        perform(record, tmp_path)
+        perform(record, tmp_path, Resources())
 
 
 def test_b05_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp_path):
