@@ -1,6 +1,5 @@
 """Evaluation of checkpoints in a separate process while training goes on."""
 
-import json
 import logging
 import os
 import subprocess
@@ -8,7 +7,7 @@ import sys
 from collections import deque
 from pathlib import Path
 
-from manifeel_ms3.evaluation.result import MEANS
+from manifeel_ms3.evaluation.result import MEANS, read_result
 
 log = logging.getLogger(__name__)
 RATES = ("success_once", "success_at_end", "fail_once", "fail_at_end", "gentle_success")
@@ -86,7 +85,7 @@ class BackgroundEvaluation:
         if code != 0:
             log.warning("the evaluation of %s failed; %s says why", checkpoint, path.with_suffix(".log"))
             return []
-        step, result = int(checkpoint.name), json.loads(path.read_text())
+        step, result = int(checkpoint.name), read_result(path)
         if (video := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
             video.replace(video.with_name(f"{step}.mp4"))  # the next evaluation records the same episode
         scalars: dict[str, float] = {name: result[name]["rate"] for name in RATES if name in result} | {

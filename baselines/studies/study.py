@@ -289,6 +289,8 @@ def _is_of(value: Any, annotation: Any) -> bool:
         return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
     if get_origin(annotation) is dict:
         return isinstance(value, dict) and all(isinstance(key, str) and _is_of(item, inner[1]) for key, item in value.items())
+    if isinstance(value, bool):  # which is an int, too
+        return annotation in (Any, bool)
     return annotation is Any or isinstance(value, int | float if annotation is float else annotation)
 
 

@@ -257,6 +257,8 @@ def test_the_printed_evaluation_does_the_same(study, tmp_path, half_precision):
         ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], num_demos: [900]}]", r"num_demos \[900\] are more than the 50 recorded"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seeds: 3}]", "`seeds` has the wrong type: 3"),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], demos: true}]", "`demos` has the wrong type: True"),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seeds: [false]}]", r"`seeds` has the wrong type: \[False\]"),
         ("grids: {tasks: table I}", "`grids` has the wrong type"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seed: 1}]", "'seed'.* are not known"),
         ("grids: [{seeds: [0]}]", "tasks"),
