@@ -9,12 +9,10 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import CONFIG, TRAINING_STATE, WEIGHTS, CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.result import published_config
 from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 
-WEIGHTS, TRAINING, CONFIG = "model.safetensors", "training.safetensors", "config.json"
-"""Files of a checkpoint: the policy's weights, the state of training, the settings."""
 LAST = "last"
 """Name of the link to the checkpoint from which training continues; it always leads to a complete one."""
 
@@ -34,7 +32,7 @@ def save_checkpoint(
         FileWriteError: The checkpoint cannot be written.
     """
     with atomic_folder(folder) as partial:
-        for name, tensors in ((WEIGHTS, weights), (TRAINING, training)):
+        for name, tensors in ((WEIGHTS, weights), (TRAINING_STATE, training)):
             write_tensors(partial / name, tensors)
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
@@ -106,7 +104,7 @@ def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
     last = (checkpoints / LAST).resolve()
     for folder in folders[:-1]:
         if folder.resolve() != last:
-            (folder / TRAINING).unlink(missing_ok=True)
+            (folder / TRAINING_STATE).unlink(missing_ok=True)
     for folder in folders[:-keep]:
         if folder not in in_use and folder.resolve() != last:
             remove_folder(folder)

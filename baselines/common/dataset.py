@@ -11,13 +11,12 @@ import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats import format_of
+from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
 from manifeel_ms3.progress import progress_bar
 
 from .observation import ObservationSpec, prepare
 
 Episode = dict[str, np.ndarray]
-SENSING = ("obs_mode", "cameras", "tactile_sensors", "sim_backend", "render_backend")
-"""Arguments of a recording that do not belong to the task: what was observed, and the machine's backends."""
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
@@ -74,7 +73,7 @@ def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
 
 
 def _of_task(recorded: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in recorded.items() if name not in SENSING}
+    return {name: value for name, value in recorded.items() if name not in (*SENSING, *BACKENDS)}
 
 
 class SequenceDataset:

@@ -16,7 +16,7 @@ from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
 from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
-from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
@@ -27,8 +27,6 @@ from .agent import spec_of
 from .background_evaluation import SUCCESS, BackgroundEvaluation
 from .checkpoint import (
     LAST,
-    TRAINING,
-    WEIGHTS,
     as_json,
     make_last,
     newest_checkpoint,
@@ -234,7 +232,7 @@ class Trainer:
         last = newest_checkpoint(self.checkpoints)
         saved = IMPLIED | checkpoint_config(last)
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
-        state = read_tensors(last / TRAINING)
+        state = read_tensors(last / TRAINING_STATE)
         self.order.load_state_dict(state)
         unpack(state, self.optimizer, self.policy, last, self.processes.rank)
         averaged = read_tensors(last / WEIGHTS)

@@ -9,7 +9,7 @@ from typing import Any
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.paper import DP, training_demos
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
+from manifeel_ms3.evaluation.checkpoint_config import published_hash
 from manifeel_ms3.evaluation.entries import ABOUT
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.files import atomic_folder, read_json, restore_folder, write_json
@@ -105,7 +105,7 @@ def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
     hashes = {}
     for path in results:
         checkpoint = path.parent / CHECKPOINTS / path.stem
-        sha256 = checkpoint_sha256(checkpoint)
+        sha256 = published_hash(checkpoint)
         hashes[_publish_result(path, checkpoint, folder).relative_to(folder).as_posix()] = sha256
     return hashes
 

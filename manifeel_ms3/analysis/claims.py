@@ -101,15 +101,16 @@ def _verdict(comparison: Comparison, gap: Estimate, best: float) -> Verdict:
     return "holds" if gap.high < MARGIN and best >= NEAR_NO_SUCCESS else "undecided"
 
 
-def claims_page(found: Found) -> str:
+def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> str:
     """Markdown: a table with a row for each comparison, those that were not run included, and the ranking of encoders.
 
     A sentence says how many comparisons the table tests, and which p-values are corrected for their number.
 
     Args:
         found: The results that enter comparisons.
+        answered: What `results_of_claims` makes of them.
     """
-    rows, answered = [], results_of_claims(found)
+    rows = []
     for comparison, outcomes in answered.items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
         ran = [(one.difference.signed, p_text(one.p_value), p_text(one.p_holm), one.verdict, one.settings) for one in outcomes]
@@ -158,11 +159,12 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
     found = of_the_protocol(collected)
     for condition in set(collected) - set(found):
         log.warning("%s is left out: %s", condition, collected[condition].why_left_out)
-    text = claims_page(found)
+    answered = results_of_claims(found)
+    text = claims_page(found, answered)
     log.info("%s", text)
     if args.out:
         write_text(args.out, text)
-    return results_of_claims(found)
+    return answered
 
 
 def next_step(args: Args, _answers: dict[Comparison, list[ClaimResult]]) -> str:

@@ -97,12 +97,6 @@ TWIN_DEMOS = {"GearAssembly": 80, "BulbInstallation": 20, "BallSorting": 80, "Ba
 """Number of training episodes in the paper's simulated twin of its real set-ups, by task."""
 TWIN_VARIANTS = {"BulbInstallation": YAW}
 """Arguments of the twin's tasks: gear has 6-D actions, the bulb 5-D, sorting 7-D."""
-REAL_AND_SIMULATED: dict[str, dict[str, tuple[float | None, float | None]]] = {
-    "GearAssembly": {VISION: (0.33, None), TACFF: (0.47, None)},
-    "BulbInstallation": {TACFF: (0.73, 0.81)},
-    "BallSorting": {VISION: (0.33, 0.70), TACRGB: (0.80, 0.85)},
-}
-"""Success on the real robot (15 episodes each) and in its simulated twin, as far as the text on its figure gives numbers."""
 SIMILARITY = {
     "tacrgb": {"ball": (5.67, 0.0579), "bulb": (5.80, 0.0646), "gear": (6.57, 0.0744)},
     "tacff": {"ball": (2.96, 0.0277), "bulb": (3.54, 0.0323), "gear": (2.91, 0.0254)},

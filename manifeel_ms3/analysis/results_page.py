@@ -24,12 +24,13 @@ from manifeel_ms3.tasks.registry import all_tasks
 
 from .answers import answers
 from .census import census_table
-from .claims import claims_page
+from .claims import claims_page, results_of_claims
 from .condition import Condition, condition_of
 from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
+from .matching import Found
 from .paper_beside import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
 from .presets import training_settings_of
@@ -40,6 +41,8 @@ from .success_curves import DPI, PANEL, write_curves
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
 SECONDS_PER_HOUR = 3600
+IMAGES = "images"
+"""Name of the folder beside the page that holds its figures."""
 LEGEND_SIZE = 7
 """Size of the letters in the legend of the losses, in points."""
 HEAD = """# Results
@@ -118,6 +121,20 @@ class Args:
     """Path of the Markdown page; its figures and their table go into the folder images beside it."""
 
 
+@dataclass(frozen=True)
+class Figures:
+    """Paths of the page's figures, relative to the page; None where there is nothing to draw."""
+
+    loss: Path | None
+    """Loss over gradient steps."""
+    success: Path | None
+    """Success in the course of training, beside its csv file."""
+    sensing: Path | None
+    """Success by task and sensing."""
+    gentle: Path | None
+    """Success against the contact force allowed."""
+
+
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
@@ -128,22 +145,25 @@ def main(args: Args) -> Path:
     """
     by_file = results_by_file(*args.results)
     results = list(by_file.values())
-    files = _links(by_file, args.out.parent)
+    collected = collect(results)
+    figures = _draw(args, results, of_the_protocol(collected))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
-    figure = args.out.parent / f"images/{args.out.stem}.png"
-    has_figure = training_curves(args.results, figure) or figure.is_file()
-    loss = figure.relative_to(args.out.parent) if has_figure else None
-    success = figure.with_name(f"{args.out.stem}_success.png")
-    has_curves = write_curves(results, success, success.with_suffix(".csv"))
-    curves = success.relative_to(args.out.parent) if has_curves else None
-    bars = figure.with_name(f"{args.out.stem}_sensing.png")
-    has_bars = draw_sensing_by_task(of_the_protocol(collect(results)), bars)
-    chart = bars.relative_to(args.out.parent) if has_bars else None
-    forces = figure.with_name(f"{args.out.stem}_gentle.png")
-    has_forces = draw_success_under_force(of_the_protocol(collect(results)), forces)
-    gentle = forces.relative_to(args.out.parent) if has_forces else None
-    write_text(args.out, "".join(page(results, loss, similarities, curves, files, chart, gentle)))
+    write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities)))
     return args.out
+
+
+def _draw(args: Args, results: list[dict[str, Any]], found: Found) -> Figures:
+    """Draw the figures of the page, those for which there are results."""
+    folder, stem = args.out.parent / IMAGES, args.out.stem
+    loss, success = folder / f"{stem}.png", folder / f"{stem}_success.png"
+    sensing, gentle = folder / f"{stem}_sensing.png", folder / f"{stem}_gentle.png"
+    drawn = {
+        loss: training_curves(args.results, loss) or loss.is_file(),
+        success: write_curves(results, success, success.with_suffix(".csv")),
+        sensing: draw_sensing_by_task(found, sensing),
+        gentle: draw_success_under_force(found, gentle),
+    }
+    return Figures(*(figure.relative_to(args.out.parent) if is_there else None for figure, is_there in drawn.items()))
 
 
 def _links(by_file: Mapping[Path, dict[str, Any]], folder: Path) -> Files:
@@ -195,44 +215,37 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
 
 def page(
     results: list[dict[str, Any]],
-    loss: Path | None = None,
-    similarities: Sequence[Path] = (),
-    success: Path | None = None,
-    files: Files | None = None,
-    chart: Path | None = None,
-    gentle: Path | None = None,
+    collected: dict[Condition, ConditionResults],
+    files: Files,
+    figures: Figures,
+    similarities: Sequence[Path],
 ) -> Iterator[str]:
     """The Markdown page, part by part.
 
     Args:
         results: Contents of result files.
-        loss: Path of the figure with the loss in training, relative to the page; no figure if not given.
+        collected: The same results by condition.
+        files: Links to the result files of conditions.
+        figures: Paths of the figures.
         similarities: Files that `manifeel similarity` wrote.
-        success: Path of the figure with success in the course of training, beside its csv file; no figure if not given.
-        files: Links to the result files of conditions; no links if not given.
-        chart: Path of the figure with success by task and sensing; no figure if not given.
-        gentle: Path of the figure with success against the contact force allowed; no figure if not given.
     """
-    collected = collect(results)
     found = of_the_protocol(collected)
-    files = files or {}
     yield HEAD.format(last=LAST)
-    if chart:
-        yield CHART.format(figure=chart)
+    if figures.sensing:
+        yield CHART.format(figure=figures.sensing)
     yield from tables_of_the_paper(found, files)
     yield from answers(found, results)
-    if gentle:
-        yield GENTLE.format(figure=gentle)
+    if figures.gentle:
+        yield GENTLE.format(figure=figures.gentle)
     yield "\n## What was run\n\n"
     yield _table_of_conditions(collected, results, files)
-    if files:
-        yield AGAIN
+    yield AGAIN
     if len(found) < len(collected):
         yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
-    if success:
-        yield CURVES.format(figure=success, table=success.with_suffix(".csv"))
-    if loss:
-        yield f"\n![Loss in training over gradient steps]({loss})\n"
+    if figures.success:
+        yield CURVES.format(figure=figures.success, table=figures.success.with_suffix(".csv"))
+    if figures.loss:
+        yield f"\n![Loss in training over gradient steps]({figures.loss})\n"
     if rows := list(_gains_over_references(found)):
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
@@ -241,15 +254,18 @@ def page(
     yield census_table(results, [condition for condition, _ in _sorted(found)])
     yield rank_table(found)
     yield f"{CLAIMS}\n"
-    yield claims_page(found)
+    yield claims_page(found, results_of_claims(found))
     yield runtime_table(results)
     yield similarity_table(similarities)
 
 
 def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Files) -> str:
     rows = []
+    of_condition: dict[Condition, list[dict[str, Any]]] = {}
+    for result in results:
+        of_condition.setdefault(condition_of(result), []).append(result)
     for condition, here in _sorted(found):
-        cost, machines = _cost([result for result in results if condition_of(result) == condition])
+        cost, machines = _cost(of_condition[condition])
         note = f"left out: {here.why_left_out}" if here.why_left_out else None
         success = success_with_links(here, files.get(condition, ())), _percent(here.success_at_end)
         measured = (

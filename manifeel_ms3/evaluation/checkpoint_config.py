@@ -8,12 +8,12 @@ from typing import Any
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import file_hash
 
+WEIGHTS, CONFIG = "model.safetensors", "config.json"
+"""Files of a checkpoint that a policy is loaded from: its weights and its settings."""
 TRAINING_STATE = "training.safetensors"
-"""File that only training reads; it is deleted from older checkpoints, and the hash leaves it out."""
+"""File of a checkpoint that only training reads; it is deleted from older checkpoints, and hashes leave it out."""
 TRAINING_LOSS = "losses/total_loss"
 """Name of the training loss in log.jsonl, the log beside the checkpoints."""
-HASHED = ("model.safetensors", "config.json")
-"""Files of a checkpoint from whose contents, one after the other, its published hash is computed."""
 
 IMPLIED = {"num_processes": 1}
 """Settings that configurations of older versions lack, with the values that they count as having."""
@@ -29,10 +29,10 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: There is no config.json, or it is broken.
     """
-    path = Path(checkpoint) / "config.json"
+    path = Path(checkpoint) / CONFIG
     if not path.is_file():
         raise CheckpointError(
-            f"{checkpoint} is not a checkpoint: it has no config.json; give a folder like runs/<name>/checkpoints/last"
+            f"{checkpoint} is not a checkpoint: it has no {CONFIG}; give a folder like runs/<name>/checkpoints/last"
         )
     try:
         config = json.loads(path.read_text(encoding="utf-8"))
@@ -58,7 +58,7 @@ def samples_per_step(config: dict[str, Any]) -> int | None:
     return of_each * processes if isinstance(of_each, int) and isinstance(processes, int) else None
 
 
-def checkpoint_hash(checkpoint: Path) -> str:
+def hash_of_all_files(checkpoint: Path) -> str:
     """SHA-256 over the names and contents of all files that a policy is loaded from.
 
     Raises:
@@ -73,13 +73,13 @@ def checkpoint_hash(checkpoint: Path) -> str:
     return digest.hexdigest()
 
 
-def checkpoint_sha256(checkpoint: Path) -> str:
+def published_hash(checkpoint: Path) -> str:
     """The published hash of a checkpoint, which `cat model.safetensors config.json | sha256sum` prints, too.
 
     Raises:
         CheckpointError: One of the two files is missing, or cannot be read.
     """
     try:
-        return file_hash(*(checkpoint / name for name in HASHED))
+        return file_hash(checkpoint / WEIGHTS, checkpoint / CONFIG)
     except OSError as error:
-        raise CheckpointError(f"{checkpoint} cannot be hashed ({error}); give a folder with {' and '.join(HASHED)}") from error
+        raise CheckpointError(f"{checkpoint} cannot be hashed ({error}); give a folder with {WEIGHTS} and {CONFIG}") from error

@@ -14,7 +14,7 @@ from manifeel_ms3.files import read_json
 from manifeel_ms3.paths import CHECKPOINTS, leaderboard_dir
 
 from .agreement import differences
-from .checkpoint_config import checkpoint_sha256
+from .checkpoint_config import published_hash
 from .result import read_result
 from .rollout import EpisodeOutcome
 
@@ -78,7 +78,7 @@ def find_entry(name: str) -> Entry:
     path = checkpoint.parents[1] / f"{checkpoint.name}.json"
     submission = board / Path(name).parts[0]
     named = _checkpoints_of(submission / ABOUT).get(path.relative_to(submission).as_posix())
-    if named != (found := checkpoint_sha256(checkpoint)):
+    if named != (found := published_hash(checkpoint)):
         raise InvalidFileError(
             f"{checkpoint} has the hash {found}, but {submission / ABOUT} names {named}: the checkpoint was changed; get it "
             "anew from the repository"

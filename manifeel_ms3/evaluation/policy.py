@@ -16,7 +16,7 @@ from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelErro
 from manifeel_ms3.files import file_hash
 from manifeel_ms3.typed_modules import look_in_working_folder
 
-from .checkpoint_config import CheckpointError, checkpoint_config, checkpoint_hash
+from .checkpoint_config import CheckpointError, checkpoint_config, hash_of_all_files
 from .redaction import redacted
 
 INFERENCE_STEPS = "inference_steps"
@@ -161,7 +161,7 @@ class PolicySource:
     def fingerprint(self) -> str | None:
         """SHA-256 of the checkpoint, or of the file with the class; None for a server, and where no such file is found."""
         if self.checkpoint is not None:
-            return checkpoint_hash(self.checkpoint)
+            return hash_of_all_files(self.checkpoint)
         if self.is_server:
             return None
         look_in_working_folder()

@@ -21,7 +21,7 @@ from scipy.stats import hypergeom
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.agreement import differences
-from manifeel_ms3.evaluation.checkpoint_config import HASHED, checkpoint_config, checkpoint_sha256
+from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS, checkpoint_config, published_hash
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
@@ -87,10 +87,10 @@ def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
     """
     found = {}
     for folder in folders:
-        here = [folder] if (folder / HASHED[1]).is_file() else sorted(path.parent for path in folder.rglob(HASHED[0]))
+        here = [folder] if (folder / CONFIG).is_file() else sorted(path.parent for path in folder.rglob(WEIGHTS))
         if not here:
             raise InvalidArgumentError(f"--checkpoint {folder} is no checkpoint and holds none; give runs/x/checkpoints")
-        found.update({checkpoint_sha256(checkpoint): checkpoint for checkpoint in here})
+        found.update({published_hash(checkpoint): checkpoint for checkpoint in here})
     return found
 
 

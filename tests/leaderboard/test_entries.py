@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
+from manifeel_ms3.evaluation.checkpoint_config import published_hash
 from manifeel_ms3.evaluation.entries import find_entry
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.checks import check
@@ -74,7 +74,7 @@ def test_an_entry_is_run_again_with_its_number_of_generation_steps(tmp_path, mon
     bare = json.dumps(dict(render_backend="none", max_episode_steps=6))
     result = run / "00000001.json"
     evaluate.main(evaluate.Args(checkpoint, inference_steps=2, episodes=2, env_kwargs=bare, out=result))
-    about = dict(name="Tiny", authors="Us", checkpoints={"Peg/tacff/seed0/00000001.json": checkpoint_sha256(checkpoint)})
+    about = dict(name="Tiny", authors="Us", checkpoints={"Peg/tacff/seed0/00000001.json": published_hash(checkpoint)})
     (tmp_path / "leaderboard/tiny/submission.json").write_text(json.dumps(about))
     monkeypatch.chdir(tmp_path)
     again = evaluate.main(evaluate.Args(entry="tiny/Peg/tacff", episodes=2))

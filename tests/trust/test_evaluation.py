@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from manifeel_ms3.errors import InUseError, InvalidFileError, ManifeelError
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_hash
+from manifeel_ms3.evaluation.checkpoint_config import hash_of_all_files
 from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.journal import Journal, OtherEvaluationError
 from manifeel_ms3.evaluation.policy import PolicySource
@@ -198,11 +198,11 @@ def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp
 
 def test_a_policy_is_identified_by_its_files(tmp_path, monkeypatch):
     (tmp_path / "config.json").write_text("{}")
-    before = checkpoint_hash(tmp_path)
+    before = hash_of_all_files(tmp_path)
     (tmp_path / "training.safetensors").write_text("deleted from older checkpoints")
-    assert checkpoint_hash(tmp_path) == before
+    assert hash_of_all_files(tmp_path) == before
     (tmp_path / "model.safetensors").write_text("other weights")
-    assert checkpoint_hash(tmp_path) != before
+    assert hash_of_all_files(tmp_path) != before
     monkeypatch.syspath_prepend(tmp_path)
     hashes = set()
     for content in ("", "# changed"):

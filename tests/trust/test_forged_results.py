@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.analysis.protocol import collect
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_sha256
+from manifeel_ms3.evaluation.checkpoint_config import published_hash
 from manifeel_ms3.evaluation.result import ResultError, summary_of
 from manifeel_ms3.leaderboard.__main__ import Hash, Submit, main
 from manifeel_ms3.leaderboard.checks import check
@@ -137,13 +137,13 @@ def test_a16_results_are_of_the_checkpoints_that_the_submission_names(folder, tm
     main(Hash(folder, checkpoint=(runs / "0", runs / "1")))
     about = json.loads((folder / "submission.json").read_text())
     one = runs / "1/checkpoints/00000200"
-    assert about["checkpoints"]["results/1/00000200.json"] == checkpoint_sha256(one)
+    assert about["checkpoints"]["results/1/00000200.json"] == published_hash(one)
     (one / "model.safetensors").write_bytes(b"other weights")
     with pytest.raises(SubmissionError, match=r"results/1/00000200.json: no given checkpoint has the hash"):
         main(submit)
     rewrite_json(
         folder / "submission.json",
-        lambda about: about["checkpoints"].update({"results/1/00000200.json": checkpoint_sha256(one)}),
+        lambda about: about["checkpoints"].update({"results/1/00000200.json": published_hash(one)}),
     )
     rewrite_json(folder / "results/1/00000200.json", lambda result: result["config"].update(num_demos=10))
     with pytest.raises(SubmissionError, match=r"differ in \['num_demos'\]"):
