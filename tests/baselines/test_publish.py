@@ -8,7 +8,7 @@ import pytest
 from baselines.studies.publish import publish
 from baselines.studies.study import Job
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
-from manifeel_ms3.evaluation.checkpoint_config import HASHED
+from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS
 from manifeel_ms3.paths import CHECKPOINTS
 from tests.analysis.made_up import write_run
 
@@ -22,7 +22,7 @@ def finished(root: Path, title: str, **run) -> Job:
     checkpoint = folder / CHECKPOINTS / result.stem
     checkpoint.mkdir(parents=True)
     result.rename(folder / result.name)
-    for name in HASHED:
+    for name in (WEIGHTS, CONFIG):
         (checkpoint / name).write_text(title)
     (folder / "done.json").write_text(json.dumps(dict(settings=job.settings)))
     return job

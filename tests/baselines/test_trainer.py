@@ -10,7 +10,7 @@ import pytest
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 
-from baselines.common.checkpoint import TRAINING, prune
+from baselines.common.checkpoint import TRAINING_STATE, prune
 from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
@@ -131,10 +131,10 @@ def test_prune_keeps_the_newest_and_those_in_use(tmp_path):
     folders = [tmp_path / f"{step:08d}" for step in range(1, 6)]
     for folder in folders:
         folder.mkdir()
-        (folder / TRAINING).touch()
+        (folder / TRAINING_STATE).touch()
     prune(tmp_path, 2, {folders[0]})
     assert sorted(tmp_path.iterdir()) == [folders[0], *folders[3:]]
-    assert [folder for folder in folders if (folder / TRAINING).exists()] == folders[-1:]
+    assert [folder for folder in folders if (folder / TRAINING_STATE).exists()] == folders[-1:]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines.common.checkpoint import (
-    TRAINING,
+    TRAINING_STATE,
     WEIGHTS,
     make_last,
     newest_checkpoint,
@@ -50,7 +50,7 @@ def steps_on_board(run_dir: Path) -> list[int]:
 
 def require_equal(run_dir: Path, other: Path) -> None:
     """Weights, the state of training and the log are the same, and every step is logged once."""
-    for name in (WEIGHTS, TRAINING):
+    for name in (WEIGHTS, TRAINING_STATE):
         one, two = (read_tensors(folder / "checkpoints/last" / name) for folder in (run_dir, other))
         assert one.keys() == two.keys()
         assert all(torch.equal(one[key], two[key]) for key in one)

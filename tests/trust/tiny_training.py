@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from baselines.common.checkpoint import TRAINING, WEIGHTS, read_tensors
+from baselines.common.checkpoint import TRAINING_STATE, WEIGHTS, read_tensors
 from baselines.common.encoders import EncoderConfig
 from baselines.common.train_args import TrainArgs
 from baselines.diffusion_policy import train as diffusion
@@ -60,7 +60,7 @@ def finished(args: TrainArgs) -> float:
 def require_whole(checkpoint: Path) -> int:
     """Check that everything that evaluation and resuming need can be read, and return the step of the checkpoint."""
     assert read_tensors(checkpoint / WEIGHTS)
-    assert read_tensors(checkpoint / TRAINING)
+    assert read_tensors(checkpoint / TRAINING_STATE)
     step = checkpoint_config(checkpoint)["step"]
     assert checkpoint.resolve().name == f"{step:08d}"
     return step
