@@ -163,11 +163,13 @@ def task_rows() -> Iterator[Row]:
     for spec in paper_tasks():
         trained_on = f"{training_demos(spec.name)} used for training"
         theirs = f"{RECORDED[spec.name]} recorded, {trained_on}; {CAMERAS[spec.category]}; {ACTIONS.get(spec.name, 6)} numbers"
+        why = ""
         if used := USED_ACTIONS.get(spec.name):
             theirs += f" in the data, {used} in the experiments"
+            why = WHY_WITH_GRIPPER
         size = len(ACTION_AXES[spec.env_class.default_control_mode])
         ours = f"{spec.paper_demos} recorded, {trained_on}; {spec.policy_camera}; {size} numbers"
-        yield _row(spec.name, theirs, "", ours, WHY_WITH_GRIPPER)
+        yield _row(spec.name, theirs, "", ours, why)
 
 
 def limit_rows() -> Iterator[Row]:

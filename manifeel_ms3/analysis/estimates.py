@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest
 
 from manifeel_ms3.evaluation.result import ResultError
 from manifeel_ms3.evaluation.statistics import wilson_interval
@@ -111,6 +110,8 @@ def has_enough_seeds(*conditions: ConditionResults) -> bool:
 
 def _mcnemar(first: np.ndarray, second: np.ndarray) -> float:
     """P-value of McNemar's exact test of paired outcomes, 0 or 1 (episodes)."""
+    from scipy.stats import binomtest  # takes a third of a second, needed only where two single runs are compared
+
     better, worse = int((first > second).sum()), int((first < second).sum())
     return float(binomtest(better, better + worse).pvalue) if better + worse else 1.0
 
