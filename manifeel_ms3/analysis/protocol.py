@@ -1,8 +1,8 @@
 """The paper's protocol: success is the mean over the last ten checkpoints, all episodes and training seeds of a condition."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ FEWEST_EPISODES = 50
 """Number of episodes of the paper's protocol. A result with fewer has another purpose, and enters no comparison."""
 FEWEST_STEPS = 2000
 """Number of gradient steps of the shortest preset. A run with fewer has another purpose, and enters no comparison."""
+Run = TypeVar("Run")
 Outcomes = dict[int, dict[str, Any]]
 """Episodes of a result file, by their seeds."""
 
@@ -97,6 +98,11 @@ def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Conditi
     }
 
 
+def in_order_of_seeds(runs: Mapping[int | None, Run]) -> list[Run]:
+    """What runs are known by their training seeds, in the order of the seeds; one without a seed comes first."""
+    return [runs[seed] for seed in sorted(runs, key=lambda seed: -1 if seed is None else seed)]
+
+
 def of_the_protocol(found: dict[Condition, ConditionResults]) -> dict[Condition, ConditionResults]:
     """The conditions that enter comparisons: those with enough episodes whose training is over, and was no short trial."""
     return {condition: results for condition, results in found.items() if not results.why_left_out}
@@ -106,7 +112,7 @@ def _stacked(
     condition: Condition, by_seed: dict[int | None, dict[int, Outcomes]], last: int, planned: int | None
 ) -> ConditionResults:
     checkpoints = min(last, *(len(steps) for steps in by_seed.values()))
-    evaluated = [[steps[step] for step in sorted(steps)[-checkpoints:]] for steps in by_seed.values()]
+    evaluated = [[steps[step] for step in sorted(steps)[-checkpoints:]] for steps in in_order_of_seeds(by_seed)]
     seeds = sorted(evaluated[0][0])
     for outcomes in (outcomes for run in evaluated for outcomes in run):
         if sorted(outcomes) != seeds:

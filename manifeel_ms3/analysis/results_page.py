@@ -34,7 +34,7 @@ from .matching import Found
 from .paper_beside import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
 from .presets import training_settings_of
-from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, of_the_protocol
+from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
 from .success_curves import DPI, PANEL, write_curves
 
@@ -173,7 +173,7 @@ def _links(by_file: Mapping[Path, dict[str, Any]], folder: Path) -> Files:
         runs, seed = last.setdefault(condition_of(result), {}), result["training_seed"]
         here = (result["config"].get("step", 0), os.path.relpath(path, folder))
         runs[seed] = max(here, runs.get(seed, here))
-    return {condition: [link for _, link in runs.values()] for condition, runs in last.items()}
+    return {condition: [link for _, link in in_order_of_seeds(runs)] for condition, runs in last.items()}
 
 
 def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
