@@ -14,6 +14,7 @@ from manifeel_ms3.demonstrations.formats import format_of
 from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
 from manifeel_ms3.progress import progress_bar
 
+from .memory import return_freed_memory
 from .observation import ObservationSpec, prepare
 
 Episode = dict[str, np.ndarray]
@@ -45,9 +46,13 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
             if left == 0:
                 break
             track = partial(bar.track, description=f"reading {file.name}")
-            for episode in known.read(file, spec.keys, num=left, progress=track, env_id=env_id):
-                episodes.append({key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"]))
+            recorded = known.read(file, spec.keys, num=left, progress=track, env_id=env_id)
+            episodes.extend(map(partial(_prepared, spec), recorded))  # unlike a loop, `map` holds no episode while it reads
     return episodes
+
+
+def _prepared(spec: ObservationSpec, episode: Episode) -> Episode:
+    return {key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"])
 
 
 def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
@@ -85,7 +90,7 @@ class SequenceDataset:
     action_horizon + 1 samples. An episode that is shorter than `action_horizon` has one sample.
 
     Args:
-        episodes: Episodes from `read_episodes`.
+        episodes: Episodes from `read_episodes`. The list is emptied, so that an episode leaves the memory once it is copied.
         spec: Observations of the policy.
         obs_horizon: Number of observations of a sample.
         pred_horizon: Number of actions of a sample.
@@ -104,9 +109,8 @@ class SequenceDataset:
     ):
         self.spec, self.device, self.num_episodes = spec, device, len(episodes)
         lengths = np.array([len(episode["actions"]) for episode in episodes])
-        self.actions = self._load([episode["actions"] for episode in episodes])  # (S, A)
-        # no action follows the last observation, so it is left out and frames and actions share an index
-        self.observations = {key: self._load([episode[key][:-1] for episode in episodes]) for key in spec.keys}
+        self.observations = {name: torch.as_tensor(a, device=device) for name, a in _joined(episodes, spec.keys).items()}
+        self.actions = self.observations.pop("actions")  # (S, A)
         ends = np.cumsum(lengths)
         starts = ends - lengths
         samples = np.maximum(lengths - action_horizon + 1, 1)  # of each episode
@@ -117,9 +121,6 @@ class SequenceDataset:
         begin = step[:, None] - obs_horizon + 1
         self._obs_index = torch.as_tensor(np.clip(begin + np.arange(obs_horizon), first, last), device=device)
         self._action_index = torch.as_tensor(np.clip(begin + np.arange(pred_horizon), first, last), device=device)
-
-    def _load(self, parts: list[np.ndarray]) -> torch.Tensor:
-        return torch.as_tensor(np.concatenate(parts), device=self.device)
 
     def names(self, index: torch.Tensor) -> str:
         """The episodes and steps of samples, for messages."""
@@ -133,6 +134,26 @@ class SequenceDataset:
         """The observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) of the samples `index` (B,)."""
         obs_index = self._obs_index[index]
         return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]
+
+
+def _joined(episodes: list[Episode], keys: list[str]) -> Episode:
+    """The "actions" and the observations `keys` (S, ...) at the steps of all episodes, one episode after the other.
+
+    No action follows the last observation of an episode, so it is left out and observations and actions share an index.
+    """
+    steps = sum(len(episode["actions"]) for episode in episodes)
+    forms = {name: (episodes[0][name].shape[1:], episodes[0][name].dtype) for name in ("actions", *keys)}
+    joined = {name: np.empty((steps, *shape), dtype) for name, (shape, dtype) in forms.items()}
+    begin = 0
+    while episodes:
+        episode = episodes.pop(0)
+        end = begin + len(episode["actions"])
+        for name, values in joined.items():
+            np.concatenate([episode[name][: end - begin]], out=values[begin:end])  # an assignment would broadcast other shapes
+        begin = end
+        del episode
+        return_freed_memory()
+    return joined
 
 
 class SampleOrder:

@@ -25,6 +25,16 @@ def keep_freed_memory(device: torch.device | str) -> None:
         mallopt(M_TRIM_THRESHOLD, -1)
 
 
+def return_freed_memory() -> None:
+    """Give the memory that this process has freed back to the system, on Linux with glibc.
+
+    By default glibc keeps small and middle-sized blocks that are freed, except at the end of the process's memory.
+    """
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim:
+        trim(0)
+
+
 def lay_out_channels_last(module: nn.Module) -> None:
     """Store the weights of two-dimensional convolutions channels last, which is faster.
 

@@ -141,7 +141,7 @@ def work_square(images: np.ndarray, camera: str) -> np.ndarray:
 def prepare_images(images: np.ndarray, size: int) -> np.ndarray:
     """Images (T, H, W, 3) resized to squares of `size` pixels."""
     if images.shape[1:3] == (size, size):
-        return images
+        return np.ascontiguousarray(images)  # a part of larger images would keep them in memory
     return np.stack([cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA) for image in images])
 
 

@@ -19,7 +19,7 @@ from manifeel_ms3.progress import progress_bar
 from .formats import FORMATS
 from .formats.demonstration_format import Progress
 from .formats.lerobot_writing import write_lerobot
-from .formats.maniskill_h5 import DemonstrationError, each_demonstration, observation_keys
+from .formats.maniskill_h5 import DemonstrationError, observation_keys, read_trajectories
 
 Format = Literal["lerobot", "zarr", "npz"]
 
@@ -45,7 +45,7 @@ def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
     Observations have their keys as names, with "." for "/".
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for i, episode in enumerate(each_demonstration(path, observation_keys(path), progress)):
+    for i, episode in enumerate(read_trajectories(path, observation_keys(path), progress=progress)):
         arrays: dict[str, Any] = {key.replace("/", "."): values for key, values in episode.items()}
         np.savez_compressed(folder / f"episode_{i:05d}.npz", **arrays)
 

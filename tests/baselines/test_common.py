@@ -1,5 +1,6 @@
 """Shared pieces of the baselines."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +82,29 @@ def test_number_of_demonstrations(demos):
         read_episodes([demos], PEG, SPEC, 9)
 
 
+def test_one_episode_at_its_recorded_size_is_in_memory():
+    spec = observation_spec("rgb", ("wrist",), (), 32)
+    recorded = read_demonstrations(observed_sample(PEG), spec.keys)
+    largest = max(episode[spec.images[0]].nbytes for episode in recorded)
+    del recorded
+    tracemalloc.start()
+    episodes = read_episodes([observed_sample(PEG)], PEG, spec, None)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    prepared = sum(values.nbytes for episode in episodes for values in episode.values())
+    assert peak < 1.2 * (largest + prepared)
+    SequenceDataset(episodes, spec, **HORIZONS, device=CPU)
+    assert episodes == []
+
+
 def test_lerobot_datasets_are_read_beside_files(demos):
     pytest.importorskip("pyarrow")
     folder = Path(__file__).parents[1] / "demonstrations/lerobot/images"
     episodes = read_episodes([folder, demos], PEG, SPEC, None)
     assert [len(episode["actions"]) for episode in episodes[:2]] == [4, 3]
     steps = [len(episode["actions"]) for episode in episodes]
-    assert len(SequenceDataset(episodes, SPEC, 2, 16, 1, CPU)) == sum(steps)
     assert episodes[0][POSE].shape == (5, 7)
+    assert len(SequenceDataset(episodes, SPEC, 2, 16, 1, CPU)) == sum(steps)
 
 
 def test_the_papers_pose_has_one_sign_for_each_rotation():

@@ -48,7 +48,7 @@ def test_what_can_be_exported_is_found():
 
 def test_lerobot(tmp_path):
     folder = exported("lerobot", tmp_path)
-    require_same(lerobot.read_lerobot(folder, KEYS, 2), last_is_repeated=True)
+    require_same(list(lerobot.read_lerobot(folder, KEYS, 2)), last_is_repeated=True)
     stats = json.loads((folder / "meta/stats.json").read_text())
     poses = np.concatenate([episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS)])
     assert np.allclose(stats["observation.state"]["mean"], poses.mean(0), atol=1e-6)
@@ -61,7 +61,7 @@ def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):
     folder = exported("lerobot", tmp_path)
     assert recorded_env_kwargs([folder]) == recorded_env_kwargs([SAMPLE])
     with pytest.raises(DemonstrationError, match="of ManiFeel-PegInsertion-v1, not of ManiFeel-BallSorting-v1"):
-        lerobot.read_lerobot(folder, KEYS, env_id="ManiFeel-BallSorting-v1")
+        list(lerobot.read_lerobot(folder, KEYS, env_id="ManiFeel-BallSorting-v1"))
     origin = folder / "meta/manifeel.json"
     origin.write_text(json.dumps(dict(env_id=PEG, env_kwargs=dict(fit="tight"))))
     with pytest.raises(DemonstrationError, match=r"with fit='tight'.*train on files"):
@@ -138,7 +138,7 @@ def test_zarr_of_the_papers_layout(tmp_path):
     assert {path.name for path in (folder / "data").iterdir() if path.is_dir()} == {
         *("wrist", "tactile_force_field_right", "state", "action")
     }
-    require_same(diffusion_policy_zarr.read_zarr(folder, KEYS, 2), last_is_repeated=True)
+    require_same(list(diffusion_policy_zarr.read_zarr(folder, KEYS, 2)), last_is_repeated=True)
 
 
 def test_images_of_touch_lie_as_in_the_papers_data():
@@ -181,7 +181,7 @@ def test_what_is_there_or_broken_is_said(tmp_path):
     with pytest.raises(DemonstrationError, match="exists already"):
         export.main(export.Args(SAMPLE, "zarr", folder))
     with pytest.raises(DemonstrationError, match=r"lacks \['front'\]; it holds \['action'"):
-        diffusion_policy_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1)
+        list(diffusion_policy_zarr.read_zarr(folder, ["sensor_data/front/rgb"], 1))
     for file in (folder / "meta").rglob("*"):
         if file.is_file():
             file.unlink()
@@ -196,6 +196,6 @@ def test_formats_are_told_apart_by_what_lies_there(tmp_path):
         known = format_of(exported(kind, tmp_path))
         assert known.name == kind
         assert known.count(tmp_path / kind) == 2
-        assert len(known.read(tmp_path / kind, KEYS)) == 2
+        assert len(list(known.read(tmp_path / kind, KEYS))) == 2
     with pytest.raises(DemonstrationError, match=r"no known format; known are \['lerobot', 'zarr', 'maniskill'\]"):
         format_of(tmp_path)

@@ -61,13 +61,13 @@ def test_a_video_file_is_decoded_once(monkeypatch):
     opened = []
     get_reader = imageio.get_reader
     monkeypatch.setattr(imageio, "get_reader", lambda path: opened.append(path) or get_reader(path))
-    assert len(read_lerobot(DATASETS / "videos", KEYS[:1], 2)) == 2
+    assert len(list(read_lerobot(DATASETS / "videos", KEYS[:1], 2))) == 2
     assert len(opened) == len(set(opened)) == 1
 
 
 def test_progress_is_reported_and_fewer_can_be_read():
     seen = []
-    assert len(read_lerobot(DATASETS / "images", KEYS, 1, lambda indices: seen.append(len(indices)) or indices)) == 1
+    assert len(list(read_lerobot(DATASETS / "images", KEYS, 1, lambda indices: seen.append(len(indices)) or indices))) == 1
     assert seen == [1]
 
 
@@ -79,14 +79,14 @@ def copy(tmp_path):
 
 def test_what_is_missing_or_broken_is_named(copy):
     with pytest.raises(DemonstrationError, match=r"lacks \['observation.images.front'\]; it holds .*wrist"):
-        read_lerobot(copy, ["sensor_data/front/rgb"], 1)
+        list(read_lerobot(copy, ["sensor_data/front/rgb"], 1))
     info = json.loads((copy / "meta/info.json").read_text())
     (copy / "data/chunk-000/file-000.parquet").write_bytes(b"PAR1 no more")
     with pytest.raises(DemonstrationError, match="data cannot be read"):
-        read_lerobot(copy, KEYS, 1)
+        list(read_lerobot(copy, KEYS, 1))
     (copy / "meta/info.json").write_text(json.dumps(info | dict(codebase_version="v2.1")))
     with pytest.raises(DemonstrationError, match="convert_dataset_v21_to_v30"):
-        read_lerobot(copy, KEYS, 1)
+        list(read_lerobot(copy, KEYS, 1))
     (copy / "meta/info.json").write_text("{")
     with pytest.raises(DemonstrationError, match=r"info\.json is not the description of a LeRobot dataset"):
-        read_lerobot(copy, KEYS, 1)
+        list(read_lerobot(copy, KEYS, 1))

@@ -37,7 +37,8 @@ def papers_store(store, tmp_path) -> Path:
 def read(folder: Path, env_id: str | None = None) -> np.ndarray:
     from manifeel_ms3.demonstrations.formats import format_of
 
-    return format_of(folder).read(folder, [FIELD], num=1, env_id=env_id)[0][FIELD]
+    (episode,) = format_of(folder).read(folder, [FIELD], num=1, env_id=env_id)
+    return episode[FIELD]
 
 
 def test_the_store_names_its_task_its_arguments_and_its_units(store):

@@ -47,7 +47,7 @@ INFOS = {
 @pytest.mark.parametrize("kind", INFOS)
 def test_a29_a_broken_description_of_a_lerobot_dataset_is_refused(kind, images):
     (images / "meta/info.json").write_bytes(INFOS[kind])
-    for read in (lerobot.count_episodes, lambda folder: lerobot.read_lerobot(folder, KEYS)):
+    for read in (lerobot.count_episodes, lambda folder: list(lerobot.read_lerobot(folder, KEYS))):
         with pytest.raises(DemonstrationError, match=r"info\.json"):
             read(images)
 
@@ -55,7 +55,7 @@ def test_a29_a_broken_description_of_a_lerobot_dataset_is_refused(kind, images):
 def test_a29_more_episodes_than_there_are_is_refused(images):
     rewrite_json(images / "meta/info.json", lambda info: info.update(total_episodes=9))
     with pytest.raises(DemonstrationError, match="holds 2 episodes, 9 are wanted"):
-        lerobot.read_lerobot(images, KEYS)
+        list(lerobot.read_lerobot(images, KEYS))
 
 
 @pytest.mark.parametrize(
@@ -65,14 +65,14 @@ def test_a29_more_episodes_than_there_are_is_refused(images):
 def test_b7_a_video_path_is_compared_and_never_filled_in(video_path, videos):
     rewrite_json(videos / "meta/info.json", lambda info: info.update(video_path=video_path))
     with pytest.raises(DemonstrationError, match="video_path"):
-        lerobot.read_lerobot(videos, KEYS)
+        list(lerobot.read_lerobot(videos, KEYS))
 
 
 def test_b7_a_playlist_named_mp4_is_not_given_to_ffmpeg(videos, secret):
     (path,) = videos.rglob("*.mp4")
     path.write_text(f"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nfile://{secret}\n#EXT-X-ENDLIST\n")
     with pytest.raises(DemonstrationError, match="not an mp4 file"):
-        lerobot.read_lerobot(videos, KEYS)
+        list(lerobot.read_lerobot(videos, KEYS))
 
 
 @pytest.mark.parametrize("name", ["meta/info.json", "data/chunk-000/file-000.parquet", "data", "extra"])
@@ -84,13 +84,13 @@ def test_b7_links_out_of_a_lerobot_dataset_are_refused(name, images, tmp_path):
         away.mkdir()
     (images / name).symlink_to(away)
     with pytest.raises(DemonstrationError, match="is a link out of"):
-        lerobot.read_lerobot(images, KEYS)
+        list(lerobot.read_lerobot(images, KEYS))
 
 
 def test_b7_a_pipe_in_a_dataset_is_refused_and_not_waited_for(images):
     os.mkfifo(images / "data/chunk-000/file-001.parquet")
     with pytest.raises(DemonstrationError, match="is no plain file"):
-        lerobot.read_lerobot(images, KEYS)
+        list(lerobot.read_lerobot(images, KEYS))
 
 
 @pytest.mark.parametrize("name", ["../elsewhere/trajectory.h5", "/etc/passwd", "link/trajectory.h5"])
@@ -144,7 +144,7 @@ def test_b1_an_array_that_could_run_code_or_fill_memory_is_refused(name, change,
         if chunk.is_file():
             chunk.write_bytes(pickle.dumps(Gadget()))
     with pytest.raises(DemonstrationError):
-        diffusion_policy_zarr.read_zarr(store, KEYS)
+        list(diffusion_policy_zarr.read_zarr(store, KEYS))
     if not name.endswith("wrist"):
         with pytest.raises(DemonstrationError):
             diffusion_policy_zarr.count_episodes(store)
@@ -156,7 +156,7 @@ def test_b1_consolidated_metadata_do_not_stand_in_for_what_was_checked(store, tm
     about = {str(path.relative_to(store)): json.loads(path.read_text()) for path in store.rglob(".z*")}
     about["data/action/.zarray"] |= {"dtype": "|O", "filters": [{"id": "pickle"}]}
     (store / ".zmetadata").write_text(json.dumps({"zarr_consolidated_format": 1, "metadata": about}))
-    assert len(diffusion_policy_zarr.read_zarr(store, KEYS)) == 2
+    assert len(list(diffusion_policy_zarr.read_zarr(store, KEYS))) == 2
     assert not (tmp_path / "executed").exists()
 
 
@@ -166,7 +166,7 @@ def test_a29_ends_of_episodes_rise_within_the_steps(ends, store):
 
     shutil.rmtree(store / "meta/episode_ends")
     zarr.open_group(str(store), mode="r+").create_array("meta/episode_ends", data=np.array(ends))
-    for read in (diffusion_policy_zarr.count_episodes, lambda folder: diffusion_policy_zarr.read_zarr(folder, KEYS)):
+    for read in (diffusion_policy_zarr.count_episodes, lambda folder: list(diffusion_policy_zarr.read_zarr(folder, KEYS))):
         with pytest.raises(DemonstrationError, match="must be rising whole numbers"):
             read(store)
 
@@ -174,9 +174,9 @@ def test_a29_ends_of_episodes_rise_within_the_steps(ends, store):
 @pytest.mark.parametrize("wanted", [-1, 0, 3])
 def test_a29_as_many_episodes_as_there_are_can_be_read(wanted, store, images):
     with pytest.raises(DemonstrationError, match="episodes"):
-        diffusion_policy_zarr.read_zarr(store, KEYS, wanted)
+        list(diffusion_policy_zarr.read_zarr(store, KEYS, wanted))
     with pytest.raises(DemonstrationError, match="episodes"):
-        lerobot.read_lerobot(images, KEYS, wanted)
+        list(lerobot.read_lerobot(images, KEYS, wanted))
 
 
 @pytest.mark.parametrize("name", ["data/action/0.0", "data/wrist", "meta"])
@@ -184,15 +184,15 @@ def test_links_out_of_a_store_are_refused(name, store, tmp_path):
     (store / name).rename(tmp_path / "away")
     (store / name).symlink_to(tmp_path / "away")
     with pytest.raises(DemonstrationError, match="is a link out of"):
-        diffusion_policy_zarr.read_zarr(store, KEYS)
+        list(diffusion_policy_zarr.read_zarr(store, KEYS))
 
 
 def test_readers_raise_errors_of_this_package_for_folders_and_missing_files(tmp_path):
     for read in (
         lambda: read_demonstrations(tmp_path / "no.h5", KEYS),
         lambda: read_demonstrations(tmp_path, KEYS),
-        lambda: diffusion_policy_zarr.read_zarr(tmp_path, KEYS),
-        lambda: lerobot.read_lerobot(tmp_path, KEYS),
+        lambda: list(diffusion_policy_zarr.read_zarr(tmp_path, KEYS)),
+        lambda: list(lerobot.read_lerobot(tmp_path, KEYS)),
         lambda: read_tensors(tmp_path),
         lambda: validate(tmp_path),
     ):

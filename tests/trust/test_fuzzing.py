@@ -26,7 +26,7 @@ from baselines.tactile_representations.released_weights import read_released
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.demonstrations.dataset import write_manifest
 from manifeel_ms3.demonstrations.formats import diffusion_policy_zarr, lerobot
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import each_demonstration, observation_keys
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, read_trajectories
 from manifeel_ms3.demonstrations.summary import summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.demonstrations.view import read_streams
@@ -191,18 +191,18 @@ def made_checkpoint(folder: Path) -> Path:
 
 def read_trajectory(path: Path) -> None:
     for read in (lambda: read_demonstrations(path, KEYS), lambda: summary(path), lambda: read_streams(path, 0),
-                 lambda: list(each_demonstration(path, observation_keys(path)))):  # fmt: skip
+                 lambda: list(read_trajectories(path, observation_keys(path)))):  # fmt: skip
         refused_or_read(read)
 
 
 def read_zarr(path: Path) -> None:
     refused_or_read(lambda: diffusion_policy_zarr.count_episodes(path))
-    diffusion_policy_zarr.read_zarr(path, KEYS)
+    list(diffusion_policy_zarr.read_zarr(path, KEYS))
 
 
 def read_lerobot(path: Path) -> None:
     refused_or_read(lambda: lerobot.count_episodes(path))
-    lerobot.read_lerobot(path, KEYS)
+    list(lerobot.read_lerobot(path, KEYS))
 
 
 def made_answer(folder: Path) -> Path:

@@ -1,6 +1,6 @@
 """What this package needs to know of a format in which demonstrations are stored."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -27,8 +27,8 @@ class ReadEpisodes(Protocol):
 
     def __call__(
         self, path: Path, keys: list[str], /, *, num: int | None = None, progress: Progress = iter, env_id: str | None = None
-    ) -> list[Episode]:
-        """The first episodes of a file or folder.
+    ) -> Iterator[Episode]:
+        """The first episodes of a file or folder, each of which is read when it is asked for.
 
         Args:
             path: File or folder.

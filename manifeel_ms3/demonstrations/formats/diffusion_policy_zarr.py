@@ -8,6 +8,7 @@ The paper's stores say nothing of their task. Their force fields hold penetratio
 that are written here name the task and its arguments, the units among them, in the attributes of the root group.
 """
 
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
-from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
-from .maniskill_h5 import each_demonstration, observation_keys, read_header, task_of
+from .demonstration_format import DemonstrationError, DemonstrationFormat, Episode, Progress
+from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
 from .own_files import broken_if_fails, read_origin, require_task
 from .zarr_arrays import open_arrays
 
@@ -96,8 +97,8 @@ def count_episodes(folder: Path) -> int:
 
 def read_zarr(
     folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
-) -> list[dict[str, np.ndarray]]:
-    """The first episodes of a store, as `read_demonstrations` returns them.
+) -> Iterator[Episode]:
+    """The first episodes of a store, as `read_demonstrations` returns them, one at a time.
 
     The store does not hold the observation after the last action: the last observation stands there a second time.
 
@@ -126,7 +127,6 @@ def read_zarr(
     count = len(ends) if num is None else num
     if not 0 < count <= len(ends):
         raise DemonstrationError(f"{folder} holds {len(ends)} episodes, {count} are wanted; ask for fewer")
-    episodes = []
     for i in progress(range(count)):
         part = slice(ends[i - 1] if i else 0, ends[i])
         with broken_if_fails(folder, f"episode {i}"):
@@ -134,8 +134,8 @@ def read_zarr(
             for key in (key for key in keys if key.endswith("/force_field")):
                 _require_units(folder, episode[key], i)
             episode = {key: np.concatenate([values, values[-1:]]) for key, values in episode.items()}
-            episodes.append(episode | dict(actions=np.asarray(arrays[ACTION][part], np.float32)))
-    return episodes
+            episode["actions"] = np.asarray(arrays[ACTION][part], np.float32)
+        yield episode
 
 
 def _ends(folder: Path, arrays: dict[str, Any]) -> list[int]:
@@ -177,7 +177,7 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
     keys, arrays, ends = observation_keys(path), {}, []
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
     store.attrs.update(_about(path))
-    for episode in each_demonstration(path, keys, progress):
+    for episode in read_trajectories(path, keys, progress=progress):
         length = len(episode["actions"])
         parts = {array_name(key): _to_paper(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
         for name, values in parts.items():

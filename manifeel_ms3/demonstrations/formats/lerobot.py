@@ -25,7 +25,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 
-from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Progress
+from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Episode, Progress
 from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
 from .own_files import broken_if_fails, read_origin, require_task, stored_bytes
@@ -112,8 +112,8 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 def read_lerobot(
     folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
-) -> list[dict[str, np.ndarray]]:
-    """The first episodes of a dataset, as `read_demonstrations` returns them.
+) -> Iterator[Episode]:
+    """The first episodes of a dataset, as `read_demonstrations` returns them, one at a time.
 
     LeRobot does not hold the observation after the last action: the last observation stands there a second time.
 
@@ -141,7 +141,6 @@ def read_lerobot(
     count = info["total_episodes"] if num is None else num
     if not 0 < count <= len(entries):
         raise DemonstrationError(f"{folder} holds {len(entries)} episodes, {count} are wanted; ask for fewer")
-    episodes = []
     for i in progress(range(count)):
         first, length = entries[i]["dataset_from_index"], entries[i]["length"]
         if not (first >= 0 and 0 < length <= data.num_rows - first):
@@ -153,8 +152,7 @@ def read_lerobot(
         for key, name in names.items():
             values = videos[name].frames(entries[i]) if name in videos else _values(folder, info, name, rows)
             episode[key] = np.concatenate([values, values[-1:]])
-        episodes.append(episode | dict(actions=_numbers(folder, info, "action", rows)))
-    return episodes
+        yield episode | dict(actions=_numbers(folder, info, "action", rows))
 
 
 def _names(key: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
 from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
-from .maniskill_h5 import each_demonstration, observation_keys, read_header, task_of
+from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
 
 FILES_PER_CHUNK = 1000
 """Number of files in a folder, lerobot's default."""
@@ -52,7 +52,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     header, keys = read_header(path), observation_keys(path)
     writer, entries, start = _Features(header, videos), [], 0
     task = _instruction(header)
-    for e, episode in enumerate(each_demonstration(path, keys, progress, outcomes=tuple(OUTCOMES))):
+    for e, episode in enumerate(read_trajectories(path, keys, progress=progress, outcomes=tuple(OUTCOMES))):
         values = _features_of(episode, keys, e, start)
         writer.describe(values)
         place = dict(chunk_index=e // FILES_PER_CHUNK, file_index=e % FILES_PER_CHUNK)

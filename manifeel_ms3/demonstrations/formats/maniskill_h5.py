@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
 
-from .demonstration_format import DemonstrationError, DemonstrationFormat, Progress
+from .demonstration_format import DemonstrationError, DemonstrationFormat, Episode, Progress
 from .h5_checks import check_trajectories
 
 COUNT = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
@@ -119,8 +118,8 @@ def count_episodes(path: Path) -> int:
 
 def read_demonstrations(
     path: Path, keys: list[str], env_id: str | None = None, num: int | None = None, progress: Progress = iter
-) -> list[dict[str, np.ndarray]]:
-    """Arrays of the first episodes of a trajectory file: `actions` (T, A) and the observations `keys` (T + 1, ...).
+) -> list[Episode]:
+    """The first episodes of a trajectory file, all in memory: `actions` (T, A) and the observations `keys` (T + 1, ...).
 
     Args:
         path: Trajectory file.
@@ -128,6 +127,30 @@ def read_demonstrations(
         env_id: Id of the task that the file must be of; any task if not given.
         num: Number of episodes; all of them if not given.
         progress: Wraps the iteration over episodes, to show a progress bar.
+
+    Raises:
+        DemonstrationError: The file is missing, truncated or of another task, has fewer episodes, or lacks one of the keys.
+    """
+    return list(read_trajectories(path, keys, num=num, progress=progress, env_id=env_id))
+
+
+def read_trajectories(
+    path: Path,
+    keys: list[str],
+    num: int | None = None,
+    progress: Progress = iter,
+    env_id: str | None = None,
+    outcomes: tuple[str, ...] = (),
+) -> Iterator[Episode]:
+    """The episodes that `read_demonstrations` returns, one at a time, so that one of them is in memory.
+
+    Args:
+        path: Trajectory file.
+        keys: Observations to read.
+        num: Number of episodes; all of them if not given.
+        progress: Wraps the iteration over episodes, to show a progress bar.
+        env_id: Id of the task that the file must be of; any task if not given.
+        outcomes: Arrays (T,) of what followed the actions, such as "success", that are read where the file has them.
 
     Raises:
         DemonstrationError: The file is missing, truncated or of another task, has fewer episodes, or lacks one of the keys.
@@ -143,26 +166,8 @@ def read_demonstrations(
             f"{path} holds {len(header['episodes'])} episodes, {count} are wanted; record more, or ask for fewer"
         )
     with open_trajectories(path) as file:
-        return [_read_episode(file, i, keys, path, header) for i in progress(range(count))]
-
-
-def each_demonstration(
-    path: Path, keys: list[str], progress: Progress = iter, outcomes: tuple[str, ...] = ()
-) -> Iterator[dict[str, np.ndarray]]:
-    """All episodes that `read_demonstrations` reads, one at a time, so that one of them is in memory.
-
-    Args:
-        path: Trajectory file.
-        keys: Observations to read.
-        progress: Wraps the iteration over episodes, to show a progress bar.
-        outcomes: Arrays (T,) of what followed the actions, such as "success", that are read where the file has them.
-    """
-    header = read_header(path)
-    with open_trajectories(path) as file:
-        for i in progress(range(len(header["episodes"]))):
-            episode = _read_episode(file, i, keys, path, header)
-            found = {name: file[f"traj_{i}/{name}"][()] for name in outcomes if name in file[f"traj_{i}"]}
-            yield episode | {name: values for name, values in found.items() if values.shape == episode["actions"].shape[:1]}
+        for i in progress(range(count)):
+            yield _read_episode(file, i, keys, path, header) | _outcomes(file[f"traj_{i}"], outcomes)
 
 
 def observation_keys(path: Path) -> list[str]:
@@ -181,7 +186,13 @@ def observation_keys(path: Path) -> list[str]:
     return [*keys, "extra/tcp_pose"]
 
 
-def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> dict[str, np.ndarray]:
+def _outcomes(group: Any, names: tuple[str, ...]) -> Episode:
+    """Arrays of an episode that have one number for each action, of those that the file has."""
+    found = {name: group[name][()] for name in names if name in group}
+    return {name: values for name, values in found.items() if values.shape == group["actions"].shape[:1]}
+
+
+def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> Episode:
     group = file[f"traj_{i}"]
     missing = [key for key in keys if f"obs/{key}" not in group]
     if missing:
@@ -203,6 +214,6 @@ MANISKILL_H5 = DemonstrationFormat(
     "maniskill",
     matches=lambda path: not Path(path).is_dir(),
     count=count_episodes,
-    read=read_demonstrations,
+    read=read_trajectories,
     env_kwargs=lambda path: read_header(path)["env_info"]["env_kwargs"],
 )
