@@ -2,18 +2,14 @@
 
 import os
 import re
-import shutil
 from pathlib import Path
 
 from manifeel_ms3.errors import FileExistsAlreadyError
-from manifeel_ms3.files import FileWriteError, atomic_write, flush
+from manifeel_ms3.files import atomic_folder
 from manifeel_ms3.ownership import owned
 
 from .submission import RERUN, Rerun, Submission, SubmissionError
 
-INCOMING = ".incoming"
-"""Folder of the leaderboard that a submission is copied to before it takes its name; the rest of an interrupted
-copy is removed by the next one."""
 NAME = re.compile(r"\w[\w.-]{0,99}", re.ASCII)
 """Names of folders that the leaderboard takes: at most 100 letters, digits, underscores, dots and hyphens."""
 
@@ -31,32 +27,22 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
     Raises:
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
         FileWriteError: The leaderboard's folder cannot be written.
-        InUseError: Another process copies a submission.
+        InUseError: Another process copies a submission of the same name.
         SubmissionError: The name of the folder has characters that are not allowed, or is too long.
     """
     name = submission.folder.resolve().name
     if not NAME.fullmatch(name):
         raise SubmissionError(submission.folder, ["its name may have letters, digits, ., _ and - only; rename the folder"])
-    target, incoming = board / name, board / INCOMING
+    target = board / name
     contents = submission.files | ({RERUN: rerun.to_json()} if rerun else {})
-    with owned(incoming):
+    with owned(target):
         if os.path.lexists(target):
             raise FileExistsAlreadyError(
                 f"{target} exists already; rename the folder of the new submission, or delete the old one"
             )
-        shutil.rmtree(incoming, ignore_errors=True)
-        try:
+        with atomic_folder(target) as partial:
             for path, content in contents.items():
-                with atomic_write(incoming / path) as partial:
-                    partial.write_bytes(content)
-            for folder in {incoming / parent for path in contents for parent in path.parents}:
-                flush(folder)
-            incoming.rename(target)
-            flush(board)
-        except FileWriteError:
-            raise
-        except OSError as error:
-            raise FileWriteError(f"{target} cannot be written ({error}); make room or get the permission") from error
-        finally:
-            shutil.rmtree(incoming, ignore_errors=True)
+                file = partial / path
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(content)
     return target

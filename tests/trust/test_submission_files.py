@@ -5,11 +5,13 @@ import random
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InUseError
+from manifeel_ms3.files import FileWriteError
 from manifeel_ms3.leaderboard import untrusted
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.page import rows_on
@@ -22,6 +24,9 @@ from .submissions import FIRST, contents
 
 # ------------------------------------------------------------------ whole or not at all
 
+COPY = ".theirs.*.partial"
+"""Pattern of the folder that a submission is copied to before it takes its name."""
+
 
 def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> bool:
     """Take a submission in a process that is killed a moment after this many files; return whether it was still at work."""
@@ -32,7 +37,7 @@ def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> b
         finally:
             os._exit(0)
     ended = (0, 0)
-    while not ended[0] and sum(len(names) for _, _, names in os.walk(board / ".incoming")) < files:
+    while not ended[0] and sum(path.is_file() for path in board.glob(f"{COPY}/**/*")) < files:
         ended = os.waitpid(child, os.WNOHANG)
     time.sleep(delay)
     if not ended[0]:
@@ -56,17 +61,19 @@ def test_a10_a_submission_that_is_killed_while_it_is_taken_is_whole_or_absent(tm
             assert rows_on(board) == []
             assert contents(take(read_submission(folder), board)) == expected
         assert len(rows_on(board)) == 1
-        assert not (board / ".incoming").exists()
+        assert not list(board.glob(COPY))
     figure(f"of {kills} processes killed while they take a submission, number hit at work", killed, at_least=kills // 3)
 
 
 def test_a10_a_copy_that_fails_leaves_nothing(folder, tmp_path):
     board = tmp_path / "board"
-    (board / ".incoming").mkdir(parents=True)  # what a killed copy has left
-    (board / ".incoming/results").write_text("in the way")
     submission = read_submission(folder)
-    with owned(board / ".incoming"), pytest.raises(InUseError, match="in use by process"):
+    with owned(board / "theirs"), pytest.raises(InUseError, match="in use by process"):
         take(submission, board)
+    broken = replace(submission, files=submission.files | {Path("submission.json/below"): b"in the way"})
+    with pytest.raises(FileWriteError, match=r"theirs cannot be written"):
+        take(broken, board)
+    assert [path for path in board.iterdir() if path.is_dir()] == []
     assert contents(take(submission, board)) == contents(folder)
 
 

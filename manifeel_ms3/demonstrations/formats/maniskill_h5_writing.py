@@ -20,7 +20,7 @@ from typing import Any
 
 import h5py
 
-from manifeel_ms3.files import atomic_write, move, read_json, remove_folder, write_json
+from manifeel_ms3.files import atomic_folder, atomic_write, read_json, remove_folder, write_json
 
 from .maniskill_h5 import DemonstrationError, episode_folder, open_trajectories, read_header
 
@@ -152,16 +152,12 @@ def separate(path: Path) -> None:
                 "another --out"
             )
     folder = episode_folder(path)
-    draft = folder.with_name(f"{folder.name}.partial")
-    for left_over in (folder, draft):
-        remove_folder(left_over)
-    draft.mkdir()
-    with h5py.File(path, "r") as whole:
+    remove_folder(folder)  # left over from a process that was killed
+    with h5py.File(path, "r") as whole, atomic_folder(folder) as draft:
         for i, (seed, info) in enumerate(infos.items()):
             with _new_h5(episode_file(draft, seed)) as file:
                 whole.copy(f"traj_{i}", file, "traj_0")
             write_json(episode_file(draft, seed).with_suffix(".json"), info)
-    move(draft, folder)
 
 
 def remove_recording(path: Path) -> None:
