@@ -18,13 +18,14 @@ import torch
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
+from manifeel_ms3.evaluation.policy import EpisodePolicy
 from manifeel_ms3.tasks.registry import task_spec
 
 from .common.agent import PolicyAgent, build_policy
 from .registry import policy_spec
 
 
-class RandomActions:
+class RandomActions(EpisodePolicy):
     """Actions that are drawn uniformly from [-1, 1], independently for each component and each step.
 
     Args:
@@ -49,7 +50,7 @@ class RandomActions:
         return self._rng.uniform(-1.0, 1.0, self._size)
 
 
-class MeanAction:
+class MeanAction(EpisodePolicy):
     """Behaviour cloning without observations: the action is always the mean over all steps of the demonstrations.
 
     Args:

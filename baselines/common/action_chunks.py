@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from mani_skill.utils import common
 
-from manifeel_ms3.evaluation.policy import Ask, PolicyRequest
+from manifeel_ms3.evaluation.policy import Ask, EpisodePolicy, PolicyRequest
 
 from .observation import ObservationSpec, prepare
 
 
-class ActionChunks:
+class ActionChunks(EpisodePolicy):
     """Executes the actions of a prediction one by one, then asks for the next from the last `obs_horizon` observations.
 
     This module imports no network, so that a process that simulates starts quickly.

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
-from manifeel_ms3.evaluation.policy import PolicyRequest
+from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicyRequest
 
 from .action_chunks import ActionChunks
 from .checkpoint import WEIGHTS, load_weights, read_tensors, require_fit
@@ -66,7 +66,7 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
     return observation_spec(config["obs_mode"], cameras, pads, *sizes, (rows, columns), config["pose"], view)
 
 
-class PolicyAgent:
+class PolicyAgent(EpisodePolicy):
     """A trained policy: it answers several episodes at once, each from its last observations, or is the policy of one.
 
     An answer depends on its request only. The noise is drawn from the seed of the episode and the step. The network always

@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,12 +27,7 @@ STEP_TIMEOUT = 60.0
 
 
 class Policy(Protocol):
-    """Any object with these two methods can be evaluated.
-
-    A policy may have more: `begin_episode(seed)`, which is then called instead of `reset`, with the seed of the episode;
-    `looks`, whether the next call of `act` needs the cameras' images, which are otherwise left out of its observation; and
-    `waited`, the time in s that the last call of `act` waited for other episodes.
-    """
+    """Any object with these two methods can be evaluated. It may have any of the members of `EpisodePolicy`, too."""
 
     def reset(self) -> None:
         """Begin a new episode: forget everything, and seed all randomness anew."""
@@ -40,6 +36,66 @@ class Policy(Protocol):
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         """Action (A,) in [-1, 1] for the environment's observation (`num_envs=1`, tensors with a leading 1)."""
         ...
+
+
+class EpisodePolicy(ABC):
+    """A policy with every member that evaluation uses. The optional ones have the defaults that are given here.
+
+    A policy may derive from this class, but need not: `with_defaults` adds what another policy lacks.
+    """
+
+    waited: float = 0.0
+    """Time in s that the last call of `act` waited for other episodes, which does not count as time of inference."""
+    limits_itself: bool = False
+    """Whether the policy itself ends an answer that takes too long, so that the time limit of a step is not applied to it."""
+
+    @property
+    def looks(self) -> bool:
+        """Whether the next call of `act` needs the cameras' images, which are otherwise left out of its observation."""
+        return True
+
+    def begin_episode(self, seed: int) -> None:
+        """Begin the episode of a seed; evaluation calls this method instead of `reset`."""
+        self.reset()
+
+    @abstractmethod
+    def reset(self) -> None:
+        """Begin a new episode: forget everything, and seed all randomness anew."""
+
+    @abstractmethod
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        """Action (A,) in [-1, 1] for the environment's observation (`num_envs=1`, tensors with a leading 1)."""
+
+
+def with_defaults(policy: Policy) -> EpisodePolicy:
+    """The policy itself if it is an `EpisodePolicy`; otherwise the policy with the defaults of the members that it lacks."""
+    return policy if isinstance(policy, EpisodePolicy) else _WithDefaults(policy)
+
+
+class _WithDefaults(EpisodePolicy):
+    def __init__(self, policy: Policy):
+        self._policy = policy
+
+    @property
+    def waited(self) -> float:
+        return getattr(self._policy, "waited", EpisodePolicy.waited)
+
+    @property
+    def limits_itself(self) -> bool:
+        return getattr(self._policy, "limits_itself", EpisodePolicy.limits_itself)
+
+    @property
+    def looks(self) -> bool:
+        return getattr(self._policy, "looks", super().looks)
+
+    def begin_episode(self, seed: int) -> None:
+        getattr(self._policy, "begin_episode", super().begin_episode)(seed)
+
+    def reset(self) -> None:
+        self._policy.reset()
+
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        return self._policy.act(obs)
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ import torch
 from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.workers import WorkerContext, end_with_parent, without_ctrl_c
 
-from .policy import Policy, PolicyRequest, PolicySource, PolicyUnavailableError
-from .rollout import PolicyFault, begin_episode
+from .policy import EpisodePolicy, Policy, PolicyRequest, PolicySource, PolicyUnavailableError, with_defaults
+from .rollout import PolicyFault
 
 FIRST_ANSWER = 120.0
 """Time in s that the first answer of a process may take beyond the usual limit, because libraries initialize themselves; set
@@ -241,7 +241,7 @@ def _send(connection: Connection, message: Any) -> None:
 # -------------------------------------------------------------------- in a simulating process
 
 
-class SharedPolicy:
+class SharedPolicy(EpisodePolicy):
     """The policy of a `PolicyProcess`, as an episode in this process sees it.
 
     Args:
@@ -262,21 +262,18 @@ class SharedPolicy:
         except (EOFError, ConnectionError, FileNotFoundError) as error:
             raise PolicyUnavailableError(ENDED) from error
         part = ready.make_episode_part
-        self._part: Any = make() if part is None else pickle.loads(part)(self._ask)
-        self.limits_itself = part is not None
-        """Whether the time for an answer is limited elsewhere, so that waiting for other episodes does not count."""
-        self.waited = 0.0
+        self._part = with_defaults(make() if part is None else pickle.loads(part)(self._ask))
+        self.limits_itself = part is not None  # the `PolicyProcess` limits the time, in which others' requests do not count
 
     @property
     def looks(self) -> bool:
-        """Whether the next action needs the cameras' images."""
-        return getattr(self._part, "looks", True)
+        return self._part.looks
 
     def reset(self) -> None:
         self._part.reset()
 
     def begin_episode(self, seed: int) -> None:
-        begin_episode(self._part, seed)
+        self._part.begin_episode(seed)
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         self.waited = 0.0

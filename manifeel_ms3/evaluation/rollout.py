@@ -16,7 +16,7 @@ from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
-from .policy import Policy, PolicyUnavailableError
+from .policy import Policy, PolicyUnavailableError, with_defaults
 
 HANGS_FOR_GOOD = 10.0
 """Time in s between the time-out and the end of the process, for a policy that hangs in code which no signal interrupts; set
@@ -112,7 +112,7 @@ def evaluate_episode(
         seed: Seed of the episode.
         on_action: Function that is called with every action (A,) before it is done.
         step_timeout: Longest time that the policy may take for one action, in s; no limit if not given, or if the policy's
-            attribute `limits_itself` is true. A limit works only in the main thread of a process.
+            attribute `limits_itself` is true (`EpisodePolicy`). A limit works only in the main thread of a process.
         stop_at_success: End the episode at success or failure.
 
     Raises:
@@ -122,14 +122,15 @@ def evaluate_episode(
     task: Any = env.unwrapped
     shape = task.single_action_space.shape
     metrics, over, fault = _Metrics(seed), False, None
-    step_timeout = None if getattr(policy, "limits_itself", False) else step_timeout
+    whole = with_defaults(policy)
+    step_timeout = None if whole.limits_itself else step_timeout
     try:
-        _answer(lambda: begin_episode(policy, seed), step_timeout)
+        _answer(lambda: whole.begin_episode(seed), step_timeout)
         while not over:
             begin = time.perf_counter()
-            action = _checked(_answer(lambda obs=obs: policy.act(obs), step_timeout), shape)
-            metrics.thinking += time.perf_counter() - begin - getattr(policy, "waited", 0.0)
-            task.renders_cameras = getattr(policy, "looks", True)
+            action = _checked(_answer(lambda obs=obs: whole.act(obs), step_timeout), shape)
+            metrics.thinking += time.perf_counter() - begin - whole.waited
+            task.renders_cameras = whole.looks
             on_action(action)
             obs, reward, terminated, truncated, info = env.step(action)
             metrics.add(float(reward), info)
@@ -215,12 +216,6 @@ def _shortcoming(task: Any, metrics: _Metrics) -> str:
     """What is missing at the end of an episode without success, by the rule of `EpisodeOutcome.ending`."""
     missing = task.shortcomings(metrics.last) if metrics.steps and hasattr(task, "shortcomings") else {}
     return next((name for name, holds in missing.items() if bool(holds)), "time-out")
-
-
-def begin_episode(policy: Policy, seed: int) -> None:
-    """Tell the policy that an episode begins, and the seed of the episode if the policy takes it."""
-    begin = getattr(policy, "begin_episode", None)
-    policy.reset() if begin is None else begin(seed)
 
 
 def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:

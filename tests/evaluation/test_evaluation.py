@@ -14,7 +14,7 @@ from manifeel_ms3.evaluation import evaluate_episode
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
-from manifeel_ms3.evaluation.policy import PolicySource, load_policy
+from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicySource, load_policy, with_defaults
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.evaluation.rollout import failed_outcome, outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
@@ -215,3 +215,33 @@ def test_a_policy_is_found_in_the_working_folder(tmp_path, monkeypatch):
     assert source.fingerprint() is not None
     assert source.make().gain == 2
     assert sys.path[-1] == str(tmp_path)  # last, so that nothing here takes the place of an installed module
+
+
+class Blind(StandStill):
+    """A policy with some of the optional members, that derives from nothing of this package."""
+
+    looks, waited = False, 0.5
+
+    def begin_episode(self, seed):
+        self.seed = seed
+
+
+class Derived(EpisodePolicy):
+    def reset(self):
+        self.episodes = getattr(self, "episodes", 0) + 1
+
+    def act(self, obs):
+        return np.zeros(6)
+
+
+def test_a_policy_with_the_two_methods_has_the_defaults_of_all_others():
+    plain, blind, derived = StandStill(), Blind(), Derived()
+    assert with_defaults(derived) is derived
+    for policy in (with_defaults(plain), derived):
+        policy.begin_episode(3)
+        assert (policy.looks, policy.waited, policy.limits_itself) == (True, 0.0, False)
+    assert (plain.steps, derived.episodes) == (0, 1)
+    assert with_defaults(plain).act({}).shape == (6,)
+    with_defaults(blind).begin_episode(3)
+    assert blind.seed == 3
+    assert (with_defaults(blind).looks, with_defaults(blind).waited, with_defaults(blind).limits_itself) == (False, 0.5, False)
