@@ -21,7 +21,7 @@ from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
 from baselines import tactile_representations as tactile_representations  # registers its encoders
-from baselines.common.dataset import Episode, SequenceDataset
+from baselines.common.dataset import Demonstration, SequenceDataset
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
 from baselines.common.memory import keep_freed_memory, lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
@@ -61,8 +61,8 @@ SPEC_SENSORS = ("rgb+tacrgb", ("wrist",), ("right",))
 """Observation mode, cameras and pads of the policy."""
 
 
-def random_episodes(spec, count: int, length: int) -> list[Episode]:
-    def episode() -> Episode:
+def random_episodes(spec, count: int, length: int) -> list[Demonstration]:
+    def episode() -> Demonstration:
         sizes = {key: (length + 1, spec.size_of(key), spec.size_of(key), 3) for key in spec.images}
         images = {key: RNG.integers(0, 255, size, np.uint8) for key, size in sizes.items()}
         return images | {

@@ -13,7 +13,7 @@ from typing import Any
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds
 from manifeel_ms3.analysis.markdown import markdown_table
-from manifeel_ms3.analysis.paper import MODALITIES, MODES, VISION
+from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
 from manifeel_ms3.analysis.paper_tables import HEADINGS, table_one
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
 from manifeel_ms3.evaluation.result import results_by_file
@@ -81,7 +81,7 @@ def _training_seconds(results: list[dict[str, Any]], conditions: set[Condition])
 
 def _cells(task: str, results: dict[tuple[str, str], ConditionResults]) -> Iterator[str]:
     """A rate for each sensing, with the paper's in brackets."""
-    for mode, paper in zip(MODES, MODALITIES[task], strict=True):
+    for mode, paper in zip(MODES, TABLE_I[task], strict=True):
         ours = results.get((task, mode))
         yield f"{'not run' if ours is None else _rate(ours, results.get((task, VISION)))} ({100 * paper.mean:.0f})"
 

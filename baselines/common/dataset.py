@@ -10,17 +10,15 @@ import numpy as np
 import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats import format_of
+from manifeel_ms3.demonstrations.formats import Demonstration, format_of
 from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
 from manifeel_ms3.progress import progress_bar
 
 from .memory import return_freed_memory
 from .observation import ObservationSpec, prepare
 
-Episode = dict[str, np.ndarray]
 
-
-def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Episode]:
+def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Demonstration]:
     """Episodes of a task: observations as a policy takes them, (T + 1, ...), and "actions", (T, A).
 
     Args:
@@ -51,7 +49,7 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
     return episodes
 
 
-def _prepared(spec: ObservationSpec, episode: Episode) -> Episode:
+def _prepared(spec: ObservationSpec, episode: Demonstration) -> Demonstration:
     return {key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"])
 
 
@@ -100,7 +98,7 @@ class SequenceDataset:
 
     def __init__(
         self,
-        episodes: list[Episode],
+        episodes: list[Demonstration],
         spec: ObservationSpec,
         obs_horizon: int,
         pred_horizon: int,
@@ -136,7 +134,7 @@ class SequenceDataset:
         return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]
 
 
-def _joined(episodes: list[Episode], keys: list[str]) -> Episode:
+def _joined(episodes: list[Demonstration], keys: list[str]) -> Demonstration:
     """The "actions" and the observations `keys` (S, ...) at the steps of all episodes, one episode after the other.
 
     No action follows the last observation of an episode, so it is left out and observations and actions share an index.

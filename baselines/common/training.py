@@ -39,7 +39,7 @@ from .checkpoint import (
     saved_checkpoints,
     unpack,
 )
-from .dataset import Episode, SampleOrder, SequenceDataset, read_episodes, recorded_env_kwargs
+from .dataset import Demonstration, SampleOrder, SequenceDataset, read_episodes, recorded_env_kwargs
 from .encoders import load_pretrained
 from .memory import keep_freed_memory, lay_out_channels_last
 from .observation import ObservationSpec
@@ -351,7 +351,7 @@ def seed_everything(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def with_taxel_shape(spec: ObservationSpec, episode: Episode) -> ObservationSpec:
+def with_taxel_shape(spec: ObservationSpec, episode: Demonstration) -> ObservationSpec:
     """The observations, with the shape of force fields that an episode has."""
     shapes = {episode[key].shape[1:3] for key in spec.force_fields}
     return replace(spec, taxel_shape=shapes.pop()) if shapes else spec

@@ -9,7 +9,7 @@ from .census import endings_of
 from .condition import Condition
 from .estimates import SIGNIFICANT, difference, has_enough_seeds
 from .matching import Found, answering
-from .paper import MODALITIES, MODES, VISION, Rate, paper_condition
+from .paper import MODES, TABLE_I, VISION, Rate, paper_condition
 from .presets import TrainingSettings
 
 TEXT = """
@@ -32,7 +32,7 @@ def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
         found: The results that enter comparisons.
         results: Contents of result files.
     """
-    paragraphs = [text for task in MODALITIES for text in _of_a_task(task, found, results)]
+    paragraphs = [text for task in TABLE_I for text in _of_a_task(task, found, results)]
     if paragraphs:
         yield TEXT
         yield "\n".join(paragraphs)
@@ -52,7 +52,7 @@ def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterat
 
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
-    rates: dict[str, Rate] = dict(zip(MODES, MODALITIES[task], strict=True))
+    rates: dict[str, Rate] = dict(zip(MODES, TABLE_I[task], strict=True))
     papers = f"the paper: {100 * (rates[mode].mean - rates[VISION].mean):+.0f}"
     touched, seen = found[conditions[mode]], found[conditions[VISION]]
     try:

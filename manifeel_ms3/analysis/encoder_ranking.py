@@ -11,7 +11,7 @@ from itertools import combinations
 from .estimates import SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, mean_success, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
-from .paper import ENCODERS, TACRGB, paper_condition, tasks_in_table
+from .paper import TABLE_III, TACRGB, paper_condition, tasks_in_table
 from .paper_claims import NO_ENCODER_IS_BEST
 from .presets import TrainingSettings
 from .protocol import ConditionResults
@@ -55,7 +55,7 @@ def rankings(found: Found) -> dict[TrainingSettings, list[EncoderRanking]]:
     """The rankings of all tasks of Table III on which every encoder was run, by set-up."""
     ran: dict[TrainingSettings, dict[str, dict[str, ConditionResults]]] = {}
     for task in tasks_in_table("III"):
-        names = tuple(ENCODERS[task])
+        names = tuple(TABLE_III[task])
         wanted = [paper_condition(task, TACRGB, encoder=name) for name in names]
         for settings, conditions in answering_all(wanted, found).items():
             results = dict(zip(names, (found[condition] for condition in conditions), strict=True))
@@ -106,7 +106,7 @@ def ranking_tables(found: Found) -> Iterator[str]:
     yield f"**{NO_ENCODER_IS_BEST}**: "
     ranked = rankings(found)
     if not ranked:
-        yield f"not run. It needs {', '.join(ENCODERS['GearAssembly'])} on a task of Table III.\n"
+        yield f"not run. It needs {', '.join(TABLE_III['GearAssembly'])} on a task of Table III.\n"
     for settings, with_settings in ranked.items():
         yield f"{verdict_on(with_settings)} (settings: {settings}).\n\n"
         names = ("task", "best", "success", "second", "success", "best over second, points", "p, Holm")

@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.gentle import success_under_force
 from .condition import Condition
 from .figures import save_figure
 from .matching import Found
-from .paper import MODALITIES, MODES
+from .paper import MODES, TABLE_I
 from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, table_one
 from .protocol import ConditionResults
 from .success_curves import PANEL
@@ -52,7 +52,7 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
     with missing_extras_named():
         from matplotlib.figure import Figure
     settings, conditions = most
-    tasks = [task for task in MODALITIES if any((task, mode) in conditions for mode in MODES)]
+    tasks = [task for task in TABLE_I if any((task, mode) in conditions for mode in MODES)]
     columns = min(len(tasks), COLUMNS)
     rows = -(-len(tasks) // columns)
     fig = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained")

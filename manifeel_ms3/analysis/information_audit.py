@@ -32,7 +32,7 @@ from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_sp
 from .estimates import TAILS
 from .figures import save_figure
 from .markdown import markdown_table
-from .probes import Episode, Probe
+from .probes import EpisodeGroup, Probe
 
 log = logging.getLogger(__name__)
 MODALITIES = {"camera": "camera", "tacrgb": "TacRGB", "tacff": "TacFF"}
@@ -112,7 +112,7 @@ def image_features(image: np.ndarray) -> np.ndarray:
     return np.concatenate([pooled(image), *(pooled(band) for band in bands)])
 
 
-def _features(episode: Episode, sensor: str, modality: str, t: int) -> np.ndarray:
+def _features(episode: EpisodeGroup, sensor: str, modality: str, t: int) -> np.ndarray:
     observed = episode[f"obs/sensor_data/{sensor}"]
     return observed["force_field"][t].ravel() if modality == "tacff" else image_features(observed["rgb"][t])
 

@@ -44,7 +44,7 @@ def _rates(*numbers: tuple[float, float]) -> tuple[Rate, ...]:
     return tuple(Rate(*pair) for pair in numbers)
 
 
-MODALITIES = {
+TABLE_I = {
     "PegInsertion": _rates((0.14, 0.01), (0.21, 0.02), (0.40, 0.02)),
     "USBInsertion": _rates((0.49, 0.03), (0.49, 0.02), (0.56, 0.01)),
     "PowerPlugInsertion": _rates((0.51, 0.02), (0.51, 0.01), (0.58, 0.02)),
@@ -61,7 +61,7 @@ _SORTING_BY_POLICY = {
     EQUIDP: _rates((0.21, 0.03), (0.46, 0.02), (0.31, 0.04)),
     FM: _rates((0.41, 0.03), (0.69, 0.01), (0.43, 0.03)),
 }
-POLICIES = {
+TABLE_II = {
     "GearAssembly": {
         DP: _rates((0.63, 0.02), (0.57, 0.02), (0.66, 0.01)),
         EQUIDP: _rates((0.70, 0.02), (0.66, 0.02), (0.74, 0.03)),
@@ -82,7 +82,7 @@ POLICIES = {
 }
 """Table II: success by task and policy, in the order of MODES; ball sorting in both lights."""
 _SORTING_BY_ENCODER = dict(resnet18=Rate(0.73, 0.03), unit=Rate(0.80, 0.05), t3=Rate(0.68, 0.01), anytouch=Rate(0.74, 0.02))
-ENCODERS = {
+TABLE_III = {
     "GearAssembly": dict(resnet18=Rate(0.57, 0.02), unit=Rate(0.61, 0.01), t3=Rate(0.57, 0.02), anytouch=Rate(0.28, 0.02)),
     "ObjectSearch": dict(resnet18=Rate(0.69, 0.01), unit=Rate(0.58, 0.03), t3=Rate(0.71, 0.03), anytouch=Rate(0.59, 0.02)),
     "BallSortingDim": _SORTING_BY_ENCODER,
@@ -171,12 +171,12 @@ def tasks_in_table(table: str, *categories: str) -> list[str]:
 def reported() -> Iterator[tuple[str, Condition, Rate]]:
     """Every success rate of the paper's tables: number of the table, condition, and rate."""
     for task in tasks_in_table("I"):
-        for mode, rate in zip(MODES, MODALITIES[task], strict=True):
+        for mode, rate in zip(MODES, TABLE_I[task], strict=True):
             yield "I", paper_condition(task, mode), rate
     for task in tasks_in_table("II"):
-        for policy, rates in POLICIES[task].items():
+        for policy, rates in TABLE_II[task].items():
             for mode, rate in zip(MODES, rates, strict=True):
                 yield "II", paper_condition(task, mode, policy), rate
     for task in tasks_in_table("III"):
-        for encoder, rate in ENCODERS[task].items():
+        for encoder, rate in TABLE_III[task].items():
             yield "III", paper_condition(task, TACRGB, encoder=encoder), rate

@@ -13,7 +13,7 @@ from .estimates import Estimate, mean_success
 from .figures import save_figure
 from .markdown import markdown_table
 from .matching import Found, answering
-from .paper import DP, ENCODERS, MODALITIES, MODES, POLICIES, Rate, paper_condition, tasks_in_table
+from .paper import DP, MODES, TABLE_I, TABLE_II, TABLE_III, Rate, paper_condition, tasks_in_table
 from .presets import PAPER, TrainingSettings
 from .protocol import ConditionResults
 
@@ -63,10 +63,10 @@ def tables_of_the_paper(found: Found, files: Files) -> Iterator[str]:
     yield TEXT
     all_settings, with_other_policies, by_encoder = _all_settings(found), set[str](), False
     for settings in all_settings:
-        if rows := list(_rows_by_sensing(found, files, settings, {(task, DP): rates for task, rates in MODALITIES.items()})):
+        if rows := list(_rows_by_sensing(found, files, settings, {(task, DP): rates for task, rates in TABLE_I.items()})):
             yield f"\n### Table I, what touch adds: Diffusion Policy, {settings}\n\n"
             yield _with_floors(("task", *HEADINGS.values()), [(task, *cells) for (task, _), cells in rows])
-        by_policy = {(task, name): rates for task, here in POLICIES.items() for name, rates in here.items()}
+        by_policy = {(task, name): rates for task, here in TABLE_II.items() for name, rates in here.items()}
         rows = list(_rows_by_sensing(found, files, settings, by_policy))
         if others := {task for (task, policy), _ in rows if policy != DP}:
             with_other_policies |= others
@@ -76,10 +76,10 @@ def tables_of_the_paper(found: Found, files: Files) -> Iterator[str]:
         if rows := list(_rows_by_encoder(found, files, settings)):
             by_encoder = True
             yield f"\n### Table III, encoders of TacRGB: {settings}\n\n"
-            names = list(dict.fromkeys(name for here in ENCODERS.values() for name in here))
+            names = list(dict.fromkeys(name for here in TABLE_III.values() for name in here))
             yield _with_floors(("task", *names), rows)
     missing = [] if any(settings.preset == PAPER for settings in all_settings) else ["the networks of the paper (ResNet-18)"]
-    if left := [task for task in POLICIES if task not in with_other_policies]:
+    if left := [task for task in TABLE_II if task not in with_other_policies]:
         where = f", on {', '.join(left)}" if with_other_policies else ""
         missing.append(f"Table II, the Equivariant Diffusion Policy and Flow Matching{where}")
     if not by_encoder:
@@ -99,8 +99,8 @@ def _with_floors(names: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def _all_settings(found: Found) -> list[TrainingSettings]:
     """The set-ups of conditions of Tables I to III, the paper's preset first."""
-    wanted = [paper_condition(task, mode, policy) for task in POLICIES for policy in POLICIES[task] for mode in MODES]
-    wanted += [paper_condition(task, mode) for task in MODALITIES for mode in MODES]
+    wanted = [paper_condition(task, mode, policy) for task in TABLE_II for policy in TABLE_II[task] for mode in MODES]
+    wanted += [paper_condition(task, mode) for task in TABLE_I for mode in MODES]
     all_settings = {settings for condition in wanted for settings in answering(condition, found)}
     return sorted(all_settings, key=lambda settings: settings.sort_key)
 
@@ -121,10 +121,10 @@ def _rows_by_sensing(
 
 def _rows_by_encoder(found: Found, files: Files, settings: TrainingSettings) -> Iterator[list[str]]:
     for task in tasks_in_table("III"):
-        wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in ENCODERS[task]}
+        wanted = {name: paper_condition(task, MODES[1], encoder=name) for name in TABLE_III[task]}
         answers = {name: answering(condition, found).get(settings) for name, condition in wanted.items()}
         if sum(answer is not None for answer in answers.values()) > 1:  # a single encoder compares nothing
-            yield [task, *(_cell(found, files, answers[name], rate) for name, rate in ENCODERS[task].items())]
+            yield [task, *(_cell(found, files, answers[name], rate) for name, rate in TABLE_III[task].items())]
 
 
 def _cell(found: Found, files: Files, condition: Condition | None, rate: Rate) -> str:
@@ -163,7 +163,7 @@ def table_one(found: Found) -> tuple[TrainingSettings, dict[tuple[str, str], Con
         found: The results that enter comparisons.
     """
     by_settings: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
-    for task in MODALITIES:
+    for task in TABLE_I:
         for mode in MODES:
             for settings, condition in answering(paper_condition(task, mode), found).items():
                 by_settings.setdefault(settings, {})[task, mode] = condition
@@ -193,13 +193,13 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         from matplotlib.figure import Figure
     settings, conditions = most
     drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
-    tasks = list(MODALITIES)
+    tasks = list(TABLE_I)
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
     for k, mode in enumerate(MODES):
         _draw_bars(ax, [tasks.index(task) for task in tasks], (k - 1) * BAR, [drawn.get((task, mode)) for task in tasks], mode)
     for place, task in enumerate(tasks):
-        for k, rate in enumerate(MODALITIES[task]):
+        for k, rate in enumerate(TABLE_I[task]):
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
             ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=PAPER_LINE, label=label)

@@ -19,11 +19,11 @@ from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
 from manifeel_ms3.tasks.registry import task_spec
 
-Episode = Any
+EpisodeGroup = Any
 """Group of one episode in a trajectory file, as h5py reads it."""
 Samples = Iterator[tuple[int, float]]
 """Pairs of an observation's index and the true answer at that moment."""
-Sampler = Callable[[Episode], Samples]
+Sampler = Callable[[EpisodeGroup], Samples]
 
 IN_CONTACT = 1.5
 """Force in N, beyond its weight, above which a held part touches the world."""
@@ -80,11 +80,11 @@ def register_probe(*env_ids: str, question: str, unit: str = "") -> Callable[[Sa
     return attach
 
 
-def _position(episode: Episode, actor: str) -> np.ndarray:
+def _position(episode: EpisodeGroup, actor: str) -> np.ndarray:
     return episode[f"env_states/actors/{actor}"][:, :3]
 
 
-def _end_of_first_closing(episode: Episode) -> list[int]:
+def _end_of_first_closing(episode: EpisodeGroup) -> list[int]:
     """Last observation before the hand, whose fingers have closed, lifts or lets go: nothing shows yet what it felt."""
     arm, gripper = np.abs(episode["actions"][:, :-1]).max(1), episode["actions"][:, -1]
     closing = (gripper < CLOSING) & (arm < STILL)
@@ -92,7 +92,7 @@ def _end_of_first_closing(episode: Episode) -> list[int]:
 
 
 @register_probe("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1", question="ball in the hand: golf or table tennis")
-def _golf_ball_held(episode: Episode) -> Samples:
+def _golf_ball_held(episode: EpisodeGroup) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
     for t in _end_of_first_closing(episode):  # the first grasp takes the wrong ball half of the time
         distance = [np.linalg.norm(_position(episode, f"{ball}_ball")[t] - tool[t]) for ball in ("golf", "tennis")]
@@ -100,14 +100,14 @@ def _golf_ball_held(episode: Episode) -> Samples:
 
 
 @register_probe("ManiFeel-ObjectSearch-v1", question="battery's place, before contact")
-def _battery_in_far_half(episode: Episode) -> Samples:
+def _battery_in_far_half(episode: EpisodeGroup) -> Samples:
     far = float(_position(episode, "battery")[0, 0] > CONTAINER_XY[0])
     for t in EARLY:
         yield t, far
 
 
 @register_probe("ManiFeel-ObjectSearch-v1", question="battery between the fingers or not, once closed")
-def _battery_held(episode: Episode) -> Samples:
+def _battery_held(episode: EpisodeGroup) -> Samples:
     tool = episode["obs/extra/tcp_pose"][:, :3]
     for t in _end_of_first_closing(episode):
         distance = np.linalg.norm((_position(episode, "battery")[t] - tool[t])[:2])
@@ -115,7 +115,7 @@ def _battery_held(episode: Episode) -> Samples:
 
 
 @register_probe("ManiFeel-PegInsertion-v1", "ManiFeel-PegReorientation-v1", question="peg's pitch in the hand", unit="degrees")
-def _pitch_in_hand(episode: Episode) -> Samples:
+def _pitch_in_hand(episode: EpisodeGroup) -> Samples:
     (name,) = [name for name in episode["env_states/actors"] if name.endswith("peg")]
     plug = episode[f"env_states/actors/{name}"][:, 3:7]
     tool = episode["obs/extra/tcp_pose"][:, 3:7]
@@ -125,32 +125,32 @@ def _pitch_in_hand(episode: Episode) -> Samples:
 
 
 @register_probe("ManiFeel-PegInsertion-v1", "ManiFeel-PegReorientation-v1", question="peg touches or not")
-def _in_contact(episode: Episode) -> Samples:
+def _in_contact(episode: EpisodeGroup) -> Samples:
     force = _force_beyond_weight(episode)
     for t in range(0, len(force), CONTACT_STRIDE):
         if force[t] > IN_CONTACT or force[t] < IN_FREE_MOTION:
             yield t + 1, float(force[t] > IN_CONTACT)  # the force of step t belongs to the observation after it
 
 
-def _force_beyond_weight(episode: Episode) -> np.ndarray:
+def _force_beyond_weight(episode: EpisodeGroup) -> np.ndarray:
     """Contact force (T,), in N, beyond the smallest of the episode, with which the fingers carry the part's weight."""
     force = episode["contact_force"][()]
     return force - force.min()
 
 
-def _touching(episode: Episode, stride: int) -> Iterator[int]:
+def _touching(episode: EpisodeGroup, stride: int) -> Iterator[int]:
     """Observations at which a held part touches the world."""
     force = _force_beyond_weight(episode)
     return (t + 1 for t in range(0, len(force), stride) if force[t] > IN_CONTACT)
 
 
-def _descent(episode: Episode, held: str, fixed: str, engaged: float) -> np.ndarray:
+def _descent(episode: EpisodeGroup, held: str, fixed: str, engaged: float) -> np.ndarray:
     """Distance in m that a screwed part has gone down since its thread could engage."""
     return engaged - (_position(episode, held)[:, 2] - _position(episode, fixed)[:, 2])
 
 
 @register_probe("ManiFeel-NutBoltAssembly-v1", question="thread engaged or resting on it")
-def _thread_engaged(episode: Episode) -> Samples:
+def _thread_engaged(episode: EpisodeGroup) -> Samples:
     screw = nut_and_bolt()
     descent = _descent(episode, "nut", "bolt", screw.engaged)
     for t in _touching(episode, CONTACT_STRIDE):
@@ -159,7 +159,7 @@ def _thread_engaged(episode: Episode) -> Samples:
 
 
 @register_probe("ManiFeel-BulbInstallation-v1", question="bulb tight or not yet")
-def _bulb_tight(episode: Episode) -> Samples:
+def _bulb_tight(episode: EpisodeGroup) -> Samples:
     screw = bulb_and_holder()
     gap = screw.engaged - screw.seated - _descent(episode, "bulb", "holder", screw.engaged)
     for t in _touching(episode, BULB_STRIDE):

@@ -11,10 +11,10 @@ from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks import VisuotactileEnv
 from manifeel_ms3.tasks.visuotactile_env import FORCE_DECIMALS
 
-from .formats.maniskill_h5_writing import Episode
+from .formats.maniskill_h5_writing import RecordedEpisode
 
 
-def demonstrate(env: gym.Env, env_id: str, seed: int) -> Episode:
+def demonstrate(env: gym.Env, env_id: str, seed: int) -> RecordedEpisode:
     """Run the scripted demonstrator of a task through one episode."""
     return run_episode(env, seed, lambda: make_expert(env_id, cast(VisuotactileEnv, env.unwrapped), seed).actions())
 
@@ -24,7 +24,7 @@ def run_episode(
     seed: int,
     actions: Callable[[], Iterable[np.ndarray]],
     on_step: Callable[[dict[str, Any], dict[str, Any]], None] = lambda _obs, _info: None,
-) -> Episode:
+) -> RecordedEpisode:
     """Run one episode, and return its observations, states and outcome.
 
     Args:
@@ -63,7 +63,7 @@ def run_episode(
         fail=bool(steps["fail"] and steps["fail"][-1]),
         peak_contact_force=round(float(max(steps["contact_force"], default=0.0)), FORCE_DECIMALS),
     )
-    return Episode(seed, arrays, info)
+    return RecordedEpisode(seed, arrays, info)
 
 
 def _stack(trees: list[Any]) -> dict[str, Any]:

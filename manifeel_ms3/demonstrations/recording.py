@@ -18,7 +18,7 @@ from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_sp
 
 from .formats.maniskill_h5 import DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
-    Episode,
+    RecordedEpisode,
     consolidate,
     episode_file,
     episode_folder,
@@ -278,7 +278,7 @@ class Recorder:
     source: gym.Env | None = None
     """Environment with the controller of the recording that is replayed, if its actions are converted to another."""
 
-    def write(self, episode: Episode) -> dict[str, Any]:
+    def write(self, episode: RecordedEpisode) -> dict[str, Any]:
         """Write an episode, and return its entry in the json."""
         write_episode(self.drafts, episode)
         return episode.info | dict(episode_seed=episode.seed)

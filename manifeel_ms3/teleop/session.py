@@ -12,7 +12,7 @@ import numpy as np
 
 from manifeel_ms3.agents.panda_gelsight import GRASP_FORCE
 from manifeel_ms3.demonstrations.episode import run_episode
-from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, write_episode
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpisode, write_episode
 from manifeel_ms3.demonstrations.recording import make_header, open_recording, require_demonstration_seeds
 from manifeel_ms3.experts.skills import Skills
 from manifeel_ms3.tasks import VisuotactileEnv
@@ -100,7 +100,7 @@ class Session:
             due += self._period
             yield self.operator.action()
 
-    def _decision(self, screen: Screen, episode: Episode) -> EpisodeCommand | None:
+    def _decision(self, screen: Screen, episode: RecordedEpisode) -> EpisodeCommand | None:
         """Wait for the command that saves, discards or repeats an episode that is over; None if the session ends before it."""
         command = self.operator.take_command(0.0)
         self.operator.end()
@@ -117,7 +117,7 @@ class Session:
             command = self.operator.take_command(PATIENCE)
         return None
 
-    def _save(self, screen: Screen, episode: Episode) -> bool:
+    def _save(self, screen: Screen, episode: RecordedEpisode) -> bool:
         """Write an episode, and return whether that worked; if it did not, the page shows the reason."""
         try:
             write_episode(self._recording.drafts, episode)

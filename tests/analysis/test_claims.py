@@ -10,7 +10,7 @@ from manifeel_ms3.analysis import claims
 from manifeel_ms3.analysis.condition import Condition
 from manifeel_ms3.analysis.encoder_ranking import rankings, verdict_on
 from manifeel_ms3.analysis.estimates import Estimate, holm
-from manifeel_ms3.analysis.paper import ENCODERS, MODES, POLICIES, TACFF, TACRGB, VISION, reported
+from manifeel_ms3.analysis.paper import MODES, TABLE_II, TABLE_III, TACFF, TACRGB, VISION, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.protocol import collect, of_the_protocol
 from manifeel_ms3.evaluation.result import ResultError, results_in
@@ -192,7 +192,7 @@ def test_each_set_up_has_an_answer_of_its_own(tmp_path):
 
 
 def test_policies_are_compared_as_their_presets_are(tmp_path):
-    for policy in POLICIES["GearAssembly"]:
+    for policy in TABLE_II["GearAssembly"]:
         write_run(tmp_path, VISION, 0.5, policy=policy, task="GearAssembly")
     assert sorted(claim[0] for claim, *_ in answered(tmp_path)) == ["4", "5"]
 
@@ -212,12 +212,12 @@ def write_encoders(folder, rates: dict[str, dict[str, float]]) -> None:
     ("best", "verdict"),
     [
         (dict(GearAssembly="unit", ObjectSearch="t3"), "holds"),
-        (dict.fromkeys(ENCODERS, "unit"), "does not hold"),
+        (dict.fromkeys(TABLE_III, "unit"), "does not hold"),
         (dict(GearAssembly="unit", ObjectSearch="unit"), "undecided"),  # the other tasks were not run
     ],
 )
 def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
-    rates = {task: {name: 0.9 if name == best[task] else 0.3 for name in ENCODERS[task]} for task in best}
+    rates = {task: {name: 0.9 if name == best[task] else 0.3 for name in TABLE_III[task]} for task in best}
     write_encoders(tmp_path, rates)
     ((settings, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
     assert str(settings) == "paper"
@@ -228,14 +228,14 @@ def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
 
 
 def test_encoders_that_are_near_each_other_decide_nothing(tmp_path):
-    write_encoders(tmp_path, {task: dict.fromkeys(ENCODERS[task], 0.5) for task in ("GearAssembly", "ObjectSearch")})
+    write_encoders(tmp_path, {task: dict.fromkeys(TABLE_III[task], 0.5) for task in ("GearAssembly", "ObjectSearch")})
     ((_, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
     assert verdict_on(ranked) == "undecided"
 
 
 def test_an_encoder_that_is_chosen_as_the_best_afterwards_must_be_better_by_more_than_chance(tmp_path):
     """The best of four lies so far ahead of the worst that a test of these two alone would find a difference."""
-    rates = {task: dict(zip(ENCODERS[task], (0.62, 0.58, 0.54, 0.5), strict=True)) for task in ENCODERS}
+    rates = {task: dict(zip(TABLE_III[task], (0.62, 0.58, 0.54, 0.5), strict=True)) for task in TABLE_III}
     write_encoders(tmp_path, rates)
     ((_, ranked),) = rankings(of_the_protocol(collect(results_in(tmp_path)))).items()
     clear = [(ranking, pair) for ranking in ranked for pair, gap in ranking.gaps.items() if gap.low > 0]

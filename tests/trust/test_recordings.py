@@ -16,7 +16,7 @@ import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, dataset, render_observations
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
-from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import Episode, episode_folder, write_episode
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpisode, episode_folder, write_episode
 from manifeel_ms3.demonstrations.recording import STATES_FILE, make_header, open_recording
 from manifeel_ms3.errors import InUseError, ManifeelError
 from manifeel_ms3.files import remove_folder
@@ -52,11 +52,11 @@ def assert_same(path: Path, undisturbed: Path) -> None:
     )
 
 
-def made_up(seed: int) -> Episode:
+def made_up(seed: int) -> RecordedEpisode:
     """A small episode, all of whose arrays tell its seed."""
     steps = 3 + seed
     arrays = dict(actions=np.full((steps, 6), seed, np.float32), env_states=dict(peg=np.full((steps + 1, 13), seed)))
-    return Episode(seed, arrays, dict(elapsed_steps=steps, success=True, peak_contact_force=1.0))
+    return RecordedEpisode(seed, arrays, dict(elapsed_steps=steps, success=True, peak_contact_force=1.0))
 
 
 def record_made_up(path: Path, num: int, say=lambda word: None) -> None:
@@ -355,7 +355,7 @@ def test_a_full_disk_keeps_every_episode_and_can_be_gone_on_from(tmp_path):
 
     def full(say) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-        large = Episode(
+        large = RecordedEpisode(
             2, dict(actions=np.random.default_rng(0).normal(size=(5000, 6))), dict(elapsed_steps=5000, success=True)
         )
         with open_recording(path, HEADER) as recording:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from .demonstration_format import Demonstration as Demonstration
 from .demonstration_format import DemonstrationFormat as DemonstrationFormat
 from .diffusion_policy_zarr import DIFFUSION_POLICY_ZARR
 from .lerobot import LEROBOT

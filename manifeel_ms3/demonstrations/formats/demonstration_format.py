@@ -9,7 +9,7 @@ import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
 
-Episode = dict[str, np.ndarray]
+Demonstration = dict[str, np.ndarray]
 """Arrays of one episode: "actions" (T, A), and observations (T + 1, ...) by their keys, such as "sensor_data/wrist/rgb"."""
 Progress = Callable[[Any], Iterable[int]]
 """Function that wraps a sequence of episode numbers to show a progress bar; `iter` shows none."""
@@ -27,7 +27,7 @@ class ReadEpisodes(Protocol):
 
     def __call__(
         self, path: Path, keys: list[str], /, *, num: int | None = None, progress: Progress = iter, env_id: str | None = None
-    ) -> Iterator[Episode]:
+    ) -> Iterator[Demonstration]:
         """The first episodes of a file or folder, each of which is read when it is asked for.
 
         Args:

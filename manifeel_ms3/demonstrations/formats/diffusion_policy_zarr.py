@@ -19,7 +19,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
-from .demonstration_format import DemonstrationError, DemonstrationFormat, Episode, Progress
+from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
 from .own_files import broken_if_fails, read_origin, require_task
 from .zarr_arrays import open_arrays
@@ -97,7 +97,7 @@ def count_episodes(folder: Path) -> int:
 
 def read_zarr(
     folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
-) -> Iterator[Episode]:
+) -> Iterator[Demonstration]:
     """The first episodes of a store, as `read_demonstrations` returns them, one at a time.
 
     The store does not hold the observation after the last action: the last observation stands there a second time.

@@ -25,7 +25,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 
-from .demonstration_format import MAX_COMPRESSION, DemonstrationError, DemonstrationFormat, Episode, Progress
+from .demonstration_format import MAX_COMPRESSION, Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
 from .own_files import broken_if_fails, read_origin, require_task, stored_bytes
@@ -112,7 +112,7 @@ def _origin(folder: Path) -> dict[str, Any]:
 
 def read_lerobot(
     folder: Path, keys: list[str], num: int | None = None, progress: Progress = iter, env_id: str | None = None
-) -> Iterator[Episode]:
+) -> Iterator[Demonstration]:
     """The first episodes of a dataset, as `read_demonstrations` returns them, one at a time.
 
     LeRobot does not hold the observation after the last action: the last observation stands there a second time.

@@ -15,7 +15,7 @@ import h5py
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
 
-from .demonstration_format import DemonstrationError, DemonstrationFormat, Episode, Progress
+from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .h5_checks import check_trajectories
 
 COUNT = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
@@ -118,7 +118,7 @@ def count_episodes(path: Path) -> int:
 
 def read_demonstrations(
     path: Path, keys: list[str], env_id: str | None = None, num: int | None = None, progress: Progress = iter
-) -> list[Episode]:
+) -> list[Demonstration]:
     """The first episodes of a trajectory file, all in memory: `actions` (T, A) and the observations `keys` (T + 1, ...).
 
     Args:
@@ -141,7 +141,7 @@ def read_trajectories(
     progress: Progress = iter,
     env_id: str | None = None,
     outcomes: tuple[str, ...] = (),
-) -> Iterator[Episode]:
+) -> Iterator[Demonstration]:
     """The episodes that `read_demonstrations` returns, one at a time, so that one of them is in memory.
 
     Args:
@@ -186,13 +186,13 @@ def observation_keys(path: Path) -> list[str]:
     return [*keys, "extra/tcp_pose"]
 
 
-def _outcomes(group: Any, names: tuple[str, ...]) -> Episode:
+def _outcomes(group: Any, names: tuple[str, ...]) -> Demonstration:
     """Arrays of an episode that have one number for each action, of those that the file has."""
     found = {name: group[name][()] for name in names if name in group}
     return {name: values for name, values in found.items() if values.shape == group["actions"].shape[:1]}
 
 
-def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> Episode:
+def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> Demonstration:
     group = file[f"traj_{i}"]
     missing = [key for key in keys if f"obs/{key}" not in group]
     if missing:

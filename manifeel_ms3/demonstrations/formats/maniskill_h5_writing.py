@@ -33,7 +33,7 @@ ENTRY = {"type": "object", "required": ["episode_seed"], "properties": {"episode
 
 
 @dataclass
-class Episode:
+class RecordedEpisode:
     """One recorded episode."""
 
     seed: int
@@ -49,7 +49,7 @@ def episode_file(folder: Path, seed: int) -> Path:
     return folder / f"seed_{seed:08d}.h5"
 
 
-def write_episode(folder: Path, episode: Episode) -> None:
+def write_episode(folder: Path, episode: RecordedEpisode) -> None:
     """Write the file of one episode into a folder.
 
     Raises:
