@@ -16,10 +16,11 @@ import yaml
 
 from baselines.common.train_args import TrainArgs
 from baselines.registry import all_policies
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIELD_OF_VIEW, IMAGE_SIZE
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import training_demos
 from manifeel_ms3.files import write_text
+from manifeel_ms3.rendering.cameras import FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.tasks import scenery
 from manifeel_ms3.tasks import visuotactile_env as env
 from manifeel_ms3.tasks.insertion import base as insertion

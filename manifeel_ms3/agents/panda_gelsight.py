@@ -21,6 +21,7 @@ from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Actor, Pose
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
@@ -59,14 +60,8 @@ ABSOLUTE_LEAD_POS, ABSOLUTE_LEAD_ROT = 0.024, 0.127
 the diagonal, so that an absolute action can do what a delta action can."""
 ABSOLUTE_RANGE_POS, ABSOLUTE_RANGE_ROT = 2.0, 2 * np.pi
 """Largest coordinate, in m, and angle, in rad, of an absolute action (ManiSkill's Panda)."""
-IMAGE_SIZE = 256
-"""Width and height of the policy's cameras' images, in pixels (public code of the paper)."""
-FARTHEST = 10.0
-"""Largest distance that the cameras draw, in m. Set once; not tuned."""
 WRIST_NEAREST = 0.005
 """Smallest distance that the wrist camera draws, in m; it is small since the fingers are near. Set once; not tuned."""
-FIELD_OF_VIEW = np.deg2rad(75)
-"""Field of view of the policy's cameras, in rad (public code of the paper)."""
 FIXED_GRIPPER = "_fixed_gripper"
 """Suffix of the names of control modes without an action for the gripper, which keeps its grip."""
 _POSE = ("x", "y", "z", "roll", "pitch", "yaw")

@@ -16,12 +16,12 @@ from typing import Annotated, Any
 
 import tyro
 
-from manifeel_ms3.agents.panda_gelsight import IMAGE_SIZE
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import file_hash, read_json, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.rendering.cameras import IMAGE_SIZE
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 

@@ -10,10 +10,10 @@ import torch
 from mani_skill.sensors.camera import CameraConfig
 from sapien.physx import PhysxMaterial
 
-from manifeel_ms3.agents.panda_gelsight import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import Box, Part
+from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE, NEAREST
 from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
 from manifeel_ms3.rendering.looks import CONCRETE
 from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, fine_shadow, presentation_shader
@@ -33,8 +33,6 @@ VIDEO_CAMERA_AT, VIDEO_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)
 """Position of the videos' camera, and the point that it looks at, base frame, in m. Chosen by eye."""
 VIDEO_FIELD_OF_VIEW = np.deg2rad(45)
 """Field of view of the videos' camera, in rad. Chosen by eye."""
-NEAREST = 0.01
-"""Smallest distance that the cameras draw, in m. Set once; not tuned."""
 TABLE = Box((1.6, 1.6, 0.04), (0.4, 0.0, -0.02))
 """Table top, base frame, in m; its upper face is at z = 0. Chosen by eye."""
 TABLE_FRICTION = 0.5
