@@ -29,7 +29,7 @@ demo: $(RUN)/report.html
 	@echo "The report: $(abspath $<)"
 
 $(DEMOS): | $(READY)
-	$(PYTHON) -m manifeel_ms3.demonstrations.record $(TASK) --num-demos 120 --workers 2 --out $@ \
+	$(PYTHON) -m manifeel_ms3.demonstrations.record $(TASK) --num-demos 120 --num-procs 2 --out $@ \
 		--obs-mode rgb+tacff --cameras wrist --tactile-sensors right --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/.trained: | $(DEMOS)
@@ -45,7 +45,7 @@ $(RUN)/report.html: $(RUN)/evaluation.json
 	$(PYTHON) -m manifeel_ms3.evaluation.report --run-dir $(RUN)
 
 data: $(READY)
-	$(PYTHON) -m manifeel_ms3.demonstrations.dataset --workers $(WORKERS) --out data/demos
+	$(PYTHON) -m manifeel_ms3.demonstrations.dataset --num-procs $(WORKERS) --out data/demos
 
 benchmark-smoke: $(READY)
 	$(PYTHON) -m baselines.studies configs/smoke.yaml --root runs/smoke

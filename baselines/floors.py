@@ -138,7 +138,9 @@ def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
     cameras = read_header(demos)["env_info"]["env_kwargs"]["cameras"]
     policy = policy_spec("diffusion_policy")
     sensing = ["--env-id", env_id, "--obs-mode", OBS_MODE, "--cameras", *cameras]
-    train = preset_cli(policy, ["cpu", "--demos", str(demos), *sensing, "--steps", "1", "--run-dir", str(folder / "run")])
+    train = preset_cli(
+        policy, ["cpu", "--demo-path", str(demos), *sensing, "--total-iters", "1", "--run-dir", str(folder / "run")]
+    )
     kwargs = json.dumps(dict(checkpoint=str(policy.train(train))))
     observed = dict(obs_mode=OBS_MODE, cameras=tuple(cameras))
     return dict(policy="baselines.references:Untrained", policy_kwargs=kwargs, **observed)

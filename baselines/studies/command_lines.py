@@ -35,7 +35,7 @@ def record_arguments(job: Job, root: Path, workers: int) -> list[str]:
     """Arguments of `manifeel record` for a job."""
     settings = job.settings
     sensing = ["--obs-mode", OBS_MODE, "--cameras", settings["camera"], "--tactile-sensors", "right"]
-    amount = ["--num", str(settings["num"]), "--workers", str(workers)]
+    amount = ["--num", str(settings["num"]), "--num-procs", str(workers)]
     out = ["--env-kwargs", settings["env_kwargs"], "--out", str(trajectory_of(job, root))]
     return [settings["env_id"], *amount, *sensing, *out]
 
@@ -48,7 +48,7 @@ def weights_of(job: Job, root: Path) -> Path:
 def pretrain_arguments(job: Job, root: Path, gpus: float) -> list[str]:
     """Arguments of `python -m baselines.tactile_representations.pretrain` for a job."""
     (record,) = job.needs
-    files = ["--demos", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
+    files = ["--demo-path", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
     return [job.settings["encoder"], *device_arguments(job.kind, gpus), *files]
 
 
@@ -56,7 +56,7 @@ def train_arguments(job: Job, root: Path, gpus: float) -> list[str]:
     """Arguments of `manifeel train <policy>` for a job; the first is the preset. A study's own flags come last and prevail."""
     record, *pretrained = job.needs
     preset, *flags = train_flags(job.settings)
-    files = ["--demos", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root))]
+    files = ["--demo-path", str(trajectory_of(record, root)), "--run-dir", str(job.folder(root))]
     weights = [text for need in pretrained for text in ("--tacrgb-weights", str(weights_of(need, root)))]
     return [preset, *device_arguments(job.kind, gpus), *files, *flags, *weights]
 
@@ -76,7 +76,7 @@ def half_precision_arguments(checkpoint: str, copy: str) -> list[str]:
 
 def evaluate_arguments(job: Job, needs: Resources, checkpoint: str, out: str) -> list[str]:
     """Arguments of `manifeel eval` for one checkpoint of a job."""
-    amount = ["--episodes", str(job.settings["episodes"]), "--workers", str(needs.workers)]
+    amount = ["--num-eval-episodes", str(job.settings["episodes"]), "--num-eval-envs", str(needs.workers)]
     amount += device_arguments(job.kind, needs.gpus)
     stop = ["--stop-at-success"] if job.settings["stop_at_success"] else []
     return ["--checkpoint", checkpoint, *amount, *stop, "--env-kwargs", job.settings["env_kwargs"], "--out", out]

@@ -300,7 +300,7 @@ def inference(policy: str, *flags: str) -> float:
 def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:
     """An untrained policy, its training arguments, and a batch of random observations and actions, on the CPU a small one."""
     preset, *rest = flags
-    args = preset_cli(policy_spec(policy), [preset, "--demos", "-", *rest]).with_task_defaults()
+    args = preset_cli(policy_spec(policy), [preset, "--demo-path", "-", *rest]).with_task_defaults()
     spec, horizon = spec_of(vars(args)), args.policy.obs_horizon
     batch = min(args.batch_size, TRIAL_BATCH) if args.device == "cpu" else args.batch_size
     network = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE).to(args.device)

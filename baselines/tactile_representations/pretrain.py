@@ -142,7 +142,7 @@ def tacrgb_images(files: Iterable[Path], size: int, env_id: str | None = None) -
     for path in files:
         header = read_header(path)
         if env_id not in (None, task := task_of(header)):
-            raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demos")
+            raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demo-path")
         with open_trajectories(path) as file:
             for i in range(len(header["episodes"])):
                 trajectory: Any = file[f"traj_{i}"]

@@ -117,7 +117,8 @@ def _stacked(
     for outcomes in (outcomes for run in evaluated for outcomes in run):
         if sorted(outcomes) != seeds:
             raise ResultError(
-                f"the results of {condition} are of different initial states; evaluate all of them with as many --episodes"
+                f"the results of {condition} are of different initial states; evaluate all of them with the same "
+                "--num-eval-episodes"
             )
     episodes = [outcomes[seed] for run in evaluated for outcomes in run for seed in seeds]
     success = np.array([episode["success_once"] for episode in episodes], float)

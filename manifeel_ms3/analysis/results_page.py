@@ -22,21 +22,21 @@ from manifeel_ms3.evaluation.result import results_by_file, successes_by_the_pap
 from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import all_tasks
 
-from .answers import answers
-from .census import census_table
 from .claims import claims_page, results_of_claims
 from .condition import Condition, condition_of
+from .episode_endings import census_table
 from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table
 from .matching import Found
-from .paper_beside import runtime_table, similarity_table
+from .paper_comparison import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
 from .presets import training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
 from .success_curves import DPI, PANEL, write_curves
+from .touch_gain import touch_gains
 
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
@@ -234,7 +234,7 @@ def page(
     if figures.sensing:
         yield CHART.format(figure=figures.sensing)
     yield from tables_of_the_paper(found, files)
-    yield from answers(found, results)
+    yield from touch_gains(found, results)
     if figures.gentle:
         yield GENTLE.format(figure=figures.gentle)
     yield "\n## What was run\n\n"

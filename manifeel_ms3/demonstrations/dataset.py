@@ -1,4 +1,4 @@
-"""Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --workers 2`.
+"""Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --num-procs 2`.
 
 Each task has two files with ManiSkill's names: `trajectory.h5` with states and actions alone, and
 `trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5` with the same episodes and their observations. A `manifest.json` beside
@@ -54,7 +54,7 @@ class Args:
     """Ids or short names of the tasks to record."""
     num: Annotated[int | None, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = None
     """Number of episodes of each task; as many as the paper recorded if not given."""
-    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
+    workers: Annotated[int, tyro.conf.arg(name="num-procs", aliases=["--workers"])] = 1
     """Number of worker processes."""
     obs_mode: str = "rgb+tacrgb+tacff"
     """Observations to render, joined by "+"; "none" writes states and actions alone."""

@@ -1,4 +1,4 @@
-"""Record demonstrations: `python -m manifeel_ms3.demonstrations.record ManiFeel-PegInsertion-v1 -n 50 --workers 2`.
+"""Record demonstrations: `python -m manifeel_ms3.demonstrations.record ManiFeel-PegInsertion-v1 -n 50 --num-procs 2`.
 
 Seeds are tried in order until `num` episodes have succeeded; any number of workers gives the same episodes. A run that was
 killed continues where it stopped when the same command is given again.
@@ -45,7 +45,7 @@ class Args:
     """Id of the task, such as ManiFeel-PegInsertion-v1, or its short name, such as PegInsertion."""
     num: Annotated[int, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = 50
     """Number of successful episodes to record into the file."""
-    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
+    workers: Annotated[int, tyro.conf.arg(name="num-procs", aliases=["--workers"])] = 1
     """Number of worker processes."""
     seed: int = 0
     """First seed to try. Seeds from 100000 on are for evaluation."""

@@ -57,7 +57,7 @@ class Args:
     """Width and height of camera images in pixels; those of the recording, 256 by default, if not given."""
     control_mode: str | None = None
     """Controller to which the actions are converted, such as pd_joint_pos; that of the recording if not given."""
-    workers: Annotated[int, tyro.conf.arg(aliases=["--num-procs"])] = 1
+    workers: Annotated[int, tyro.conf.arg(name="num-procs", aliases=["--workers"])] = 1
     """Number of worker processes."""
     num: Annotated[int | None, tyro.conf.arg(name="num-demos", aliases=["-n", "--num"])] = None
     """Number of episodes to render; all of them if not given."""

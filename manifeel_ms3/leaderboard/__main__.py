@@ -23,11 +23,11 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.files import write_json
 
+from .adding import take
 from .checks import check
 from .page import rows_on, write_page
 from .rerun import about_with_checkpoints, checkpoint_sources, name_checkpoints, policy_sources, run_again
 from .submission import ABOUT, Submission, read_submission
-from .taking import take
 
 log = logging.getLogger(__name__)
 

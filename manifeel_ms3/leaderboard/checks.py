@@ -103,7 +103,7 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
         missing, foreign = sorted(set(seeds) - set(given)), sorted(set(given) - set(seeds))
         faults.append(
             f"its {len(given)} episodes are not those of the {EPISODES} evaluation seeds from {seeds[0]} on (missing "
-            f"{missing[:SHOWN]}, foreign {foreign[:SHOWN]}, or in another order); evaluate with --episodes {EPISODES}"
+            f"{missing[:SHOWN]}, foreign {foreign[:SHOWN]}, or in another order); evaluate with --num-eval-episodes {EPISODES}"
         )
     if result["revision"] != here:
         faults.append(

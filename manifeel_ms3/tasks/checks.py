@@ -54,7 +54,7 @@ def check_num_envs(num_envs: Any) -> None:
     if num_envs > 1 and not torch.cuda.is_available():
         raise MachineError(
             f"num_envs={num_envs}: many environments in one process need a CUDA GPU, and torch finds none; use several "
-            "processes (gymnasium's AsyncVectorEnv, --workers of the commands)"
+            "processes (gymnasium's AsyncVectorEnv, --num-procs and --num-eval-envs of the commands)"
         )
 
 

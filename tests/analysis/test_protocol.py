@@ -6,8 +6,8 @@ from dataclasses import asdict
 import numpy as np
 import pytest
 
-from manifeel_ms3.analysis.census import census_table
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
+from manifeel_ms3.analysis.episode_endings import census_table
 from manifeel_ms3.analysis.estimates import _weights, difference, holm, mean_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in

@@ -14,9 +14,9 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InUseError
 from manifeel_ms3.files import FileWriteError
 from manifeel_ms3.leaderboard import untrusted
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
+from manifeel_ms3.leaderboard.adding import take
 from manifeel_ms3.leaderboard.page import rows_on
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
-from manifeel_ms3.leaderboard.taking import take
 from manifeel_ms3.ownership import owned
 from tests.leaderboard.made_up import made_up
 

@@ -20,8 +20,8 @@ from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
+from .folder_checks import broken_if_fails, read_origin, require_task
 from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
-from .own_files import broken_if_fails, read_origin, require_task
 from .zarr_arrays import open_arrays
 
 ENDS, ACTION = "meta/episode_ends", "data/action"

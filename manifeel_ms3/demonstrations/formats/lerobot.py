@@ -26,9 +26,9 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 
 from .demonstration_format import MAX_COMPRESSION, Demonstration, DemonstrationError, DemonstrationFormat, Progress
+from .folder_checks import broken_if_fails, read_origin, require_task, stored_bytes
 from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
-from .own_files import broken_if_fails, read_origin, require_task, stored_bytes
 
 MP4 = b"ftyp"
 """Bytes 4 to 8 of an mp4 file (ISO 14496-12, section 4.3); a playlist of that name would make ffmpeg read other files."""

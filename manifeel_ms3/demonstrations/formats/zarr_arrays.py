@@ -13,7 +13,7 @@ from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
 
 from .demonstration_format import MAX_COMPRESSION, DemonstrationError
-from .own_files import broken_if_fails, stored_bytes
+from .folder_checks import broken_if_fails, stored_bytes
 
 CHUNKS_PER_FILE = 64
 """Largest number of chunks of an array per file of the store. zarr does not store chunks that hold only zeros, but not every

@@ -5,8 +5,8 @@ from typing import Any
 
 from manifeel_ms3.evaluation.result import ResultError
 
-from .census import endings_of
 from .condition import Condition
+from .episode_endings import endings_of
 from .estimates import SIGNIFICANT, difference, has_enough_seeds
 from .matching import Found, answering
 from .paper import MODES, TABLE_I, VISION, Rate, paper_condition
@@ -25,7 +25,7 @@ NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), str
 """Names of the observation modes in the text."""
 
 
-def answers(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
+def touch_gains(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
     """Markdown, part by part; nothing if no task was run both with and without touch.
 
     Args:

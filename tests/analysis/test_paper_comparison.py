@@ -3,7 +3,7 @@
 import pytest
 
 from manifeel_ms3.analysis.paper import RUNTIME_DEMOS, TACRGB
-from manifeel_ms3.analysis.paper_beside import runtime_table
+from manifeel_ms3.analysis.paper_comparison import runtime_table
 from manifeel_ms3.evaluation.result import results_in
 
 from .made_up import TOTAL_STEPS, write_run
