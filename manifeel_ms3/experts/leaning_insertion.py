@@ -22,6 +22,13 @@ class LeaningConfig(InsertionExpertConfig):
     """As in `InsertionExpertConfig`, in N; smaller, since the leading corner is a small contact. Tuned."""
     press_force: float = 8.0
     """As in `InsertionExpertConfig`, in N. Tuned."""
+    corner_aim: float = 0.75
+    """Distance of the place where the leading corner is first set down from the hole's own corner, as a share of the hole's
+    half size: near its middle, which allows for the error of sight. Tuned."""
+    lead: float = 0.0007
+    """Depth, in m, that the leading corner can reach before the plug's other side meets the hole's. Tuned."""
+    leans: tuple[float, float] = (float(np.deg2rad(5.0)), float(np.deg2rad(12.0)))
+    """Smallest and largest lean of the plug along x and along y, in rad. Tuned."""
     search_radius: float = 0.0012
     """Distance of the second and later landing places from the first, in m. Tuned."""
     search_places: int = 6
@@ -61,14 +68,26 @@ class LeaningInsertionExpert(InsertionExpert):
 
     def __init__(self, env: InsertionEnv, seed: int):
         super().__init__(env, seed)
-        fit = env.fit
-        self._corner = np.array([fit.corner[0], -fit.corner[1], fit.reach])  # plug frame: z ahead, y turned over
-        down_x, down_y = np.sign(fit.corner) * fit.lean
+        corner, self._aim, lean = self._leading_corner()
+        self._corner = np.array([corner[0], -corner[1], env.fit.reach])  # plug frame: z ahead, y turned over
+        down_x, down_y = np.sign(corner) * lean
         self._lean = Rotation.from_euler("xy", [-down_y, down_x])
         self._lean_on_edge = Rotation.from_euler("x", -down_y)
 
+    def _leading_corner(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The corner that goes ahead, where it is set down, and the plug's lean.
+
+        Returns:
+            Corner of the foremost face when the plug is in, (x, y) in m from the socket's axis.
+            Place where it is set down, well within the hole, in the same form.
+            Lean along x and along y, in rad.
+        """
+        config, hole, hole_at = self.config, np.array(self.fit.hole), np.array(self.fit.hole_at)
+        lean = np.clip(np.arctan(config.lead / ((2 - config.corner_aim) * hole)), *config.leans)
+        return hole_at + self.fit.pin, hole_at + (1 - config.corner_aim) * hole, lean
+
     def _enter(self) -> Actions:
-        over = np.array([*(self.socket[:2] + self.fit.aim), self._rim])
+        over = np.array([*(self.socket[:2] + self._aim), self._rim])
         start = self._tool_for(self._corner, above(over, self.config.hover_height), self._lean)
         yield from self.skills.reach(*start, tolerance=self.config.approach_tolerance)
         yield from self._touch_down(over, self._lean)
@@ -127,7 +146,24 @@ class LeaningPowerPlugExpert(LeaningInsertionExpert):
     config = LeaningConfig(light_press=1.0)  # tuned
 
 
+@dataclass(frozen=True)
+class LeaningGearConfig(LeaningConfig):
+    """Constants of the demonstrator that leans a gear."""
+
+    twist: float = 0.10
+    """As in `InsertionExpertConfig`. Tuned."""
+    beside: float = 0.0022
+    """Distance from the shaft's side to where the bore's rim is set down, in m. Tuned."""
+    lean: tuple[float, float] = (float(np.deg2rad(7.0)), float(np.deg2rad(5.0)))
+    """Lean of the gear along x and along y, in rad. Tuned."""
+
+
 class LeaningGearExpert(LeaningInsertionExpert):
     """Puts a gear's bore over its shaft like a plug into a socket, feeling for the shaft's side with the bore's rim."""
 
-    config = LeaningConfig(twist=0.10)  # tuned
+    config = LeaningGearConfig()
+
+    def _leading_corner(self):
+        diagonal, config = -np.sqrt(0.5), self.config
+        corner, aim = diagonal * np.array(self.fit.hole), diagonal * (np.array(self.fit.pin) + config.beside)
+        return corner, aim, np.array(config.lean)

@@ -108,7 +108,7 @@ class PegReorientationExpert(LeaningInsertionExpert):
     def _turn_peg(self, towards: float) -> Actions:
         """Push the peg upright, its end towards +x (1.0) or -x (-1.0) of the hand, against the rim's outside."""
         skills, config = self.skills, self.config
-        corner = np.array([towards * self.fit.corner[0], 0.0, self.fit.reach])  # plug frame
+        corner = np.array([towards * self.fit.pin[0], 0.0, self.fit.reach])  # plug frame
         beside = self.socket[0] - towards * (self._half_width + config.start_gap)
         start = np.array([beside, self.socket[1], self._rim - config.contact_depth])
         for height in (config.contact_depth + config.hover_height, 0.0):

@@ -60,6 +60,8 @@ class ScrewingExpertConfig:
     """Largest rotation under torque, in rad per step. Tuned."""
     slow_torque: float = 0.03
     """Torque, in N m, above which the hand turns slower. Tuned."""
+    tightening: float = float(np.deg2rad(40))
+    """Rotation of the part once it is at its final height, in rad. Tuned."""
     tighten_torque: float = 0.16
     """Torque, in N m, at which the hand stops turning and holds: above the 0.1 N m that BulbInstallation asks for. Tuned."""
     turn_force: float = 1.5
@@ -204,7 +206,7 @@ class ScrewingExpert:
         height = self._height()
         yield from skills.move_fingers(self._open, config.open_steps)
         here = skills.tool[0] + self._in_hand()
-        left = (height - self.screw.seated) / self.screw.pitch * 2 * np.pi + self.screw.tightening
+        left = (height - self.screw.seated) / self.screw.pitch * 2 * np.pi + config.tightening
         period = self.screw.symmetry
         back = self.yaw + period * np.clip(np.ceil(left / period), 1, np.floor(config.sweep / period))
         while self.yaw < back:
@@ -219,6 +221,7 @@ class BulbExpert(ScrewingExpert):
     """Screws in a bulb that it holds, or one that already sits in the holder's thread (`start="holder"`)."""
 
     config = ScrewingExpertConfig(
+        tightening=float(np.deg2rad(120)),  # tuned
         release_force=4.0,  # tuned: when the bulb meets the contact, the holder's thread must take the load, not the hand
         follow=0.2,  # tuned: a round part that slips between the pads would slip out of them
     )

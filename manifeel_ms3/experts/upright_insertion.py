@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.geometry.fits import MeetingFaces
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
 from manifeel_ms3.tasks.registry import register_demonstrator
 
@@ -45,6 +46,12 @@ class UprightConfig(InsertionExpertConfig):
     """Lean of a gear, in rad, from which on it has slipped in the hand and is set down anew. Tuned."""
     shallow: float = 0.012
     """Depth of the gear's end below the shaft's tip, in m, up to which a gear that slipped is set down anew. Tuned."""
+    early: tuple[float, ...] = (0.002, 0.0005)
+    """Depth before a pair of faces meets, in m, from which on a contact is taken for theirs, because the place of the
+    plug's end is not known exactly; of the first pair and of the second. Tuned."""
+    meeting_span: float = 0.003
+    """Descent, in m, over which the contact of a pair of faces tells a direction; deeper, the pin is in the hole. Set once;
+    not tuned."""
     centred: float = 0.0008
     """Distance of the contact from the middle, in m, below which it shows no direction. Tuned."""
 
@@ -81,15 +88,24 @@ class UprightInsertionExpert(InsertionExpert):
         return self.config.aim_error * share * np.array([np.cos(angle), np.sin(angle)])
 
     def _aside(self, load: np.ndarray) -> np.ndarray:
-        config, lead = self.config, self.fit.lead_at(self._rim - self._place(self._end)[2])
-        if lead is None or load[2] < config.sure_force:
+        config, faces = self.config, self._meeting_faces()
+        if faces is None or load[2] < config.sure_force:
             return np.zeros(2)
-        moment = self.skills.load_moment(self._place(self._end + np.array([*lead.middle, 0.0])))
-        contact = lead.tells * np.array([-moment[1], moment[0]]) / load[2]
+        moment = self.skills.load_moment(self._place(self._end + np.array([*faces.middle, 0.0])))
+        contact = faces.tells * np.array([-moment[1], moment[0]]) / load[2]
         distance = np.linalg.norm(contact)
         if distance < config.centred:
             return np.zeros(2)
-        return (config.slide if lead.is_pin_below else -config.slide) * contact / distance
+        return (config.slide if faces.is_pin_below else -config.slide) * contact / distance
+
+    def _meeting_faces(self) -> MeetingFaces | None:
+        """The pair of faces that meets at the plug's present depth; None if none does."""
+        depth, found = self._rim - self._place(self._end)[2], None
+        for faces, early in zip(self.fit.meeting_faces, self.config.early, strict=False):
+            first = faces.depth - early
+            if first <= depth < first + self.config.meeting_span:
+                found = faces
+        return found
 
 
 class UprightGearExpert(UprightInsertionExpert):

@@ -7,7 +7,7 @@ import numpy as np
 
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, DARK_PLASTIC, STEEL, Look
 
-from .fits import ABOVE_RIM, Fit, Lead
+from .fits import Fit, MeetingFaces
 from .materials import ABS, ALUMINIUM
 from .part import Box, Cylinder, Hulls, Part, Piece, extruded, lofted, ring_of_wedges
 
@@ -39,12 +39,8 @@ RING_OVERLAP = 2e-4
 """Distance by which the ring around the bore and the teeth overlap, in m, so that no gap is between them."""
 NECK_RADIUS = 0.010
 """Radius of the ring between the medium gear and its handle, in m. Chosen by eye."""
-LEAN = (np.deg2rad(7.0), np.deg2rad(5.0))
-"""Lean along x and along y, in rad, with which the bore's rim goes ahead. Tuned."""
 GEAR_FRICTION = 0.15
 """Coulomb's friction coefficient of greased gears."""
-BESIDE = 0.0022
-"""Distance from the shaft's side to where the bore's rim is set down, in m. Tuned."""
 TIP_POINTS = 24
 """Number of corners of a shaft's chamfer, which lies at most 0.04 mm inside its circle."""
 FLANK_POINTS = 5
@@ -147,7 +143,6 @@ def gear_fit(fit: str = "paper") -> Fit:
     reach = top + THICKNESS["medium"]
     body = gear_hulls(TEETH["medium"], sizes.bore, top, reach)
     ring = Cylinder(NECK_RADIUS, RING_HEIGHT, (0.0, 0.0, top - RING_HEIGHT / 2))
-    diagonal = np.sqrt(0.5)
     return Fit(
         plug=Part(
             "medium_gear",
@@ -164,12 +159,11 @@ def gear_fit(fit: str = "paper") -> Fit:
         grip_width=HANDLE_SIZE[1],
         rim=BASE_SIZE[2] + SHAFT_HEIGHT,
         floor=BASE_SIZE[2],
-        corner=(-diagonal * sizes.bore,) * 2,
-        aim=(-diagonal * (sizes.shaft + BESIDE),) * 2,
-        lean=LEAN,
+        pin=(sizes.shaft, sizes.shaft),
+        hole=(sizes.bore, sizes.bore),
         clearance=sizes.clearance,
         goes_in_upright=fit == "paper",
-        leads=(Lead(ABOVE_RIM, is_pin_below=True),),
+        meeting_faces=(MeetingFaces(is_pin_below=True),),
     )
 
 

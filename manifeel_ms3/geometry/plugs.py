@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, BRASS
 
 from . import materials
-from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
+from .fits import UNSEATED_SHARE, Fit, MeetingFaces
 from .part import Box, Part, block_with_chamfered_holes, block_with_holes
 
 PEG_SIZE = (0.01196, 0.00791, 0.050)
@@ -48,7 +48,6 @@ def peg_fit(fit: str = "paper") -> Fit:
     side, floor = socket.plate
     block = block_with_chamfered_holes(PEG_BLOCK, socket.depth, [(socket.hole, (0.0, 0.0))], floor, socket.chamfer)
     plate = (Box((side, side, floor), (0.0, 0.0, floor / 2)),) if floor else ()
-    half_hole = (socket.hole[0] / 2, socket.hole[1] / 2)
     return Fit(
         plug=Part("peg", (Box(PEG_SIZE),), look=BRASS, density=materials.BRASS),
         socket=Part("socket", (*block, *plate), look=BLUE_PLASTIC),
@@ -58,8 +57,9 @@ def peg_fit(fit: str = "paper") -> Fit:
         rim=floor + socket.depth,
         floor=floor,
         goes_in_upright=fit == "paper",
-        leads=(Lead(ABOVE_RIM),),
-        **Fit.into_hole((PEG_SIZE[0] / 2, PEG_SIZE[1] / 2), half_hole),
+        pin=(PEG_SIZE[0] / 2, PEG_SIZE[1] / 2),
+        hole=(socket.hole[0] / 2, socket.hole[1] / 2),
+        meeting_faces=(MeetingFaces(),),
     )
 
 
@@ -89,5 +89,6 @@ def reorientation_fit() -> Fit:
         rim=RIM_BOTTOM + RIM_DEPTH,
         floor=RIM_BOTTOM,
         max_gap=UNSEATED_SHARE * RIM_DEPTH,
-        **Fit.into_hole((x / 2, y / 2), (hole[0] / 2, hole[1] / 2)),
+        pin=(x / 2, y / 2),
+        hole=(hole[0] / 2, hole[1] / 2),
     )

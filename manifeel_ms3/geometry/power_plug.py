@@ -7,7 +7,7 @@ import numpy as np
 from manifeel_ms3.rendering import looks
 
 from . import materials
-from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
+from .fits import UNSEATED_SHARE, Fit, MeetingFaces
 from .part import Box, Cylinder, Holes, Hulls, Part, Piece, bevelled_box, block_with_chamfered_holes, lofted
 
 ARC_POINTS = 8
@@ -113,8 +113,10 @@ def power_fit(fit: str = "paper") -> Fit:
         floor=floor,
         max_gap=UNSEATED_SHARE * sizes.blade[2],
         goes_in_upright=fit == "paper",
-        leads=(Lead(ABOVE_RIM, (sizes.offset / 2, 0.0)),),
-        **Fit.into_hole((ground[0] / 2, ground[1] / 2), (hole[0] / 2, hole[1] / 2), (sizes.offset / 2, 0.0)),
+        pin=(ground[0] / 2, ground[1] / 2),
+        hole=(hole[0] / 2, hole[1] / 2),
+        hole_at=(sizes.offset / 2, 0.0),
+        meeting_faces=(MeetingFaces(middle=(sizes.offset / 2, 0.0)),),
     )
 
 

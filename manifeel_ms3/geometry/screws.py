@@ -37,8 +37,6 @@ class Screw:
     """Height of one turn of the thread."""
     seated: float
     """Height of the held part's origin over the underside of the fixed one at which it is far enough in."""
-    tightening: float
-    """Angle, in rad, by which the held part is turned further once it is at the height `seated`."""
     reach: float
     """Distance below the held part's origin at which its thread begins."""
     symmetry: float
@@ -75,8 +73,8 @@ NUT_TURNS, NUT_MOUTH = 2.0, 0.0015
 """Number of turns of the nut's ridge, and height of the free mouth below it, in m. Set once; not tuned."""
 NUT_DESCENT = 1.5
 """Descent of the nut from the first contact of the threads to the goal, in pitches. Our choice."""
-NUT_TIGHTENING, NUT_SYMMETRY = np.deg2rad(40), np.deg2rad(60)
-"""Angle by which the nut is turned further at the end, tuned, and the symmetry of a hexagon, in rad."""
+NUT_SYMMETRY = np.deg2rad(60)
+"""Symmetry of a hexagon, in rad."""
 NUT_GRIP_FORCE = 27.0
 """Force of each pad on the nut, in N. Set once; not tuned."""
 NUT_ENGAGED = 0.0018
@@ -128,7 +126,6 @@ def nut_and_bolt() -> Screw:
         engaged=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED,
         pitch=M16.pitch,
         seated=BOLT_FOOT + BOLT_LENGTH + NUT_ENGAGED - NUT_DESCENT * M16.pitch,
-        tightening=NUT_TIGHTENING,
         reach=NUT_HEIGHT / 2,
         symmetry=NUT_SYMMETRY,
         grip_force=NUT_GRIP_FORCE,
@@ -180,9 +177,8 @@ the lower end of what is measured of silicone gels (0.75 to 1). Flat parts do wi
 torque of an even pressure, and a round part none of it (docs/sensor.md)."""
 LEAD_IN = 0.25
 """Number of turns over which the cap's ridge rises. Set once; not tuned."""
-BULB_TIGHTENING, BULB_SYMMETRY = np.deg2rad(120), np.deg2rad(15)
-"""Angle by which the bulb is turned further at the end, tuned, and step of the angles at which the round bulb is
-grasped, in rad."""
+BULB_SYMMETRY = np.deg2rad(15)
+"""Step of the angles at which the round bulb is grasped, in rad. Set once; not tuned."""
 BULB_GRIP_FORCE = 12.0
 """Force of each pad on the bulb, in N. Set once; not tuned."""
 BULB_DENSITY = 400.0
@@ -262,7 +258,6 @@ def bulb_and_holder() -> Screw:
         engaged=BULB_SEATED + BULB_TRAVEL,
         pitch=E27.pitch,
         seated=BULB_SEATED,
-        tightening=BULB_TIGHTENING,
         reach=-CAP_FOOT,
         symmetry=BULB_SYMMETRY,
         grip_force=BULB_GRIP_FORCE,

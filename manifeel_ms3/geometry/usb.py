@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from manifeel_ms3.rendering import looks
 
-from .fits import ABOVE_RIM, UNSEATED_SHARE, Fit, Lead
+from .fits import UNSEATED_SHARE, Fit, MeetingFaces
 from .materials import STEEL
 from .part import Box, Part, Piece, block_with_holes
 
@@ -12,8 +12,6 @@ HANDLE = (0.012, 0.030, 0.070)
 """Size of the handle, in m; it is narrower than a pad, so that the pad feels its edges."""
 GRIP = -0.012
 """Distance of the middle between the pads from the handle's middle along the plug's z, in m. Set once; not tuned."""
-ABOVE_TONGUE = 0.0005
-"""Height over the tongue's end, in m, from which on the plug may meet it. Chosen by hand."""
 BLOCK, RIM = (0.066, 0.066), 0.037
 """Size of the port's block along x and y, and its height, in m. Set once; not tuned."""
 
@@ -105,11 +103,12 @@ def usb_fit(fit: str = "paper") -> Fit:
         floor=floor,
         max_gap=UNSEATED_SHARE * sizes.port[2],
         goes_in_upright=fit == "paper",
-        leads=(
-            Lead(ABOVE_RIM),
-            Lead(sizes.recess - ABOVE_TONGUE, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
+        pin=(prong[0] / 2, prong[1] / 2),
+        hole=(hole[0] / 2, hole[1] / 2),
+        meeting_faces=(
+            MeetingFaces(),
+            MeetingFaces(sizes.recess, _along(sizes, 0.0, sizes.tongue_at), _along(sizes, 0.0, 1.0), is_pin_below=True),
         ),
-        **Fit.into_hole((prong[0] / 2, prong[1] / 2), (hole[0] / 2, hole[1] / 2)),
     )
 
 
