@@ -76,7 +76,7 @@ def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch
         InvalidArgumentError: The action is not made of numbers, has another shape, or holds NaN or infinity.
     """
     try:
-        array = action.detach() if isinstance(action, torch.Tensor) else torch.from_numpy(np.array(action, np.float32))
+        array = action.detach().clone() if isinstance(action, torch.Tensor) else torch.from_numpy(np.array(action, np.float32))
         tensor = array.to(device, torch.float32)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InvalidArgumentError(f"the action is no array of numbers ({error}): {action!r}") from error
