@@ -140,6 +140,8 @@ class LimitedLeadEEPoseController(PDEEPoseController):
     def set_state(self, state: dict):
         if state:  # the state of some controllers is empty
             self._target_pose = Pose.create(state["target_pose"])
+            if not self.scene.gpu_sim_enabled:  # on a GPU, the next action sets the drives of all environments
+                self.set_drive_targets(solve_ik(self.kinematics, self._target_pose, self.articulation.get_qpos()))
 
 
 @dataclass

@@ -73,21 +73,20 @@ class RandomLooks:
         cameras: dict[str, sapien.render.RenderCameraComponent],
     ):
         self.ranges, self.scene, self.lamp, self.cameras = ranges, scene, lamp, cameras
-        self.episodes = 0  # number drawn in this scene: without a new seed, ManiSkill keeps the last one in a reset
         self.light = np.array(scene.ambient_light), np.array(lamp.color)
         self.poses = {name: camera.local_pose for name, camera in cameras.items()}
         parts = {name: actor for name, actor in scene.actors.items() if name not in (TABLE, FLOOR)}
         self.colours = {name: [(m, np.array(m.base_color[:3])) for m in _materials([part])] for name, part in parts.items()}
         self.table = _materials([scene.actors[TABLE]])
 
-    def draw(self, seed: int) -> dict[str, Any]:
-        """Draw the looks of the scene's next episode and apply them; return what was drawn, by name.
+    def draw(self, seed: int, episode: int = 0) -> dict[str, Any]:
+        """Draw the looks of an episode and apply them; return what was drawn, by name.
 
         Args:
             seed: Seed of the episode.
+            episode: Number of earlier episodes with this seed.
         """
-        ranges, start = self.ranges, [seed, STREAM, self.episodes]
-        self.episodes += 1
+        ranges, start = self.ranges, [seed, STREAM, episode]
 
         def stream(name: str) -> np.random.Generator:
             return np.random.default_rng([*start, crc32(name.encode())])  # each stream is independent of what else is random

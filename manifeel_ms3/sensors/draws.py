@@ -3,14 +3,37 @@
 # (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
 """Random numbers that are functions of an episode's seed, for many episodes at once."""
 
+from zlib import crc32
+
 import numpy as np
 import torch
 import warp as wp
 
 from .warp_device import warp_device
 
+LOWEST_32_BITS = (1 << 32) - 1
+"""Mask of the part of a seed from which is drawn."""
 STREAM_STRIDE = 1 << 20
 """Distance of the offsets at which streams begin: more than the numbers that any stream draws."""
+
+
+EPISODE_STRIDE = 0x9E3779B1
+"""Odd number by whose multiples the seeds of episodes differ that have the same seed of a reset: Knuth's multiplicative hash,
+2^32 divided by the golden ratio."""
+UNCHANGED = "tactile_right"
+"""Pad that draws from the episode's seed itself, as it did before the pads' draws were told apart."""
+
+
+def pad_seeds(seeds: np.ndarray, episodes: np.ndarray, pad: str) -> np.ndarray:
+    """Seeds (n,) from which a pad draws, others for each pad and for each episode.
+
+    Args:
+        seeds: Seeds (n,) of the last resets with a seed.
+        episodes: Numbers (n,) of earlier episodes since then.
+        pad: Name of the pad.
+    """
+    of_pad = 0 if pad == UNCHANGED else crc32(pad.encode())
+    return seeds ^ of_pad ^ (episodes * EPISODE_STRIDE & LOWEST_32_BITS)
 
 
 @wp.kernel

@@ -13,6 +13,7 @@ from manifeel_ms3.errors import UnknownNameError
 from .config import TactileSensorConfig
 from .depth.depth_camera import CameraDepth
 from .depth.raycast import RaycastDepth
+from .draws import pad_seeds
 from .mechanics.wrench import WrenchGauge
 from .touch_model import OUTPUTS, TouchModel
 from .visualisation import force_field_images
@@ -95,14 +96,17 @@ class TactileSensor(BaseSensor):
         """What the present episodes drew of the sensor's imperfections, (N, ...) each; empty for a perfect sensor."""
         return self.model.drawn_imperfections
 
-    def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None) -> None:
+    def reset(self, env_idx: torch.Tensor, seeds: np.ndarray | None = None, episodes: np.ndarray | None = None) -> None:
         """Begin an episode in these environments, without shear.
 
         Args:
             env_idx: Indices (n,) of the environments.
             seeds: Seeds (n,) of noise and randomization; 0 if not given.
+            episodes: Numbers (n,) of earlier episodes with these seeds; 0 if not given.
         """
-        self.model.reset(env_idx, np.zeros(len(env_idx), int) if seeds is None else np.asarray(seeds))
+        zeros = np.zeros(len(env_idx), np.int64)
+        seeds, episodes = (zeros if given is None else np.asarray(given) for given in (seeds, episodes))
+        self.model.reset(env_idx, pad_seeds(seeds, episodes, self.config.uid))
 
     def forget_readings(self, env_idx: torch.Tensor) -> None:
         """Let the next observation of these environments be the first one that shear and imperfections remember."""

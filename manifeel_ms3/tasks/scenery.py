@@ -125,10 +125,10 @@ class SceneryEnv(SensingEnv):
             cameras = {name: self._sensors[name].camera._render_cameras[0] for name in self._camera_names}
             self._random_looks = RandomLooks(self.visual_randomization, self.scene, self._lamps[0], cameras)
 
-    def _draw_looks(self, seed: int) -> None:
-        """Draw the looks of an episode from its seed, if they are random."""
+    def _draw_looks(self, seed: int, episode: int) -> None:
+        """Draw the looks of an episode from its seed and the number of earlier episodes with it, if they are random."""
         if self._random_looks is not None:
-            drawn = self._random_looks.draw(seed)
+            drawn = self._random_looks.draw(seed, episode)
             self._looks = {
                 name: torch.as_tensor(value, dtype=torch.float32, device=self.device)[None] for name, value in drawn.items()
             }

@@ -1,14 +1,81 @@
-"""States of an environment as vectors."""
+"""States of an environment: how they are set, and their forms as trees and as vectors."""
 
+# pyright: reportArgumentType=false, reportIncompatibleMethodOverride=false
+# (ManiSkill annotates states as tensors, and has dicts of them)
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import torch
+from mani_skill.utils import common
 
 from manifeel_ms3.errors import InvalidArgumentError
 
+from .sensing import SensingEnv
+
 Tree = Mapping[str, Any]
 """Nested dicts of tensors (N, D)."""
+
+
+class RestorableEnv(SensingEnv):
+    """An environment whose states can be set, with the forces and the controllers' targets that belong to them."""
+
+    def _state_has_changed(self, changed: torch.Tensor | slice, joint_forces: torch.Tensor | None) -> None:
+        """Do what a task must do after a state was set.
+
+        Args:
+            changed: Indices of the environments whose state has changed.
+            joint_forces: Forces and moments (N, L, 6), N and N m, of the joints of the robot's L links in the new state, if
+                they are known.
+        """
+        raise NotImplementedError
+
+    def get_state_dict(self) -> dict[str, Any]:
+        """Copy of the present state; ManiSkill returns the controllers' own targets, which a reset changes."""
+        return _copied(super().get_state_dict())
+
+    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None):
+        """Set the state. Setting the present state again changes nothing.
+
+        In particular, it keeps the engine's memory of contacts, which no state holds, and on which the last bits of an episode
+        depend. Contact forces are no part of a state either. On the CPU, a physics step in the new state finds them, and then
+        the state is set again; on a GPU, touch has the forces of the last state until the next step. Shear is that of a motion
+        from the last state to this one.
+        """
+        if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
+            return
+        self._set_all_of_state(state, env_idx)
+        forces = None
+        if not self.gpu_sim_enabled:
+            self.scene.step()
+            forces = self.agent.robot.get_link_incoming_joint_forces()
+            self._set_all_of_state(state, env_idx)
+        self._state_has_changed(slice(None) if env_idx is None else env_idx, forces)
+
+    def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
+        """Set the state from the vectors (N, D) of `get_state`, which hold the controller's targets, too."""
+        self.set_state_dict(unflattened(common.to_tensor(state, self.device), self._init_raw_state), env_idx)
+
+    def _set_all_of_state(self, state: dict, env_idx: torch.Tensor | None) -> None:
+        """Set the states of bodies and controllers."""
+        super().set_state_dict(state, env_idx)
+        if "controller" in state:  # ManiSkill's controllers take the states of all environments
+            changed = slice(None) if env_idx is None else env_idx
+            self.agent.set_controller_state(with_rows(self.agent.get_controller_state(), changed, state["controller"]))
+
+    @contextmanager
+    def _others_unchanged(self, env_idx: torch.Tensor) -> Iterator[None]:
+        """Restore the other environments' states afterwards, with their controllers' targets; their pads are not read again."""
+        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
+        others[env_idx] = False
+        if not others.any():
+            yield
+            return
+        running = others.nonzero()[:, 0]
+        state, were_stale = rows(self.get_state_dict(), running), self._touch_is_stale[running].clone()
+        yield
+        self._set_all_of_state(state, running)
+        self._touch_is_stale[running] = were_stale
 
 
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
@@ -25,6 +92,10 @@ def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
     if state.ndim != 2 or state.shape[1] != sum(widths):
         raise InvalidArgumentError(f"a state of shape {tuple(state.shape)} is given; get_state returns (N, {sum(widths)})")
     return _filled(like, iter(state.split(widths, dim=1)))
+
+
+def _copied(tree: Tree) -> dict[str, Any]:
+    return {name: _copied(value) if isinstance(value, Mapping) else value.clone() for name, value in tree.items()}
 
 
 def rows(tree: Tree, idx: torch.Tensor) -> dict[str, Any]:

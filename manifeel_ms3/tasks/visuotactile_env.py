@@ -2,15 +2,14 @@
 
 # pyright: reportArgumentType=false
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import numpy as np
 import sapien
 import torch
 from gymnasium.envs.registration import EnvSpec
-from mani_skill.utils import common
 from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConfig
 
 from manifeel_ms3.agents import PandaGelSight
@@ -31,7 +30,7 @@ from .checks import check_num_envs, check_seed, checked_randomization, split_sen
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
-from .states import is_part_of, rows, unflattened, with_rows
+from .states import RestorableEnv
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
@@ -55,7 +54,7 @@ CONTACTS: dict[str, Any] = dict(
 """Settings of the engine's contact solver: fields of ManiSkill's `SceneConfig`."""
 
 
-class VisuotactileEnv(SceneryEnv):
+class VisuotactileEnv(RestorableEnv, SceneryEnv):
     """Base class of the ManiFeel tasks: a Panda with two tactile fingers at the origin of a table, x ahead, z up.
 
     The observation mode joins ManiSkill's modes with `tacrgb` and `tacff` by "+". An observation holds what the mode asks for:
@@ -120,6 +119,9 @@ class VisuotactileEnv(SceneryEnv):
     """Largest value of the dense reward."""
     agent: PandaGelSight
     _spec: EnvSpec | None = None
+    _episodes_of_seed: np.ndarray
+    """Number of episodes (N,) that each environment has begun since a reset with a seed. ManiSkill keeps that seed in resets
+    without one, so that draws from the seed alone would be the same in every episode."""
 
     def __init__(
         self,
@@ -282,19 +284,27 @@ class VisuotactileEnv(SceneryEnv):
         The engine's solver remembers earlier episodes. Only in a new scene is an episode a function of its seed alone, bit for
         bit. Where several environments share a process, ManiSkill seeds the draws of their initial states with the first
         environment's seed: they are then functions of that seed and of the number of environments.
+
+        The option `reset_to_env_states` begins an episode in a given state. Its observation is computed, even where ManiSkill
+        would take a given one.
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
         check_seed(seed)
-        if seed is not None and self.num_envs == 1:
-            options["reconfigure"] = True
+        given = options.pop("reset_to_env_states", None)
+        if seed is not None:
+            self._episodes_of_seed = np.zeros(self.num_envs, np.int64)
+            if self.num_envs == 1:
+                options["reconfigure"] = True
         env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
         if "env_idx" in options:
             options["env_idx"] = env_idx  # a list is accepted, too
         with self._others_unchanged(env_idx):
-            obs, info = super().reset(seed=seed, options=options)
-            if "reset_to_env_states" in options:
-                return obs, info
-            self._settle()
+            _, info = super().reset(seed=seed, options=options)
+            if given is None:
+                self._settle()
+            else:
+                set_state = self.set_state_dict if isinstance(given["env_states"], Mapping) else self.set_state
+                set_state(given["env_states"], env_idx)
         self._touch_is_stale[env_idx] = True
         for sensor in self._tactile_sensors.values():
             sensor.forget_readings(env_idx)  # which are from before the grip had settled
@@ -306,20 +316,6 @@ class VisuotactileEnv(SceneryEnv):
         """The task as a sentence, one for each environment; the method's name and form are those of ManiSkill's tasks."""
         return [instruction_of(type(self))] * self.num_envs
 
-    @contextmanager
-    def _others_unchanged(self, env_idx: torch.Tensor) -> Iterator[None]:
-        """Restore the other environments' states afterwards, with their controllers' targets; their pads are not read again."""
-        others = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        others[env_idx] = False
-        if not others.any():
-            yield
-            return
-        running = others.nonzero()[:, 0]
-        state = rows(self.get_state_dict(), running)
-        yield
-        self.set_state_dict(state, running)
-        self._touch_is_stale[running] = False
-
     def _settle(self) -> None:
         """Let the grip take its load before the first observation."""
         for _ in range(round(SETTLE_SECONDS * self._sim_freq)):
@@ -330,13 +326,16 @@ class VisuotactileEnv(SceneryEnv):
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict):
         with torch.device(self.device):
             self._initialize_task(env_idx)
-        self._draw_looks(int(self._episode_seed[0]))
+        reset = env_idx.cpu().numpy()
+        seeds, episodes = self._episode_seed[reset], self._episodes_of_seed[reset]
+        self._episodes_of_seed[reset] += 1
+        self._draw_looks(int(seeds[0]), int(episodes[0]))
         self._steps_at_goal[env_idx] = 0
         self._success_paper[env_idx] = False
         self._contact_force[env_idx] = 0.0
         self._touch_is_stale[env_idx], self._measured = True, None
         for sensor in self._tactile_sensors.values():
-            sensor.reset(env_idx, self._episode_seed[env_idx.cpu().numpy()])
+            sensor.reset(env_idx, seeds, episodes)
 
     def _step_action(self, action):
         if action is not None:
@@ -357,23 +356,12 @@ class VisuotactileEnv(SceneryEnv):
     def _after_simulation_step(self):
         self._joint_forces.append(self.agent.robot.get_link_incoming_joint_forces())
 
-    def set_state_dict(self, state: dict, env_idx: torch.Tensor | None = None):
-        """Set the state. Setting the present state again changes nothing.
-
-        In particular, it keeps the engine's memory of contacts, which no state holds, and on which the last bits of an episode
-        depend.
-        """
-        if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
-            return
-        super().set_state_dict(state, env_idx)
-        changed = slice(None) if env_idx is None else env_idx
-        if "controller" in state:  # ManiSkill's controllers take the states of all environments
-            self.agent.set_controller_state(with_rows(self.agent.get_controller_state(), changed, state["controller"]))
+    def _state_has_changed(self, changed: torch.Tensor | slice, joint_forces: torch.Tensor | None) -> None:
+        """Let what is counted and measured be that of the new state; steps at the goal count on if it is at the goal, too."""
+        if joint_forces is not None:
+            self._contact_force = self.agent.held_object_force(joint_forces)
+        self._steps_at_goal[changed] *= self.goal_reached(self.measure())[changed]
         self._touch_is_stale[changed], self._measured = True, None
-
-    def set_state(self, state: Any, env_idx: torch.Tensor | None = None):
-        """Set the state from the vectors (N, D) of `get_state`, which hold the controller's targets, too."""
-        self.set_state_dict(unflattened(common.to_tensor(state, self.device), self._init_raw_state), env_idx)
 
     def evaluate(self) -> dict:
         measures, self._measured = self._measured or self.measure(), None

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+import sapien
 import torch
 from mani_skill.utils.structs import Pose
 
@@ -281,6 +282,73 @@ def test_a_flat_state_holds_the_targets_of_arm_and_gripper(make_env, mode):
     assert ends[0] == pytest.approx(ends[1], abs=1e-3)
     with pytest.raises(ValueError, match=r"get_state returns \(N, "):
         first.unwrapped.set_state(state[:, :-1])
+
+
+def test_every_episode_draws_its_own_touch_and_a_seed_begins_anew(make_env):
+    """Without a seed ManiSkill keeps the last one in a reset; the draws of touch are new all the same."""
+    kwargs = dict(imperfections=dict(gain=(0.0, 0.2)), tactile={"randomization.stiffness": 0.3})
+    env = make_env(obs_mode="tacff", render_backend="none", **kwargs)
+
+    def drawn() -> tuple[float, float]:
+        sensor = env.unwrapped._tactile_sensors["tactile_right"]
+        return sensor.drawn_imperfections["gain"].sum().item(), sensor.model._gel.normal_stiffness.sum().item()
+
+    env.reset(seed=3)
+    episodes = [drawn()]
+    for _ in range(3):
+        env.reset()
+        episodes.append(drawn())
+    assert all(len(set(values)) == 4 for values in zip(*episodes, strict=True))
+    env.reset(seed=3)
+    assert drawn() == episodes[0]
+    env.reset()
+    assert drawn() == episodes[1]
+
+
+def test_two_pads_are_two_sensors(make_env):
+    """Both pads of the same kind, in the same episode: neither their imperfections nor their noise are the same."""
+    amounts = dict(gain=(0.0, 0.2), noise=0.05, dead_taxels=0.1)
+    env = make_env(obs_mode="tacff", render_backend="none", tactile_sensors=("left", "right"), imperfections=amounts)
+    _, info = env.reset(seed=0)
+    left, right = (info["imperfections"][f"tactile_{side}"] for side in ("left", "right"))
+    assert not torch.equal(left["gain"], right["gain"])
+    noise = [env.unwrapped._tactile_sensors[f"tactile_{side}"].model._imperfections._seed for side in ("left", "right")]
+    assert not torch.equal(*noise)
+
+
+@pytest.mark.parametrize("seed", [None, 5])
+@pytest.mark.parametrize("flat", [False, True])
+def test_an_episode_that_begins_in_a_given_state_begins_anew(make_env, seed, flat):
+    env = make_env(obs_mode="tacff", render_backend="none")
+    base = env.unwrapped
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample() * 0.3)
+    tree, vector = base.get_state_dict(), base.get_state()
+    base._steps_at_goal[:] = 5
+    _, info = env.reset(seed=seed, options=dict(reset_to_env_states=dict(env_states=vector if flat else tree)))
+    assert not info["success"]
+    assert info["elapsed_steps"] == 0
+    assert base.get_state() == pytest.approx(vector, abs=1e-6)
+
+
+def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):
+    """Neither forces nor drives are part of a state; the gripped peg is felt again as soon as its state is set."""
+    env = make_env(obs_mode="tacff", render_backend="none")
+    base = env.unwrapped
+    obs, _ = env.reset(seed=0)
+
+    def pressing(obs) -> float:
+        return obs["sensor_data"]["tactile_right"]["force_field"][..., 0].sum().item()
+
+    gripped, force = base.get_state_dict(), pressing(obs)
+    assert force > 10
+    base.plug.set_pose(sapien.Pose([0.0, 0.6, 0.3]))
+    for _ in range(8):
+        obs, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
+    assert pressing(obs) == 0
+    base.set_state_dict(gripped)
+    assert pressing(base.get_obs()) == pytest.approx(force, rel=0.01)
 
 
 def test_a_gel_that_is_caught_from_behind_is_not_taken_for_one_on_the_wrong_side(make_env, monkeypatch, caplog):
