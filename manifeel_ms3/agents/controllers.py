@@ -166,8 +166,8 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
     the force near 16 N."""
     target_lead_limit_rot: float = 0.04
     """Largest lead of the target over the tool in rotation, in rad. Set once; not tuned."""
-    use_target: bool = True
-    """Whether delta actions are relative to the last target, and not to the tool's pose."""
+    use_target: bool = field(init=False, default=True)
+    """Delta actions are always relative to the last target."""
     controller_cls = LimitedLeadEEPoseController
 
     def __post_init__(self):

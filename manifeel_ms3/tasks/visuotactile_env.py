@@ -24,6 +24,7 @@ from manifeel_ms3.rendering.backend import (
     restrict_torch_after_fork,
 )
 from manifeel_ms3.rendering.presentation import drawn_sizes
+from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
@@ -157,7 +158,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             for side, name in names.items()
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
-        self._finger = Finger.of(configs["right"], self.grips_round_parts)
+        self._finger = self._finger_of([configs[side] for side in self._sides or SIDES])
         self._set_looks(lighting, quality, visual_randomization or {}, kwargs.get("num_envs", 1))
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
@@ -181,6 +182,16 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
+
+    def _finger_of(self, pads: list[TactileSensorConfig]) -> Finger:
+        """The finger that carries the pads; both fingers are alike."""
+        finger, *others = (Finger.of(pad, self.grips_round_parts) for pad in pads)
+        if any(other != finger for other in others):
+            raise InvalidArgumentError(
+                "the pads have housings or gels of different sizes, but both fingers are alike; give such fields in `tactile`, "
+                "for both pads, instead of in `sensor_configs` for one"
+            )
+        return finger
 
     def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
         if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):

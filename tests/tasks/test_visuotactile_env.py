@@ -10,6 +10,8 @@ import sapien
 import torch
 from mani_skill.utils.structs import Pose
 
+from manifeel_ms3.arguments import checked_action
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
@@ -303,6 +305,21 @@ def test_every_episode_draws_its_own_touch_and_a_seed_begins_anew(make_env):
     assert drawn() == episodes[0]
     env.reset()
     assert drawn() == episodes[1]
+
+
+def test_pads_on_fingers_of_different_sizes_are_refused(make_env):
+    options = dict(obs_mode="tacff", render_backend="none", sensor_configs=dict(tactile_left={"gel.size": (0.026, 0.034)}))
+    with pytest.raises(InvalidArgumentError, match="both fingers are alike"):
+        make_env(tactile_sensors=("left", "right"), **options)
+    assert make_env(tactile_sensors=("left",), **options).unwrapped._finger.gel_size == (0.026, 0.034)
+
+
+def test_an_action_is_copied_when_it_is_checked():
+    """A policy may write its next action into the same memory."""
+    action = torch.zeros(6)
+    checked = checked_action(action, [(6,)])
+    action += 1
+    assert checked.abs().sum() == 0
 
 
 def test_two_pads_are_two_sensors(make_env):

@@ -177,7 +177,13 @@ class InsertionEnv(VisuotactileEnv):
 
     def shortcomings(self, measures):
         outside = (measures["gap"] >= self.fit.depth) | (measures["offset"] >= BESIDE)
-        return {"beside or above the hole": outside, "in the hole, not pressed home": ~outside}
+        too_high = ~outside & (measures["gap"] >= self.fit.max_gap)
+        at_bottom = ~outside & ~too_high
+        return {
+            "beside or above the hole": outside,
+            "in the hole, not pressed home": too_high,
+            "pressed home, not upright or not for long enough": at_bottom,
+        }
 
     def _privileged_state(self):
         return dict(plug_pose=self.plug.pose.raw_pose, socket_pose=self.socket.pose.raw_pose)

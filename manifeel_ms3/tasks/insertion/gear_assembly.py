@@ -102,5 +102,10 @@ class GearAssemblyEnv(InsertionEnv):
     def goal_reached(self, measures):
         return super().goal_reached(measures) & (measures["neighbours_off"] < ON_SHAFT)
 
+    def shortcomings(self, measures):
+        return {"a neighbouring gear pushed off its shaft": measures["neighbours_off"] >= ON_SHAFT} | super().shortcomings(
+            measures
+        )
+
     def _privileged_state(self):
         return super()._privileged_state() | {f"{name}_gear_pose": a.pose.raw_pose for name, a in self.neighbours.items()}
