@@ -1,8 +1,8 @@
 """PPO on joint states and touch, with the arguments of ManiSkill's `ppo.py`: `python examples/ppo.py`.
 
 The observation is a vector of the state and of the right pad's force field, made by `FlattenVisuotactileObservationWrapper`.
-Each environment simulates on the CPU in a process of its own. To do the same on a GPU, ManiSkill's own `ppo.py` needs the two
-wrappers of `WRAPPERS` and nothing else.
+Each environment simulates on the CPU in a process of its own. To do the same on a GPU, ManiSkill's own `ppo.py` would need the
+two wrappers of `WRAPPERS`, which was not tried.
 """
 
 import json

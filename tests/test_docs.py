@@ -8,9 +8,11 @@ import shlex
 import shutil
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import cv2
+import gymnasium as gym
 import h5py
 import pytest
 import torch
@@ -21,6 +23,7 @@ from baselines.tactile_representations.t3 import T3
 from docs import make_readme_results
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import render_observations
+from manifeel_ms3.tasks.registry import all_tasks
 from tests.links import dead_links, missing_targets
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
@@ -50,6 +53,15 @@ def command_of(words: list[str]) -> list[str]:
         if training := re.fullmatch(r"baselines/(\w+)/train\.py", word):
             return ["train", training[1], *words[k + 1 :]]
     return words[1:] if words[0] == "manifeel" and words[1] in cli.all_commands() else words
+
+
+@pytest.mark.parametrize("spec", all_tasks().values(), ids=lambda spec: spec.name)
+def test_every_entry_of_info_and_of_the_state_is_explained(spec):
+    page = (REPOSITORY / "docs" / "observations.md").read_text()
+    with closing(gym.make(spec.env_id, obs_mode="state_dict", render_backend="none")) as env:
+        obs, info = env.reset(seed=0)
+    assert [name for name in info if f"`{name}`" not in page] == ["reconfigure"]  # ManiSkill's own
+    assert [name for name in obs["extra"] if not name.endswith("_pose")] == []
 
 
 @pytest.mark.parametrize("line", SHOWN)

@@ -22,7 +22,7 @@ EPISODES = FEWEST_EPISODES
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 MOST_FORCE = 500.0
-"""Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 60 N."""
+"""Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 90 N."""
 RATE_TOLERANCE = 1e-3
 """Largest difference between rates or means that count as equal; a result rounds the ends of intervals to four decimals."""
 SHOWN = 5

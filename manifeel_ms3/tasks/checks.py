@@ -1,5 +1,6 @@
 """Checks of the arguments that a task's environment is made and reset with."""
 
+import inspect
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
@@ -40,6 +41,23 @@ def checked_randomization(
         if value > limit:
             raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
     return kind(**overrides)
+
+
+def check_argument_names(task: type, given: Collection[str]) -> None:
+    """Check the names of the arguments with which a task's environment is made.
+
+    Args:
+        task: Class of the task.
+        given: Names that no constructor of the task has taken before ManiSkill's.
+
+    Raises:
+        InvalidArgumentError: No constructor has an argument of this name; the message lists those that they have.
+    """
+    constructors = [vars(base)["__init__"] for base in task.__mro__[:-1] if "__init__" in vars(base)]
+    parameters = [p for constructor in constructors for p in inspect.signature(constructor).parameters.values()]
+    known = {p.name for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)} - {"self"}
+    if unknown := sorted(set(given) - known):
+        raise InvalidArgumentError(f"{task.__name__} has no arguments {unknown}; choose from {sorted(known)}")
 
 
 def check_num_envs(num_envs: Any) -> None:

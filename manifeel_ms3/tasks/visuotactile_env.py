@@ -4,7 +4,7 @@
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 import sapien
@@ -27,7 +27,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .checks import check_num_envs, check_seed, checked_randomization, split_sensor_configs
+from .checks import check_argument_names, check_num_envs, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
@@ -97,7 +97,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         kwargs: Other arguments of ManiSkill's `BaseEnv`.
 
     Raises:
-        InvalidArgumentError: An argument has a value that is not allowed; the message lists those that are.
+        InvalidArgumentError: An argument is unknown or has a value that is not allowed; the message lists those that are.
         MachineError: Images are asked for on a machine without a renderer, or many environments on one without a GPU.
     """
 
@@ -145,6 +145,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         visual_randomization: dict[str, float] | None = None,
         **kwargs,
     ):
+        check_argument_names(type(self), kwargs)
         own_mode, self._tactile_outputs = split_obs_mode(obs_mode or "state")
         self._full_obs_mode = obs_mode or "state"
         self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
@@ -171,7 +172,8 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         check_num_envs(kwargs.get("num_envs", 1))
         restrict_torch_after_fork()
         backend = available_render_backend(render_backend)
-        self._require_renderer(backend, own_mode, kwargs.get("render_mode"))
+        if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
+            self._refuse_images(wanted, is_asked_for=render_backend == "none")
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -193,9 +195,14 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             )
         return finger
 
-    def _require_renderer(self, backend: str, own_mode: str, render_mode: str | None) -> None:
-        if backend == "none" and (wanted := self._wanted_images(own_mode, render_mode)):
-            raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+    @staticmethod
+    def _refuse_images(wanted: str, is_asked_for: bool) -> NoReturn:
+        """Refuse images without a renderer, which the caller has asked for, or which this machine does not have."""
+        if is_asked_for:
+            raise InvalidArgumentError(
+                f"render_backend='none' draws nothing, and {wanted} needs images; leave it out, or ask for no images"
+            )
+        raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
 
     @staticmethod
     def _wanted_images(own_mode: str, render_mode: str | None) -> str:

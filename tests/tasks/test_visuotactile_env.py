@@ -14,6 +14,7 @@ from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
+from manifeel_ms3.tasks import visuotactile_env
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from tests.tasks_and_marks import needs_renderer
 
@@ -110,6 +111,7 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(sensor_configs=dict(wrist=dict(widht=64))), "'widht'. are not fields of a camera; choose from"),
         (dict(occlusion=True), "nothing that could occlude"),
         (dict(fit="snug"), "tight"),
+        (dict(randomisation={}), r"no arguments \['randomisation'\]; choose from .*'fit'.*'randomization'.*'reward_mode'"),
         (dict(randomization=dict(colour=1.0)), "socket_xy"),
         (dict(randomization=dict(socket_xy=-1.0)), "socket_xy"),
         (dict(randomization=dict(socket_xy=float("nan"))), "finite"),
@@ -120,12 +122,18 @@ def test_bad_arguments_name_what_is_allowed(make_env, kwargs, word):
         make_env(render_backend="none", **kwargs)
 
 
-def test_images_without_a_renderer_say_what_to_install(make_env):
+def test_images_without_a_renderer_say_what_to_install(make_env, monkeypatch):
+    monkeypatch.setattr(visuotactile_env, "available_render_backend", lambda _asked: "none")
     assert "mesa-vulkan-drivers" in NO_RENDERER
     with pytest.raises(RuntimeError, match="mesa-vulkan-drivers"):
-        make_env(obs_mode="rgb", render_backend="none")
+        make_env(obs_mode="rgb")
     with pytest.raises(RuntimeError, match="render_mode"):
-        make_env(obs_mode="state", render_mode="rgb_array", render_backend="none")
+        make_env(obs_mode="state", render_mode="rgb_array")
+
+
+def test_images_from_a_renderer_that_was_declined_are_refused(make_env):
+    with pytest.raises(InvalidArgumentError, match="render_backend='none' draws nothing, and obs_mode='rgb' needs images"):
+        make_env(obs_mode="rgb", render_backend="none")
 
 
 def test_machine_without_vulkan_runs_what_needs_no_picture():
