@@ -7,6 +7,8 @@ from typing import ClassVar, Literal, cast
 import torch
 import torch.nn as nn
 
+from manifeel_ms3.errors import InvalidArgumentError
+
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
 from .mlp import ConditionalMLP
 from .normalizer import ActionNormalizer, Normalizer
@@ -19,7 +21,11 @@ HEIGHT = 2
 
 @dataclass
 class PolicyConfig:
-    """Settings of a policy; the defaults are the paper's, which are those of Diffusion Policy."""
+    """Settings of a policy; the defaults are the paper's, which are those of Diffusion Policy.
+
+    Raises:
+        InvalidArgumentError: A horizon is less than 1, or a prediction has too few actions for those that are executed.
+    """
 
     obs_horizon: int = 2
     """Number of observations, the present one included, that condition a prediction."""
@@ -52,6 +58,18 @@ class PolicyConfig:
     and says how far the work has come."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
+
+    def __post_init__(self):
+        if self.obs_horizon < 1 or self.action_horizon < 1:
+            raise InvalidArgumentError(
+                f"obs_horizon={self.obs_horizon} and action_horizon={self.action_horizon} must be at least 1"
+            )
+        if self.pred_horizon < (least := self.obs_horizon - 1 + self.action_horizon):
+            raise InvalidArgumentError(
+                f"pred_horizon={self.pred_horizon} must be at least {least}: a prediction begins with the action at the "
+                f"first of obs_horizon={self.obs_horizon} observations, and action_horizon={self.action_horizon} actions are "
+                "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
+            )
 
 
 class VisuotactilePolicy(nn.Module):

@@ -151,7 +151,9 @@ def check_run(args: TrainArgs) -> None:
         save_freq=args.save_freq,
         keep=args.keep,
         eval_freq=args.eval_freq,
+        num_eval_episodes=args.num_eval_episodes or None,  # 0 asks for no evaluation
         num_eval_envs=args.num_eval_envs,
+        inference_steps=args.inference_steps,
         log_freq=args.log_freq,
     )
     if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):

@@ -75,6 +75,22 @@ def test_the_arguments_of_the_recorded_task_are_known(demos):
         recorded_env_kwargs([demos, observed_sample(PEG)])
 
 
+@pytest.mark.parametrize(
+    ("horizons", "said"),
+    [
+        (dict(action_horizon=16), "pred_horizon=16 must be at least 17"),
+        (dict(obs_horizon=10), "pred_horizon=16 must be at least 17"),
+        (dict(pred_horizon=0), "pred_horizon=0 must be at least 9"),
+        (dict(action_horizon=0), "action_horizon=0 must be at least 1"),
+        (dict(obs_horizon=0), "obs_horizon=0 and .* must be at least 1"),
+    ],
+)
+def test_horizons_that_a_prediction_cannot_meet_are_refused(horizons, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        PolicyConfig(**HORIZONS | horizons)
+    assert PolicyConfig(obs_horizon=9).action_horizon == 8  # the last action of a prediction may be executed
+
+
 def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
     assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3

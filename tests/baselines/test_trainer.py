@@ -44,6 +44,8 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
         (dict(keep=-2), "--keep -2 must be at least 1"),
         (dict(eval_freq=0), "--eval-freq 0 must be at least 1"),
         (dict(num_eval_envs=0), "--num-eval-envs 0 must be at least 1"),
+        (dict(num_eval_episodes=-1), "--num-eval-episodes -1 must be at least 1"),
+        (dict(inference_steps=0), "--inference-steps 0 must be at least 1"),  # else the first evaluation fails, hours later
         (dict(log_freq=0), "--log-freq 0 must be at least 1"),
         (dict(save_freq=4, eval_freq=6), "--eval-freq 6 must be a multiple of --save-freq 4"),
     ],
