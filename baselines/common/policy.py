@@ -91,6 +91,8 @@ class VisuotactilePolicy(nn.Module):
     """Name under which the policy is registered (`baselines.registry`)."""
     Config: ClassVar[type[PolicyConfig]] = PolicyConfig
     """Class of the settings."""
+    control_modes: ClassVar[tuple[str, ...] | None] = None
+    """Control modes whose actions the policy can learn; all of them if None."""
     config: PolicyConfig
 
     def __init__(self, config: PolicyConfig, spec: ObservationSpec, action_dim: int):

@@ -15,13 +15,14 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
-from manifeel_ms3.errors import FileExistsAlreadyError, WorkFailedError
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
+from manifeel_ms3.tasks.registry import task_spec
 
 from .agent import spec_of
 from .background_evaluation import SUCCESS, BackgroundEvaluation
@@ -67,7 +68,8 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         policy_class: Class of the policy.
 
     Raises:
-        InvalidArgumentError: A number is too small, or the settings contradict each other (`check_run`).
+        InvalidArgumentError: A number is too small, the settings contradict each other (`check_run`), or the policy cannot
+            learn actions of the demonstrations' control mode.
         FileExistsAlreadyError: The folder of the run has checkpoints, and is neither to be resumed nor to be overwritten.
         InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
@@ -99,6 +101,7 @@ class Trainer:
         processes: The processes of the run.
 
     Raises:
+        InvalidArgumentError: The policy cannot learn actions of the demonstrations' control mode.
         DemonstrationError: The demonstrations are not what the settings ask for.
         CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
     """
@@ -358,7 +361,19 @@ def with_taxel_shape(spec: ObservationSpec, episode: Demonstration) -> Observati
 
 
 def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
-    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json can hold."""
+    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json can hold.
+
+    Raises:
+        InvalidArgumentError: The policy cannot learn actions of the control mode of its data.
+        DemonstrationError: Two files were recorded with different arguments.
+    """
+    env_kwargs = recorded_env_kwargs(args.demos)
+    mode = env_kwargs.get("control_mode") or task_spec(args.env_id).env_class.default_control_mode
+    if policy_class.control_modes is not None and mode not in policy_class.control_modes:
+        raise InvalidArgumentError(
+            f"the actions of {', '.join(map(str, args.demos))} are of the control mode {mode!r}, which the policy "
+            f"{policy_class.name!r} cannot learn; record them in one of {list(policy_class.control_modes)}, or train another"
+        )
     settings = {name: value for name, value in as_json(args).items() if name != "wandb_entity"}  # personal, so not published
     return settings | dict(
         policy_name=policy_class.name,
@@ -366,7 +381,7 @@ def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset:
         taxel_shape=list(dataset.spec.taxel_shape),
         num_demos=dataset.num_episodes,
         num_samples=len(dataset),
-        env_kwargs=recorded_env_kwargs(args.demos),
+        env_kwargs=env_kwargs,
     )
 
 

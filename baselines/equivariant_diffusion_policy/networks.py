@@ -5,6 +5,7 @@ import torch.nn as nn
 
 from baselines.common.encoders import EncoderConfig, by_name, field_encoder, image_encoder, network_images
 from baselines.common.observation import POSE, ObservationSpec, is_tactile
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .groups import ORDER, GroupConv, from_regular, representation, to_regular, turned
@@ -12,12 +13,16 @@ from .image_encoders import EQUIVARIANT_IMAGE_ENCODERS
 
 POSE_PAIRS = ((0, 1), (3, 4), (6, 7))
 """Indices of x and y, which turn, in the position and the two columns of the rotation matrix that encode a pose."""
-ACTION_PAIRS = {
-    5: ((0, 1),),  # position, rotation about the vertical axis, gripper
-    6: ((0, 1), (3, 4)),  # position, rotation vector
-    7: ((0, 1), (3, 4)),  # position, rotation vector, gripper
-}
-"""Indices of x and y, which turn, in the positions and rotation vectors of actions, by the size of an action."""
+
+
+def _turning(axes: tuple[str, ...]) -> tuple[tuple[int, int], ...]:
+    """Indices of the pairs that turn as vectors do, among the named components of an action."""
+    return tuple((axes.index(x), axes.index(y)) for x, y in (("x", "y"), ("roll", "pitch")) if x in axes)
+
+
+ACTION_PAIRS = {len(axes): _turning(axes) for axes in ACTION_AXES.values()}
+"""Indices of x and y, which turn, in the positions and rotation vectors of actions, by the size of an action; all control modes
+of `ACTION_AXES` whose actions have the same size have the same."""
 HAND_CAMERAS = ("sensor_data/wrist/rgb",)
 """Images of cameras that the hand carries."""
 
@@ -110,8 +115,8 @@ class EquivariantActionNetwork(nn.Module):
         super().__init__()
         if action_dim not in ACTION_PAIRS:
             raise InvalidArgumentError(
-                f"action_dim={action_dim}: this policy can rotate actions of {sorted(ACTION_PAIRS)} numbers only; add yours to "
-                "ACTION_PAIRS"
+                f"action_dim={action_dim}: this policy rotates actions of {sorted(ACTION_PAIRS)} numbers only (ACTION_PAIRS); "
+                f"record them in one of the control modes {list(ACTION_AXES)}"
             )
         self.embed = nn.Sequential(nn.Linear(action_dim, fields), nn.ReLU())
         self.network = network

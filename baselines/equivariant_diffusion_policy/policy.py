@@ -10,6 +10,7 @@ from baselines.common.normalizer import Normalizer
 from baselines.common.observation import POSE
 from baselines.common.policy import make_action_network
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 
 from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantActionNetwork, EquivariantObservationEncoder
 
@@ -39,6 +40,7 @@ class EquivariantDiffusionPolicy(DiffusionPolicy):
 
     name = "equivariant_diffusion_policy"
     Config = EquivariantConfig
+    control_modes = tuple(ACTION_AXES)
     config: EquivariantConfig  # pyright: ignore[reportIncompatibleVariableOverride] (set once, in the constructor)
 
     def make_networks(self):

@@ -1,6 +1,9 @@
 """When the scene turns about the vertical, the actions of the equivariant policy turn with it."""
 
+import json
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from baselines.common.encoders import EncoderConfig
 from baselines.common.observation import POSE, observation_spec, rotation_6d_pose
+from baselines.equivariant_diffusion_policy import train
 from baselines.equivariant_diffusion_policy.groups import ORDER, GroupConv, halve, pooled, rotation, turned
 from baselines.equivariant_diffusion_policy.image_encoders import EquivariantKeyPoints, EquivariantResNet
+from baselines.equivariant_diffusion_policy.networks import ACTION_PAIRS
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
 SPEC = observation_spec("rgb+tacrgb+tacff", ("front", "wrist"), ("right",), 48, pose="rotation_6d")
@@ -204,6 +210,25 @@ def test_what_touch_feels_matters_and_does_not_turn(policy):
 def test_actions_of_an_unknown_size_are_refused(policy):
     with pytest.raises(ValueError, match="ACTION_PAIRS"):
         EquivariantDiffusionPolicy(policy.config, SPEC, action_dim=4)
+
+
+@pytest.mark.parametrize(("mode", "axes"), ACTION_AXES.items())
+def test_what_turns_of_an_action_are_its_horizontal_components(mode, axes):
+    pairs = [tuple(axes[i] for i in pair) for pair in ACTION_PAIRS[len(axes)]]
+    assert pairs == [("x", "y"), ("roll", "pitch")][: 1 if mode == "pd_ee_delta_yaw" else 2]
+
+
+@pytest.mark.parametrize("mode", ["pd_joint_pos_fixed_gripper", "pd_ee_pose_fixed_gripper"])
+def test_actions_that_do_not_turn_as_vectors_are_refused(mode, demos, tmp_path):
+    """Those of the first mode have the size of a motion with the gripper, those of the second that of one without it."""
+    copy = Path(shutil.copy(demos, tmp_path / "copy.h5"))
+    header = json.loads(demos.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"]["control_mode"] = mode
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    settings = dict(demos=(copy,), obs_mode="tacff", cameras=(), steps=1, device="cpu", precision="fp32", compile=False)
+    with pytest.raises(InvalidArgumentError, match=rf"copy.h5 are of the control mode '{mode}'.*pd_ee_delta_pose"):
+        train.SPEC.train(replace(train.PRESETS["cpu"].args, run_dir=tmp_path / "run", **settings))
+    assert not (tmp_path / "run/log.jsonl").exists()
 
 
 def test_a_pose_that_does_not_turn_as_a_vector_is_refused(policy):
