@@ -73,8 +73,8 @@ class BackgroundEvaluation:
         self.folder.mkdir(parents=True, exist_ok=True)
         result = self._result(checkpoint).absolute()
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
-        # --overwrite, because an interrupted run may have evaluated another checkpoint of this step
-        command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite", *self._arguments]
+        # an interrupted run may have evaluated another checkpoint of this step
+        command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite-other", *self._arguments]
         folder = None if NOT_FROM_HERE else self.folder  # a folder that only this package writes into
         environment = os.environ | dict(PYTHONSAFEPATH="1")  # the same for the processes that the evaluation starts
         with result.with_suffix(".log").open("w") as output:

@@ -23,7 +23,6 @@ from manifeel_ms3.demonstrations import record
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
-from manifeel_ms3.evaluation.journal import OtherEvaluationError
 from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
@@ -147,10 +146,8 @@ def _evaluate(job: Job, root: Path, needs: Resources) -> int:
         out = job.folder(root) / f"{checkpoint.name}.json"
         if not is_result_of(checkpoint, out):
             args = tyro.cli(evaluate.Args, args=evaluate_arguments(job, needs, str(checkpoint), str(out)))
-            try:
-                evaluate.main(args)
-            except OtherEvaluationError:  # begun on another machine or with other versions, so its episodes cannot be kept
-                evaluate.main(replace(args, overwrite=True))
+            # episodes that were finished on another machine or with other versions cannot be kept
+            evaluate.main(replace(args, overwrite_other=True))
     return len(chosen) * settings["episodes"]
 
 

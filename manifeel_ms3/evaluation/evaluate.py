@@ -77,6 +77,9 @@ class Args:
     overwrite: bool = False
     """Discard the finished episodes of an evaluation that was interrupted, and begin again. Without this flag the evaluation
     goes on if nothing has changed, and is refused otherwise. It cannot be known whether the policy of a server has changed."""
+    overwrite_other: bool = False
+    """Begin again where an evaluation that was interrupted would be refused, because something has changed, and go on with it
+    otherwise."""
     episodes: Annotated[int, tyro.conf.arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     seeds: Path | None = None
@@ -125,7 +128,7 @@ def main(args: Args) -> Path:
     out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
     _check_outputs(args, evaluation, seeds, out)
     with owned(out):
-        journal = Journal(out, _identity(evaluation), seeds, args.overwrite)
+        journal = Journal(out, _identity(evaluation), seeds, args.overwrite, args.overwrite_other)
         if journal.outcomes:
             log.info("%s has %d finished episodes; the evaluation goes on", journal.path, len(journal.outcomes))
         with journal.kept():

@@ -36,18 +36,33 @@ class Journal:
         evaluation: Everything that the outcomes depend on, as json. An unfinished evaluation goes on if all of it is the same.
         seeds: Seeds of the episodes.
         overwrite: Discard the episodes of an unfinished evaluation.
+        overwrite_other: Discard the episodes of an unfinished evaluation if it is another one.
 
     Raises:
-        OtherEvaluationError: There is an unfinished evaluation that is another one.
+        OtherEvaluationError: There is an unfinished evaluation that is another one, and it is not to be discarded.
         InvalidFileError: The file is broken.
         FileWriteError: The file cannot be written.
     """
 
-    def __init__(self, result: Path, evaluation: dict[str, Any], seeds: list[int], overwrite: bool = False):
+    def __init__(
+        self,
+        result: Path,
+        evaluation: dict[str, Any],
+        seeds: list[int],
+        overwrite: bool = False,
+        overwrite_other: bool = False,
+    ):
         self.path = result.with_name(f"{result.stem}.episodes.jsonl")
         self.seeds = seeds
         self._first_line = json.dumps(evaluation | dict(seeds=seeds), default=str, allow_nan=False)
-        self.outcomes = {} if overwrite or not self.path.exists() else self._read()
+        self.outcomes: dict[int, EpisodeOutcome] = {}
+        if self.path.exists() and not overwrite:
+            try:
+                self.outcomes = self._read()
+            except OtherEvaluationError as error:
+                if not overwrite_other:
+                    raise
+                log.info("the evaluation begins again, because %s", error)
         lines = [self._first_line, *map(_line_of, self.outcomes.values())]
         write_text(self.path, "".join(f"{line}\n" for line in lines))  # leaves out an incomplete last line
 

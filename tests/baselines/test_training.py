@@ -25,6 +25,7 @@ from baselines.registry import PolicySpec
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config, samples_per_step
 from tests.tasks_and_marks import PEG
+from tests.trust.running_evaluations import wait_for_episodes
 
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
 POLICIES["consistency"] = (flow, dict(consistency=True))
@@ -261,6 +262,31 @@ def test_checkpoints_are_evaluated_one_after_the_other(evaluation, tmp_path):
         == json.loads((tmp_path / "evaluations/00000001.json").read_text())["success_once"]["rate"]
     )
     assert evaluation.in_use == set()
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_an_evaluation_that_was_stopped_continues_where_it_stopped(evaluation, tmp_path):
+    """Except that it begins again if the checkpoint of this step is another one."""
+    checkpoint, journal = tmp_path / "checkpoints/00000001", tmp_path / "evaluations/00000001.episodes.jsonl"
+    kwargs = json.dumps(dict(render_backend="none", max_episode_steps=60))
+    for change in (False, True):
+        first, second = (BackgroundEvaluation(evaluation.folder, 4, 1, kwargs) for _ in range(2))
+        first.submit(checkpoint)
+        first.finished()
+        wait_for_episodes(journal, 1)
+        first.stop()
+        kept = [json.loads(line) for line in journal.read_text().splitlines()[1:]]
+        assert 0 < len(kept) < 4
+        if change:
+            config = json.loads((checkpoint / "config.json").read_text())
+            (checkpoint / "config.json").write_text(json.dumps(config | dict(training_seconds=0.0)))
+        second.submit(checkpoint)
+        assert len(second.finished(wait=True)) == 1
+        said = (evaluation.folder / "00000001.log").read_text()
+        assert ("the evaluation goes on" in said, "the evaluation begins again" in said) == (not change, change)
+        episodes = json.loads((evaluation.folder / "00000001.json").read_text())["episodes"]
+        assert len(episodes) == 4
+        assert all((episode in episodes) != change for episode in kept)  # an episode holds the time that it took
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)

@@ -178,7 +178,7 @@ def test_a_line_that_broke_off_is_dropped_and_what_is_broken_is_refused(tmp_path
     assert Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3], overwrite=True).remaining == [1, 2, 3]
 
 
-def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp_path):
+def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp_path, caplog):
     args = args_of("Nobody", tmp_path / "evaluation.json")
     journal = Journal(args.out, IDENTITY, evaluation_seeds(2))
     journal.add(outcome(100_000))
@@ -191,6 +191,13 @@ def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp
             Journal(args.out, IDENTITY | changed, evaluation_seeds(2))
     with pytest.raises(OtherEvaluationError, match="another seeds"):
         Journal(args.out, IDENTITY, evaluation_seeds(3))
+    same = Journal(args.out, IDENTITY, evaluation_seeds(2), overwrite_other=True)
+    assert (list(same.outcomes), same.remaining) == ([100_000], [100_001])
+    with caplog.at_level("INFO"):
+        other = Journal(args.out, IDENTITY | dict(git_commit="0" * 40), evaluation_seeds(2), overwrite_other=True)
+    assert other.remaining == evaluation_seeds(2)
+    assert "begins again, because" in caplog.text
+    assert "with another git_commit" in caplog.text
     with pytest.raises(ManifeelError, match="Nobody cannot be made"):
         main(replace(args, overwrite=True))
     assert not journal.path.exists()
