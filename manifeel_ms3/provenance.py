@@ -19,26 +19,37 @@ def package_versions() -> dict[str, str]:
 
 
 def git_commit() -> str | None:
-    """Commit of this package's own repository.
+    """Commit of this package's own repository, followed by "-dirty" if files of the repository have uncommitted changes.
 
-    It is None if the package was installed from a wheel, even inside another repository, if git is not installed, or if git
-    refuses to read a repository of another user.
+    Files that the repository does not know do not count. It is None if the package was installed from a wheel, even inside
+    another repository, if git is not installed, or if git refuses to read a repository of another user.
     """
     source = Path(__file__).resolve().parents[1]
     project = source / "pyproject.toml"
     if not project.is_file() or f'name = "{PACKAGES[0]}"' not in project.read_text(encoding="utf-8").splitlines():
         return None
-    foreign = {name for name in os.environ if name.startswith("GIT_")}  # git sets GIT_DIR for its hooks
-    environment = {name: value for name, value in os.environ.items() if name not in foreign}
-    command = ["git", "rev-parse", "--show-toplevel", "HEAD"]
     try:
-        answer = subprocess.run(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=source, env=environment, check=True
-        )
+        if Path(_git(source, "rev-parse", "--show-toplevel")).resolve() != source:
+            return None
+        return _git(source, "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty")  # a hash, whatever tags there are
     except (OSError, subprocess.CalledProcessError):
         return None
-    top, commit = os.fsdecode(answer.stdout).splitlines()
-    return commit if Path(top).resolve() == source else None
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """What git answers in a folder.
+
+    Raises:
+        OSError: Git is not installed.
+        CalledProcessError: Git refuses.
+    """
+    foreign = {name for name in os.environ if name.startswith("GIT_")}  # git sets GIT_DIR for its hooks
+    environment = {name: value for name, value in os.environ.items() if name not in foreign}
+    environment["GIT_OPTIONAL_LOCKS"] = "0"  # the user may run git at the same time
+    answer = subprocess.run(
+        ["git", *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, cwd=folder, env=environment, check=True
+    )
+    return os.fsdecode(answer.stdout).rstrip("\n")
 
 
 def machine() -> dict[str, Any]:

@@ -124,16 +124,17 @@ def main(args: Args) -> Path:
     if entry is not None:
         args = _like_entry(args, entry)
     evaluation = evaluation_from_args(args)
+    origin = provenance(evaluation.env_id)  # of the code that runs; while it does, others may be committed
     seeds = evaluation_seeds(args.episodes) if args.seeds is None else read_seeds(args.seeds)
     out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
-    _check_outputs(args, evaluation, seeds, out)
+    _check_outputs(args, evaluation, seeds, out, origin)
     with owned(out):
-        journal = Journal(out, _identity(evaluation), seeds, args.overwrite, args.overwrite_other)
+        journal = Journal(out, _identity(evaluation) | origin, seeds, args.overwrite, args.overwrite_other)
         if journal.outcomes:
             log.info("%s has %d finished episodes; the evaluation goes on", journal.path, len(journal.outcomes))
         with journal.kept():
             run_episodes(evaluation, journal.remaining, args.workers, journal.add)
-            write_result(_result(evaluation, journal.in_order), out)
+            write_result(_result(evaluation, journal.in_order, origin), out)
     if entry is not None:
         log.info("%s", entry.agreement(journal.in_order))
     for number in args.videos:
@@ -162,7 +163,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
     )
 
 
-def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Path) -> None:
+def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Path, origin: dict[str, Any]) -> None:
     """Check before the first episode what would otherwise fail after the last one.
 
     Raises:
@@ -180,11 +181,11 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
     if args.videos:
         with missing_extras_named():
             from . import video  # noqa: F401  (only to see whether it can be imported)
-    as_published(_result(evaluation, [failed_outcome(seeds[0], None, args.stop_at_success)]), out)
+    as_published(_result(evaluation, [failed_outcome(seeds[0], None, args.stop_at_success)], origin), out)
 
 
 def _identity(evaluation: Evaluation) -> dict[str, Any]:
-    """Everything that outcomes depend on, as far as it can be known."""
+    """Everything that outcomes depend on beside `provenance`, as far as it can be known."""
     return dict(
         env_id=evaluation.env_id,
         env_kwargs=evaluation.env_kwargs,
@@ -194,14 +195,13 @@ def _identity(evaluation: Evaluation) -> dict[str, Any]:
         step_timeout=evaluation.step_timeout,
         stop_at_success=evaluation.stop_at_success,
         inference=dict(device=evaluation.source.device, batch_size=evaluation.source.batch_size),
-        **provenance(evaluation.env_id),
     )
 
 
-def _result(evaluation: Evaluation, outcomes: list[EpisodeOutcome]) -> dict[str, Any]:
+def _result(evaluation: Evaluation, outcomes: list[EpisodeOutcome], origin: dict[str, Any]) -> dict[str, Any]:
     source = evaluation.source
     inference = dict(device=source.device, batch_size=source.batch_size)
-    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes, inference)
+    return result_of(evaluation.env_id, evaluation.env_kwargs, evaluation.config, outcomes, inference, origin)
 
 
 def evaluation_from_args(args: Args) -> Evaluation:

@@ -49,7 +49,7 @@ def published_config(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def provenance(env_id: str) -> dict[str, Any]:
-    """Versions, commit, revision of the task and machine, as results hold them."""
+    """Versions, commit, revision of the task and machine of the present moment, as results hold them."""
     commit, revision = git_commit(), task_spec(env_id).revision
     return dict(versions=package_versions(), git_commit=commit, revision=revision, machine=machine())
 
@@ -60,6 +60,7 @@ def result_of(
     config: dict[str, Any],
     outcomes: list[EpisodeOutcome],
     inference: dict[str, Any] | None = None,
+    origin: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of a result file.
 
@@ -69,6 +70,7 @@ def result_of(
         config: Configuration of the policy; `published_config` says what is left out of it, since results are published.
         outcomes: Outcomes of all episodes.
         inference: Device and batch size of the policy, where they are known.
+        origin: What `provenance` said when the evaluation began; that of the present moment if not given.
     """
     config, episodes = published_config(config), [outcome_as_json(outcome) for outcome in outcomes]
     return dict(
@@ -80,7 +82,7 @@ def result_of(
         training_seed=config.get("seed"),
         config=config,
         inference=inference or dict(device=None, batch_size=None),
-        **provenance(env_id),
+        **(origin or provenance(env_id)),
         **summary_of(episodes, task_spec(env_id).force_limit),
         episodes=episodes,
     )

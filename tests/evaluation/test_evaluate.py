@@ -39,6 +39,15 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     assert result["env_kwargs"]["obs_mode"] == "tacff"
 
 
+def test_a_result_names_the_commit_at_which_its_evaluation_began(tmp_path, monkeypatch):
+    """The repository may go on to other commits while the code that was loaded runs."""
+    commits = iter(letter * 40 for letter in "abcdef")
+    monkeypatch.setattr("manifeel_ms3.evaluation.result.git_commit", lambda: next(commits))
+    assert evaluated("StandStill", tmp_path, episodes=1)["git_commit"] == "a" * 40
+    monkeypatch.setattr("manifeel_ms3.evaluation.result.git_commit", lambda: f"{'a' * 40}-dirty")
+    assert evaluated("StandStill", tmp_path, episodes=1)["git_commit"] == f"{'a' * 40}-dirty"
+
+
 @pytest.mark.parametrize(
     ("policy", "reason"),
     [

@@ -49,7 +49,12 @@ def test_a28_the_commit_is_that_of_the_package_and_of_no_repository_around_it(tm
         (tmp_path / name / "pyproject.toml").write_text(f'[project]\nname = "{"manifeel-ms3" if name == "own" else "other"}"\n')
         git(tmp_path / name, "add", ".")
         git(tmp_path / name, "commit", "-qm", name)
-    assert commit_seen_from(tmp_path / "own/manifeel_ms3") == git(tmp_path / "own", "rev-parse", "HEAD")
+    own = git(tmp_path / "own", "rev-parse", "HEAD")
+    git(tmp_path / "own", "tag", "v1")
+    assert commit_seen_from(tmp_path / "own/manifeel_ms3") == own  # whose provenance.py the repository does not know
+    with (tmp_path / "own/pyproject.toml").open("a") as project:
+        project.write("version = 1\n")
+    assert commit_seen_from(tmp_path / "own/changed") == f"{own}-dirty"
     assert commit_seen_from(tmp_path / "foreign/.venv/lib/site-packages/manifeel_ms3") is None
     assert commit_seen_from(tmp_path / "foreign/manifeel_ms3") is None
     assert commit_seen_from(tmp_path / "own/.venv/lib/site-packages/manifeel_ms3") is None
