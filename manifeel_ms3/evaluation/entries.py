@@ -20,7 +20,8 @@ from .rollout import EpisodeOutcome
 
 ABOUT = "submission.json"
 """File that names the checkpoints' hashes."""
-
+SETTINGS = ("env_kwargs", "revision", "config", "inference", "stop_at_success")
+"""Parts of a result that say what was evaluated, and how; only results that have the same can be compared by episode."""
 CHECKPOINT_HASHES = {
     "type": "object",
     "properties": {"checkpoints": {"type": "object", "additionalProperties": {"type": "string"}}},
@@ -38,6 +39,10 @@ class Entry:
     """Content of the result file."""
     checkpoint: Path
     """Folder of the checkpoint."""
+
+    def unlike(self, result: dict[str, Any]) -> list[str]:
+        """Names of the settings of a result that are not the entry's; its outcomes may then differ on any machine."""
+        return [name for name in SETTINGS if result[name] != self.result[name]]
 
     def agreement(self, outcomes: list[EpisodeOutcome]) -> str:
         """Sentence that says how many of the given outcomes agree with those of the entry.

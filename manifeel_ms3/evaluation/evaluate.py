@@ -54,7 +54,8 @@ class Args:
     """Checkpoint folder, with config.json and weights."""
     entry: str | None = None
     """Entry of the leaderboard to run again instead of a checkpoint of one's own, such as cpu/PegInsertion/rgb+tacff, with the
-    settings of its result; the command says in how many episodes the outcomes agree."""
+    settings of its result, of which --env-kwargs, --inference-steps, --device and --batch-size change single ones; if none is
+    changed, the command says in how many episodes the outcomes agree."""
     policy: str | None = None
     """Policy to evaluate instead of a checkpoint: a class that can be imported ("module:Class"), or the address of a server
     ("http://localhost:8000")."""
@@ -136,17 +137,19 @@ def main(args: Args) -> Path:
             run_episodes(evaluation, journal.remaining, args.workers, journal.add)
             write_result(_result(evaluation, journal.in_order, origin), out)
     if entry is not None:
-        log.info("%s", entry.agreement(journal.in_order))
+        log.info("%s", _comparison(entry, args, out, journal.in_order))
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
     return out
 
 
 def _like_entry(args: Args, entry: Entry) -> Args:
-    """The arguments with which the result of an entry was made, and a result in the working folder.
+    """The arguments with which the result of an entry was made, except for those that are given.
+
+    Without --out, the result comes into the working folder.
 
     Raises:
-        InvalidArgumentError: Another policy is given as well.
+        InvalidArgumentError: Another policy is given as well, or --env-kwargs is no json object.
     """
     if args.checkpoint is not None or args.policy is not None:
         raise InvalidArgumentError("--entry brings its checkpoint; leave out --checkpoint and --policy")
@@ -159,8 +162,19 @@ def _like_entry(args: Args, entry: Entry) -> Args:
         batch_size=args.batch_size or inference["batch_size"],
         inference_steps=args.inference_steps or made["config"].get(INFERENCE_STEPS),
         stop_at_success=made["stop_at_success"],
-        env_kwargs=args.env_kwargs if args.env_kwargs != "{}" else json.dumps(made["env_kwargs"]),
+        env_kwargs=json.dumps(made["env_kwargs"] | json_object("--env-kwargs", args.env_kwargs)),
     )
+
+
+def _comparison(entry: Entry, args: Args, out: Path, outcomes: list[EpisodeOutcome]) -> str:
+    """Sentence that compares the outcomes with those of the entry, or says why they cannot be compared."""
+    unlike = entry.unlike(read_result(out))
+    if json_object("--policy-kwargs", args.policy_kwargs):  # which the result of a checkpoint does not hold
+        unlike.append("policy_kwargs")
+    if not unlike:
+        return entry.agreement(outcomes)
+    named = ", ".join(unlike)
+    return f"the episodes are not compared with those of the entry {entry.name}, which was evaluated with other {named}"
 
 
 def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Path, origin: dict[str, Any]) -> None:

@@ -66,7 +66,8 @@ def test_outcomes_that_differ_are_counted_and_the_first_is_named():
     assert f"In the episode of seed {seed}, success_once says {not other}, run again it is {other}" in said
 
 
-def test_an_entry_is_run_again_with_its_number_of_generation_steps(tmp_path, monkeypatch):
+def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
     run = tmp_path / "leaderboard/tiny/Peg/tacff/seed0"
     checkpoint = save_tiny_checkpoint(run / "checkpoints/00000001")
     config = json.loads((checkpoint / "config.json").read_text()) | dict(env_id=PEG)
@@ -79,6 +80,17 @@ def test_an_entry_is_run_again_with_its_number_of_generation_steps(tmp_path, mon
     monkeypatch.chdir(tmp_path)
     again = evaluate.main(evaluate.Args(entry="tiny/Peg/tacff", episodes=2))
     assert config["inference_steps"] != read_result(again)["config"]["inference_steps"] == 2
+    assert "2 of 2 episodes agree with those of the entry tiny/Peg/tacff" in caplog.text
+    for changes, named in (
+        (dict(env_kwargs='{"fit": "tight"}'), "env_kwargs"),
+        (dict(inference_steps=1), "config"),
+        (dict(policy_kwargs='{"seed": 1}'), "policy_kwargs"),
+    ):
+        caplog.clear()
+        other = read_result(evaluate.main(evaluate.Args(entry="tiny/Peg/tacff", episodes=1, **changes)))
+        assert f"not compared with those of the entry tiny/Peg/tacff, which was evaluated with other {named}" in caplog.text
+        assert "agree" not in caplog.text
+        assert other["env_kwargs"] == read_result(result)["env_kwargs"] | (dict(fit="tight") if named == "env_kwargs" else {})
     submission = read_submission(tmp_path / "leaderboard/tiny")
     rerun = run_again(submission, checkpoint_sources(submission, [checkpoint], "{}"), seed=0)
     assert [len(file.episodes) for file in rerun.files.values()] == [2]  # an outcome that differs would be an error
