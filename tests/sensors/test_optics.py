@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.sensors import Light, LightsConfig, sensor_config
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
@@ -230,6 +230,29 @@ def test_shader_is_fitted_from_ball_presses(optics, tmp_path):
         main(Presses(**known | dict(ball_radius=5e-4), out=tmp_path / "x.npz"))
     with pytest.raises(ValueError, match=r"presses\.csv"):
         main(Presses(**known | dict(folder=tmp_path / "out"), out=tmp_path / "x.npz"))
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        (["file,x,y,r", "0.png,1,2,3"], "must have the columns file, row, col, radius"),
+        (["file,row,col,radius"], "at least one press"),
+        (["file,row,col,radius", "0.png,1,two,3"], r"'col': 'two'.*numbers of pixels"),
+        (["file,row,col,radius", "0.png,1,2"], r"'radius': None.*numbers of pixels"),
+        (["file,row,col,radius", "0.png,1,2,nan"], r"'radius': 'nan'.*numbers of pixels"),
+        (["file,row,col,radius", ",1,2,3"], r"'file': ''.*the name of a file"),
+    ],
+)
+def test_a_list_of_presses_that_cannot_be_read_is_named(lines, said, tmp_path):
+    (tmp_path / "presses.csv").write_text("\n".join(lines))
+    with pytest.raises(InvalidFileError, match=said):
+        main(Presses(folder=tmp_path, ball_radius=0.003, pixel_size=CONFIG.pixel_size, out=tmp_path / "x.npz"))
+
+
+def test_one_press_alone_cannot_be_refined():
+    picture, circle = np.zeros((40, 40, 3), np.uint8), np.array([[20.0, 20.0, 8.0]])
+    with pytest.raises(InvalidArgumentError, match=r"give more presses, or leave out --refine"):
+        refined_circles(picture, picture[None], circle, 0.003, CONFIG.pixel_size)
 
 
 def test_circles_that_were_drawn_by_hand_are_shifted_to_where_the_ball_was(tmp_path):

@@ -153,7 +153,15 @@ def refined_circles(
     """Contact circles (P, 3), shifted to where a shader that is fitted to one half of the presses fits the other half best.
 
     The arguments are those of `fit_presses`.
+
+    Raises:
+        InvalidArgumentError: There is only one press, or `fit_presses` refuses the arguments.
     """
+    if len(images) < 2:
+        raise InvalidArgumentError(
+            "one press alone cannot be refined, because its circle is shifted to where the colours of other presses fit best; "
+            "give more presses, or leave out --refine"
+        )
     circles, (row, col, place) = circles.astype(float), _pixels(*background.shape[:2])
 
     def misfit(shader: Shader, press: int, middle: np.ndarray) -> float:
@@ -176,17 +184,34 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Background, images and circles of a folder, in the form that `fit_presses` expects.
 
     Raises:
-        InvalidFileError: A file is missing or cannot be read.
+        InvalidFileError: A file is missing or cannot be read, or the list of presses lacks columns, presses or numbers.
     """
     listing = folder / "presses.csv"
     if not listing.is_file():
         raise InvalidFileError(f"{listing} does not exist; it must list file,row,col,radius of every press")
     with listing.open(newline="") as lines:
         presses = list(csv.DictReader(lines))
-    if not presses or set(presses[0]) < {"file", "row", "col", "radius"}:
+    if not presses or not {"file", "row", "col", "radius"} <= set(presses[0]):
         raise InvalidFileError(f"{listing} must have the columns file, row, col, radius and at least one press")
-    circles = np.array([[float(press[name]) for name in ("row", "col", "radius")] for press in presses])
+    circles = np.array([_circle_of(press, listing) for press in presses])
     return _read_image(folder / "background.png"), np.stack([_read_image(folder / p["file"]) for p in presses]), circles
+
+
+def _circle_of(press: dict[str, str | None], listing: Path) -> list[float]:
+    """Row, column and radius of a press's contact circle, pixels.
+
+    Raises:
+        InvalidFileError: A cell of the press is missing or is no finite number.
+    """
+    try:
+        circle = [float(press[name] or "") for name in ("row", "col", "radius")]
+        if press["file"] and np.isfinite(circle).all():
+            return circle
+    except ValueError:
+        pass
+    raise InvalidFileError(
+        f"{listing} has the press {press}; it must have the name of a file, and numbers of pixels as row, col and radius"
+    )
 
 
 def read_pack(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
