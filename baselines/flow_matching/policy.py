@@ -52,12 +52,19 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         draw = torch.rand if self.config.public_code else torch.randn
         return draw_rows(draw, (self.config.pred_horizon, self.action_dim), generators, condition.device)
 
-    def velocity(self, x: torch.Tensor, time: torch.Tensor, condition: torch.Tensor) -> torch.Tensor:
-        """The velocity (B, T, A) at points x (B, T, A) and times (B,) in [0, 1]."""
+    def velocity(self, x: torch.Tensor, time: torch.Tensor, condition: torch.Tensor, step: float) -> torch.Tensor:
+        """The velocity (B, T, A) at points x (B, T, A) and times (B,) in [0, 1].
+
+        Args:
+            x: Points of the paths.
+            time: Times of the points.
+            condition: Conditions (B, ...).
+            step: Time in which a velocity may lead to the end at the earliest; it bounds the velocity near time 1.
+        """
         predicted = self.action_network(x, self.time_scale * time, condition)
         if self.config.prediction == "velocity":
             return predicted
-        return (predicted - x) / _column((1 - time).clamp(min=self.config.interval))
+        return (predicted - x) / _column((1 - time).clamp(min=step))
 
     def generation_loss(self, clean, condition):
         noise, time = torch.randn_like(clean), torch.rand(len(clean), device=clean.device)
@@ -71,9 +78,9 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         end = (torch.floor(time * self.config.segments) + 1) / self.config.segments
         later = torch.minimum(time + self.config.interval, end)
         here, there = _between(noise, clean, time), _between(noise, clean, later)
-        velocity = self.velocity(here, time, condition)
+        velocity = self.velocity(here, time, condition, self.config.interval)
         with torch.no_grad():
-            later_velocity = self.velocity(there, later, condition)
+            later_velocity = self.velocity(there, later, condition, self.config.interval)
         reached = here + _column(end - time) * velocity
         later_reached = there + _column(end - later) * later_velocity
         # at a segment's end, the target is the path's own point
@@ -85,7 +92,8 @@ class FlowMatchingPolicy(VisuotactilePolicy):
         actions = self.noise(condition, generators)
         for k in range(steps):  # Euler integration
             time = torch.full((len(actions),), k / steps, device=actions.device)
-            actions = actions + self.velocity(actions, time, condition) / steps
+            # the last step leads to the end
+            actions = actions + self.velocity(actions, time, condition, min(self.config.interval, 1 / steps)) / steps
         return actions.clamp(-1.0, 1.0)
 
 

@@ -30,5 +30,25 @@ def test_generation_starts_from_the_noise_of_the_setting(public_code):
     torch.testing.assert_close(alone, policy.sample(obs, 2, generators(batch))[7:8], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("steps", [1, 8, 100, 101, 250])
+def test_generation_reaches_the_actions_that_are_predicted(steps):
+    config = FlowConfig(encoder=EncoderConfig("small_cnn", image_features=8), prediction="sample")
+    policy = FlowMatchingPolicy(config, observation_spec("none", (), (), 16), action_dim=6).eval()
+    actions = torch.linspace(-0.9, 0.9, 16 * 6).view(1, 16, 6).expand(3, -1, -1)
+    policy.action_network = Always(actions)
+    torch.testing.assert_close(policy.generate(torch.zeros(3, 8), steps, generators(3)), actions, rtol=0, atol=1e-4)
+
+
+class Always(torch.nn.Module):
+    """A network that predicts the same actions everywhere."""
+
+    def __init__(self, actions: torch.Tensor):
+        super().__init__()
+        self.actions = actions
+
+    def forward(self, *_inputs):
+        return self.actions
+
+
 def generators(count: int) -> list[torch.Generator]:
     return [torch.Generator().manual_seed(seed) for seed in range(count)]
