@@ -52,7 +52,7 @@ def run_episode(
         if terminated or truncated:
             break
     arrays: dict[str, Any] = {name: np.array(values) for name, values in steps.items()}
-    if observations[0]:
+    if len(observations[0]):  # none with obs_mode "none"; a dict, or the vectors (1, D) of obs_mode "state"
         arrays["obs"] = _stack(observations)
     arrays["env_states"] = _stack(states)
     info = dict(
@@ -66,12 +66,9 @@ def run_episode(
     return RecordedEpisode(seed, arrays, info)
 
 
-def _stack(trees: list[Any]) -> dict[str, Any]:
-    """Turn a list over time of trees with arrays (1, ...) into one tree with arrays (T, ...)."""
+def _stack(trees: list[Any]) -> Any:
+    """Turn a list over time of trees with arrays (1, ...), or of such arrays, into one tree or array (T, ...)."""
     first = trees[0]
-    return {
-        key: _stack([tree[key] for tree in trees])
-        if isinstance(first[key], dict)
-        else np.concatenate([tree[key] for tree in trees])
-        for key in first
-    }
+    if not isinstance(first, dict):
+        return np.concatenate(trees)
+    return {key: _stack([tree[key] for tree in trees]) for key in first}

@@ -14,10 +14,11 @@ import numpy as np
 import psutil
 import pytest
 
-from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay, view
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import episode_folder
 from manifeel_ms3.demonstrations.recording import make_header
+from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
@@ -70,6 +71,21 @@ def test_another_sensor_is_recorded_and_named(recorded, tmp_path):
         first, r15 = (file["traj_0/obs"][KEYS[0]][0] for file in (digit, other))
     assert first[..., 0].sum() == pytest.approx(r15[..., 0].sum(), rel=0.05)  # the same grip at the same start
     assert np.abs(first - r15).max() > 0.02  # N: the domed gel spreads it otherwise
+
+
+def test_vectors_of_states_are_recorded_as_observations(tmp_path):
+    path = run(tmp_path / "state.h5", num=1, obs_mode="state")
+    assert validate(path) == []
+    (episode,) = read_header(path)["episodes"]
+    with h5py.File(path) as file:
+        states = file["traj_0/obs"][()]
+    assert states.shape[0] == episode["elapsed_steps"] + 1
+    assert np.ptp(states, axis=0).max() > 0.01  # the hand moves
+    assert "actions" in view.read_streams(path, 0).series
+    with pytest.raises(DemonstrationError, match=r"lacks \['sensor_data/wrist/rgb'\]"):
+        read_demonstrations(path, ["sensor_data/wrist/rgb"], PEG)
+    with pytest.raises(DemonstrationError, match="render-observations"):
+        observation_keys(path)
 
 
 def test_names_of_files_say_what_is_in_them():
