@@ -26,7 +26,7 @@ from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
 from . import record, render_observations
-from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header, task_of
+from .formats.maniskill_h5 import DemonstrationError, count_episodes, read_header, task_of, versions_of
 from .recording import STATES_FILE, trajectory_name
 
 DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
@@ -145,7 +145,7 @@ def describe(path: Path) -> dict[str, Any]:
     return dict(
         env_id=task_of(header),
         env_kwargs=header["env_info"]["env_kwargs"],
-        versions=header.get("versions"),
+        versions=versions_of(header),
         revision=header.get("revision"),
         sha256=file_hash(path),
         json_sha256=file_hash(path.with_suffix(".json")),

@@ -16,7 +16,7 @@ from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
 
-from .formats.maniskill_h5 import DemonstrationError, read_header, task_of
+from .formats.maniskill_h5 import ORIGIN, DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
     RecordedEpisode,
     consolidate,
@@ -118,7 +118,8 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
 
     Args:
         path: The trajectory file, which need not exist.
-        header: The json of the file, without its episodes. `failed_seeds` is kept up to date if it is among the fields.
+        header: The json of the file, without its episodes. `failed_seeds` is kept up to date if it is among the fields. Where
+            the file says already who recorded it (`ORIGIN`), that stays, and the further episodes' entries name what differs.
         order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
 
     Raises:
@@ -154,6 +155,7 @@ class Recording:
         """Whether the file holds its episodes itself and is not an index."""
         self._waiting: dict[int, dict[str, Any]] = {}
         self._header, self._order = header, order
+        self._origin = {name: header.get(name) for name in ORIGIN}
         self._folder = episode_folder(path)
         self.drafts = self._folder / f"{SESSION}{uuid4().hex}"
         """Folder into which the workers of this session write episodes."""
@@ -178,6 +180,7 @@ class Recording:
         if self.is_complete:
             remove_folder(self._folder)
             self.infos = {info["episode_seed"]: info for info in before["episodes"]}
+            self._keep_origin(before)
             return
         found = finished_episodes(self._folder)
         seeds = indexed_seeds(self.path)
@@ -188,6 +191,13 @@ class Recording:
             )
         self.infos = {seed: found.pop(seed) for seed in seeds}
         self.kept = found
+        if self.infos or self.kept:
+            self._keep_origin(before)
+
+    def _keep_origin(self, before: dict[str, Any]) -> None:
+        """Let the file's header say of its episodes what it said before this session."""
+        others = {name: value for name, value in self._header.items() if name not in ORIGIN}
+        self._header = others | {name: before[name] for name in ORIGIN if name in before}
 
     @property
     def num_finished(self) -> int:
@@ -213,7 +223,7 @@ class Recording:
 
         Args:
             seed: Seed of the episode.
-            info: The episode's entry in the json.
+            info: The episode's entry in the json; what it says of the episode's origin precedes what the header says.
 
         Returns:
             Number of episodes by which the file has grown.
@@ -223,10 +233,13 @@ class Recording:
         """
         file = episode_file(self._folder, seed)
         entry = file.with_suffix(".json")
+        origin = self._origin | {name: info[name] for name in ORIGIN if name in info}
+        own = {name: value for name, value in origin.items() if value != self._header.get(name)}
+        info = {name: value for name, value in info.items() if name not in ORIGIN} | dict(episode_seed=seed) | own
         move(self.drafts / file.name, file)
         try:
-            write_json(entry, info | dict(episode_seed=seed))
-            return self._enter({seed: info | dict(episode_seed=seed)})
+            write_json(entry, info)
+            return self._enter({seed: info})
         except FileWriteError:
             if seed not in indexed_seeds(self.path):
                 entry.unlink(missing_ok=True)

@@ -80,7 +80,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     if args.path.resolve() == args.out.resolve():
         raise InvalidArgumentError(f"--out {args.out} is the file that is read; give another")
     env_id, env_kwargs = task_of(source), _env_kwargs(args, source)
-    header = make_header(env_id, env_kwargs) | dict(recorded_with=source.get("versions"), failed_seeds=[])
+    header = make_header(env_id, env_kwargs) | _origin(source) | dict(failed_seeds=[])
     source_kwargs = None
     if args.control_mode is not None:
         source_kwargs = source["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
@@ -106,6 +106,12 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         _warn(recording)
         recording.finish()
     return args.out
+
+
+def _origin(source: dict[str, Any]) -> dict[str, Any]:
+    """Who acted in the recorded episodes, and with which versions, as far as a header or an episode's entry says it."""
+    kept = {name: source[name] for name in ("source_type", "source_desc") if name in source}
+    return kept | ({"recorded_with": source["versions"]} if "versions" in source else {})
 
 
 def _warn(recording: Recording) -> None:
@@ -164,6 +170,7 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
             deviation = _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"], len(actions))
         if deviation or len(actions) != episode.info["elapsed_steps"]:
             episode.info[DEVIATION] = deviation
+    episode.info |= _origin(recorded)
     return recorder.write(episode)
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from manifeel_ms3.command_line import run
 
-from .formats.maniskill_h5 import open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import open_trajectories, origins, read_header, task_of
 
 BARS = " ▁▂▃▄▅▆▇█"
 """Characters of a sparkline, from the lowest level to the highest: Unicode's eighths of a block."""
@@ -90,7 +90,7 @@ def _file_table(path: Path, header: dict) -> Table:
     table = Table(title=str(path), show_header=False)
     table.add_row("task", task_of(header))
     table.add_row("observations", str(env["env_kwargs"].get("obs_mode")))
-    table.add_row("source", str(header.get("source_type")))
+    table.add_row("source", ", ".join(map(str, origins(header, "source_type"))))
     table.add_row(
         "episodes", f"{len(episodes)}, {successes} successes, {len(header.get('failed_seeds', []))} seeds that failed"
     )

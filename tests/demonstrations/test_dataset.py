@@ -108,6 +108,22 @@ def test_a_replay_that_ends_earlier_is_compared_as_far_as_it_goes(folder, tmp_pa
     assert episode["replay_deviation"] == 0.0
 
 
+def test_a_rendered_file_says_who_acted_and_with_which_versions(folder, tmp_path):
+    states, rendered = damaged(folder, tmp_path) / PEG / STATES, tmp_path / "rendered.h5"
+    header = read_header(states)
+    added = dict(source_type="scripted", source_desc="a script", versions=dict(sapien="0.2"))
+    header |= dict(source_type="human", source_desc="a person", versions=dict(sapien="0.1"))
+    header["episodes"][1] |= added
+    states.with_suffix(".json").write_text(json.dumps(header))
+    render_observations.main(render_observations.Args(states, rendered, "tacff", ()))
+    found = read_header(rendered)
+    assert (found["source_type"], found["source_desc"], found["recorded_with"]) == ("human", "a person", dict(sapien="0.1"))
+    first, second = found["episodes"]
+    assert not first.keys() & {"source_type", "source_desc", "recorded_with", "versions"}
+    assert (second["source_type"], second["source_desc"], second["recorded_with"]) == tuple(added.values())
+    assert "versions" not in second  # both were rendered with these
+
+
 def test_a_quaternion_of_the_other_sign_is_the_same_rotation(folder, tmp_path):
     copy = damaged(folder, tmp_path)
     with h5py.File(copy / PEG / STATES, "r+") as file:

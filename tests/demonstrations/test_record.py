@@ -1,5 +1,6 @@
 """Recording: reproducible, crash-safe, resumable; files that say what is wrong with them."""
 
+import io
 import json
 import os
 import signal
@@ -13,11 +14,14 @@ import h5py
 import numpy as np
 import psutil
 import pytest
+from rich.console import Console
 
-from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations, record, replay, view
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, read_header
-from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import episode_folder
-from manifeel_ms3.demonstrations.recording import make_header
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, read_demonstrations, record, replay, view
+from manifeel_ms3.demonstrations.formats.lerobot_card import card
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import ORIGIN, observation_keys, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpisode, episode_folder, write_episode
+from manifeel_ms3.demonstrations.recording import make_header, open_recording
+from manifeel_ms3.demonstrations.summary import summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
@@ -152,6 +156,50 @@ def test_killed_run_keeps_every_finished_episode_and_goes_on(recorded, tmp_path)
 def test_other_settings_do_not_mix_into_a_file(recorded):
     with pytest.raises(DemonstrationError, match="another --out"):
         run(recorded, num=4, obs_mode="none")
+
+
+def add_episode(path: Path, seed: int, header: dict, finish: bool = True) -> None:
+    """Add a tiny episode to a file, in a recording session with this header, which is killed if it does not finish."""
+    with open_recording(path, header) as recording:
+        recording.begin()
+        for kept in list(recording.kept):
+            recording.accept_kept(kept)
+        arrays = dict(actions=np.zeros((2, 6)), success=np.ones(2, bool))
+        write_episode(recording.drafts, RecordedEpisode(seed, arrays))
+        recording.accept(seed, dict(elapsed_steps=2, success=True))
+        if finish:
+            recording.finish()
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_a_file_that_is_continued_says_who_recorded_each_episode(tmp_path, finish):
+    path, now = tmp_path / "trajectory.h5", make_header(PEG, dict(obs_mode="none"))
+    before = now | dict(versions={"manifeel-ms3": "0.0.9"}, commit_info=dict(commit_id="0" * 40), source_type="human")
+    for seed, header in enumerate((before, before, now, before)):
+        add_episode(path, seed, header, finish or seed == 3)
+    held = read_header(path)
+    differing = {name: now[name] for name in ("versions", "commit_info", "source_type")}
+    entries = [{name: value for name, value in episode.items() if name in ORIGIN} for episode in held["episodes"]]
+    assert {name: held[name] for name in differing} == {name: before[name] for name in differing}
+    assert entries == [{}, {}, differing, {}]
+    assert validate(path) == []
+    page = io.StringIO()
+    Console(width=200, file=page).print(summary(path))
+    assert "human, scripted" in page.getvalue()
+    described = dataset.describe(path)["versions"]
+    assert described["manifeel-ms3"] == f"0.0.9, {now['versions']['manifeel-ms3']}"
+    told = card(held, "Insert the peg.", dict(total_episodes=4, total_frames=8, fps=10, codebase_version="v3.0", features={}))
+    assert f"manifeel_ms3 {described['manifeel-ms3']} " in told
+
+
+def test_a_file_without_episodes_is_of_the_session_that_records_into_it(tmp_path):
+    path, header = tmp_path / "trajectory.h5", make_header(PEG, dict(obs_mode="none"))
+    with open_recording(path, header | dict(source_type="human")) as recording:
+        recording.begin()
+    add_episode(path, 0, header)
+    held = read_header(path)
+    assert held["source_type"] == "scripted"
+    assert "source_type" not in held["episodes"][0]
 
 
 def test_reader_gives_actions_and_observations(recorded):

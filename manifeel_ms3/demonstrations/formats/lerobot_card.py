@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from .maniskill_h5 import task_of
+from .maniskill_h5 import origins, task_of, versions_of
 
 FRONT = """---
 license: apache-2.0
@@ -57,9 +57,9 @@ def card(header: dict[str, Any], task: str, info: dict[str, Any]) -> str:
         episodes=info["total_episodes"],
         frames=info["total_frames"],
         fps=info["fps"],
-        version=header.get("versions", {}).get("manifeel-ms3", "of unknown version"),
+        version=(versions_of(header) or {}).get("manifeel-ms3", "of unknown version"),
         revision=header.get("revision", "not known"),
-        source=header.get("source_desc", "a source that is not named"),
+        source="; ".join(str(source or "a source that is not named") for source in origins(header, "source_desc")),
         form=info["codebase_version"],
     )
     rows = [

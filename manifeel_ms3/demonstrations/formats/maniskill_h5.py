@@ -38,6 +38,7 @@ HEADER = {
                     **dict.fromkeys(("episode_id", "episode_seed", "elapsed_steps"), COUNT),
                     "control_mode": {"type": "string"},
                     "peak_contact_force": {"type": "number"},
+                    "versions": {"type": "object"},
                 },
             },
         },
@@ -47,6 +48,8 @@ HEADER = {
     },
 }
 """Json schema of the fields that are read from the json beside a trajectory file."""
+ORIGIN = ("source_type", "source_desc", "commit_info", "versions", "recorded_with")
+"""Fields of the header that say who recorded the episodes, and with which code. An episode's entry has those that differ."""
 
 
 def episode_folder(path: Path) -> Path:
@@ -77,6 +80,36 @@ def task_of(header: dict[str, Any]) -> str:
         header: The json beside the file.
     """
     return header["env_info"]["env_id"].rpartition(":")[2]
+
+
+def origins(header: dict[str, Any], name: str) -> list[Any]:
+    """What a trajectory file says of its episodes' origin: the different values, in the order of the episodes.
+
+    Args:
+        header: The json beside the file.
+        name: One of `ORIGIN`.
+
+    Returns:
+        One value if the episodes agree; more if other sessions continued the file. A value is None where nothing is said.
+    """
+    values = []
+    for episode in header["episodes"]:
+        if (value := episode.get(name, header.get(name))) not in values:
+            values.append(value)
+    return values or [header.get(name)]
+
+
+def versions_of(header: dict[str, Any]) -> dict[str, str] | None:
+    """Versions of the packages that recorded a file, joined by commas where episodes differ; None if an episode says nothing.
+
+    Args:
+        header: The json beside the file.
+    """
+    found = origins(header, "versions")
+    if None in found:
+        return None
+    names = dict.fromkeys(name for versions in found for name in versions)
+    return {name: ", ".join(dict.fromkeys(str(one.get(name, "not known")) for one in found)) for name in names}
 
 
 @contextmanager
