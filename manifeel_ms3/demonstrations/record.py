@@ -23,6 +23,7 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
+from .formats.maniskill_h5 import DemonstrationError
 from .recording import (
     Recorder,
     Recording,
@@ -48,7 +49,7 @@ class Args:
     workers: Annotated[int, tyro.conf.arg(name="num-procs", aliases=["--workers"])] = 1
     """Number of worker processes."""
     seed: int = 0
-    """First seed to try. Seeds from 100000 on are for evaluation."""
+    """First seed to try. A file holds episodes from one first seed on. Seeds from 100000 on are for evaluation."""
     out: Path | None = None
     """Path of the trajectory file to write. If not given, it is in data/demos/<task>: trajectory.h5 without observations, and
     trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5 with observations."""
@@ -106,7 +107,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     Raises:
         UnknownNameError: The task is not registered, or has no demonstrator.
         InvalidArgumentError: Seeds that are reserved for evaluation are requested, or an argument is not allowed.
-        DemonstrationError: The file was recorded with other arguments.
+        DemonstrationError: The file was recorded with other arguments, or from other seeds.
         InUseError: Another process records into the file.
         WorkFailedError: Too many seeds failed, or a worker process died.
     """
@@ -115,6 +116,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     path, seeds, env_kwargs = args.path, args.seeds, args.all_env_kwargs
     header = make_header(args.env_id, env_kwargs) | dict(failed_seeds=[])
     with open_recording(path, header, seeds) as recording:
+        _require_same_seeds(args, recording)
         if recording.is_complete and len(recording.infos) >= args.num:
             log.info("%s already holds %d episodes", path, len(recording.infos))
             return path
@@ -131,6 +133,21 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
                 _submit(pool, left, args, recording, count)
         recording.finish()
     return path
+
+
+def _require_same_seeds(args: Args, recording: Recording) -> None:
+    """Check that a file holds no episodes of seeds that this run would not try.
+
+    Raises:
+        DemonstrationError: It does.
+    """
+    held = [*recording.infos, *recording.kept]
+    tried = range(args.seed, args.seed + args.max_tries * max(args.num, len(held)))
+    if others := sorted(set(held).difference(tried)):
+        raise DemonstrationError(
+            f"{recording.path} holds episodes of the seeds {others[0]} to {others[-1]}, this run tries those from {args.seed} "
+            "on; give another --out, or the --seed of the file"
+        )
 
 
 def _submit(

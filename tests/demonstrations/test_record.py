@@ -202,6 +202,31 @@ def test_a_file_without_episodes_is_of_the_session_that_records_into_it(tmp_path
     assert "source_type" not in held["episodes"][0]
 
 
+@pytest.mark.parametrize(("first", "num"), [(5000, 3), (5000, 4), (1, 3)])
+def test_episodes_of_other_seeds_are_neither_returned_nor_mixed_in(recorded, first, num):
+    before = bytes_of(recorded)
+    with pytest.raises(DemonstrationError, match=f"episodes of the seeds 0 to .*from {first} on; give another --out"):
+        run(recorded, num, seed=first)
+    assert bytes_of(recorded) == before
+
+
+def test_a_held_out_file_is_not_taken_for_the_training_set(tmp_path):
+    path = tmp_path / "trajectory.h5"
+    env_kwargs = record.Args(PEG, obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs=json.dumps(EASY)).all_env_kwargs
+    add_episode(path, 5000, make_header(PEG, env_kwargs))
+    with pytest.raises(DemonstrationError, match="holds episodes of the seeds 5000 to 5000"):
+        record.main(record.Args(PEG, 1, 1, 0, path, "none", (), (), env_kwargs=json.dumps(EASY)))
+
+
+def test_fewer_episodes_than_a_file_holds_may_be_asked_for_where_many_seeds_failed(tmp_path):
+    path, seeds = tmp_path / "trajectory.h5", (0, 4, 13)
+    args = record.Args(PEG, 1, out=path, obs_mode="none", env_kwargs=json.dumps(EASY))
+    for seed in seeds:
+        add_episode(path, seed, make_header(PEG, args.all_env_kwargs))
+    assert record.main(args) == path
+    assert [episode["episode_seed"] for episode in read_header(path)["episodes"]] == list(seeds)
+
+
 def test_reader_gives_actions_and_observations(recorded):
     episodes = read_demonstrations(recorded, KEYS, PEG, num=2)
     assert len(episodes) == 2
