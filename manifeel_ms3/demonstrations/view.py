@@ -30,7 +30,7 @@ from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_he
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-FORCE_NAMES = ("normal, N", "shear down the pad, N", "shear across the pad, N")
+FORCE_NAMES = ("normal, N", "shear across the finger, N", "shear along the finger, N")
 """Names of the components of the force on a whole pad, in the order of the force field's channels."""
 JOINTS = tuple(PandaGelSight.arm_joint_names)
 """Names of the joints of the arm."""

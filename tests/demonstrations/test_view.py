@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -45,19 +46,42 @@ def test_without_rerun_it_says_what_to_install(monkeypatch):
         view.main(view.Args(FILE))
 
 
-def test_an_episode_in_joint_mode_is_shown(tmp_path):
-    file = tmp_path / "joints.h5"
-    with h5py.File(file, "w") as written:
+def file_of_one_episode(path: Path, arrays: dict, control_mode: str, env_kwargs: dict) -> Path:
+    """A trajectory file with three steps of these arrays."""
+    with h5py.File(path, "w") as written:
         group = written.create_group("traj_0")
-        group["actions"], group["contact_force"], group["success"] = np.zeros((3, 8)), np.zeros(3), np.zeros(3, bool)
-    episode = dict(episode_id=0, episode_seed=5, elapsed_steps=3, success=False, control_mode="pd_joint_pos")
-    header = dict(env_info=dict(env_id=f"manifeel_ms3:{PEG}", env_kwargs={}), episodes=[episode])
-    file.with_suffix(".json").write_text(json.dumps(header))
+        for name, values in (dict(contact_force=np.zeros(3), success=np.zeros(3, bool)) | arrays).items():
+            group[name] = values
+    episode = dict(episode_id=0, episode_seed=5, elapsed_steps=3, success=False, control_mode=control_mode)
+    header = dict(env_info=dict(env_id=f"manifeel_ms3:{PEG}", env_kwargs=env_kwargs), episodes=[episode])
+    path.with_suffix(".json").write_text(json.dumps(header))
+    return path
+
+
+def test_an_episode_in_joint_mode_is_shown(tmp_path):
+    file = file_of_one_episode(tmp_path / "joints.h5", dict(actions=np.zeros((3, 8))), "pd_joint_pos", {})
     streams = view.read_streams(file, 0)
     names, values = streams.series["actions"]
     assert names[:1] + names[6:] == ["panda_joint1", "panda_joint7", "gripper"]
     assert values.shape == (3, len(names))
     assert streams.title == f"{PEG}, seed 5"
+
+
+def file_with_touch(path: Path, field: np.ndarray, **env_kwargs) -> Path:
+    """A trajectory file whose right pad reads this force field (10, 14, 3) all the time."""
+    arrays = {"actions": np.zeros((3, 6)), "obs/sensor_data/tactile_right/force_field": np.stack([field] * 4)}
+    return file_of_one_episode(path, arrays, "pd_ee_delta_pose_fixed_gripper", env_kwargs)
+
+
+@pytest.mark.parametrize(
+    ("channel", "name"), [(0, "normal, N"), (1, "shear across the finger, N"), (2, "shear along the finger, N")]
+)
+def test_forces_on_a_pad_have_the_names_of_the_pads_axes(tmp_path, channel, name):
+    """Rows lie side by side across the finger, and columns along it (`TactileSensorConfig`)."""
+    field = np.zeros((10, 14, 3), np.float32)
+    field[4, 6, channel] = 0.5
+    names, values = view.read_streams(file_with_touch(tmp_path / "touch.h5", field), 0).series["tactile_right_force"]
+    assert {name: value for name, value in zip(names, values[0], strict=True) if value} == {name: 0.5}
 
 
 def test_actions_of_another_robot_are_numbered():
