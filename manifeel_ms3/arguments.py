@@ -59,9 +59,25 @@ def require_positive(**flags: int | None) -> None:
     Raises:
         InvalidArgumentError: A number is less than 1.
     """
+    _require_at_least(1, flags)
+
+
+def require_not_negative(**flags: int) -> None:
+    """Check that whole numbers of a command line are at least 0.
+
+    Args:
+        **flags: Numbers by the names of their flags, with underscores.
+
+    Raises:
+        InvalidArgumentError: A number is less than 0.
+    """
+    _require_at_least(0, flags)
+
+
+def _require_at_least(least: int, flags: Mapping[str, int | None]) -> None:
     for name, given in flags.items():
-        if given is not None and given < 1:
-            raise InvalidArgumentError(f"--{name.replace('_', '-')} {given} must be at least 1; give a larger number")
+        if given is not None and given < least:
+            raise InvalidArgumentError(f"--{name.replace('_', '-')} {given} must be at least {least}; give a larger number")
 
 
 def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch.device | str = "cpu") -> torch.Tensor:

@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import file_hash, read_json, write_json
@@ -71,9 +72,11 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: A task is not registered, or has no demonstrator.
+        InvalidArgumentError: A number is too small.
         MachineError: The disk has too little room, or the folder cannot be written.
         InUseError: Another process writes the folder.
     """
+    require_positive(num_demos=args.num, num_procs=args.workers, image_size=args.image_size)
     with owned(args.out / MANIFEST_FILE):
         return _record_all(args)
 
@@ -98,8 +101,7 @@ def _record_all(args: Args) -> Path:
             record.main(_states_args(args, task, counts[task], states), count)
             if observed:
                 bar.update(progress, description=f"rendering {task}")
-                images = (args.obs_mode, args.cameras, args.tactile_sensors, args.image_size)
-                render_observations.main(render_observations.Args(states, trajectory, *images, workers=args.workers), count)
+                render_observations.main(_render_args(args, counts[task], states, trajectory), count)
             write_manifest(args.out)
     return args.out / MANIFEST_FILE
 
@@ -108,6 +110,12 @@ def _states_args(args: Args, task: str, num: int, path: Path) -> record.Args:
     """Arguments to record states and actions alone, without a renderer."""
     backend = '{"render_backend": "none"}'
     return record.Args(task, num, args.workers, out=path, obs_mode="none", cameras=(), tactile_sensors=(), env_kwargs=backend)
+
+
+def _render_args(args: Args, num: int, states: Path, trajectory: Path) -> render_observations.Args:
+    """Arguments to render the observations of the first episodes of a file of states and actions."""
+    images = (args.obs_mode, args.cameras, args.tactile_sensors, args.image_size)
+    return render_observations.Args(states, trajectory, *images, workers=args.workers, num=num)
 
 
 def _num_finished(path: Path) -> int:

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
@@ -88,12 +89,13 @@ class Args:
         """Seeds that may be tried.
 
         Raises:
-            InvalidArgumentError: No episode is asked for, or there are not `num` seeds for demonstrations from `seed` on.
+            InvalidArgumentError: No episode or no try is asked for, or too few demonstration seeds are left from `seed` on.
         """
         if self.num < 1:
             raise InvalidArgumentError(f"--num-demos {self.num}: at least 1 episode must be asked for")
         asked = f"{self.num} episodes from seed {self.seed} on are asked for; "
         require_demonstration_seeds(self.seed, self.num, asked)
+        require_positive(max_tries=self.max_tries)
         return range(self.seed, min(self.seed + self.max_tries * self.num, FIRST_EVALUATION_SEED))
 
 

@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from manifeel_ms3.arguments import by_name
+from manifeel_ms3.arguments import by_name, require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.progress import episode_counter
@@ -76,6 +76,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         InUseError: Another process writes the file.
         WorkFailedError: A worker process died.
     """
+    require_positive(num_demos=args.num, num_procs=args.workers, image_size=args.image_size)
     source = read_header(args.path)
     if args.path.resolve() == args.out.resolve():
         raise InvalidArgumentError(f"--out {args.out} is the file that is read; give another")

@@ -12,6 +12,7 @@ import numpy as np
 import tyro
 from mani_skill.utils import common
 
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
@@ -117,7 +118,14 @@ def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarra
 
 
 def main(args: Args) -> int:
-    """Replay, and return 1 if an episode fails, else 0."""
+    """Replay, and return 1 if an episode fails, else 0.
+
+    Raises:
+        InvalidArgumentError: The number of episodes is less than 1.
+        DemonstrationError: The file is missing or broken.
+        UnknownNameError: The task of the file is not registered.
+    """
+    require_positive(num_demos=args.num)
     results = replay(args.path, args.num)
     failures = [result.seed for result in results if not result.success]
     worst = max((result.deviation for result in results), default=0.0)

@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console, Group
 from rich.table import Table
 
+from manifeel_ms3.arguments import require_not_negative
 from manifeel_ms3.command_line import run
 
 from .formats.maniskill_h5 import open_trajectories, origins, read_header, task_of
@@ -49,8 +50,10 @@ def main(args: Args) -> None:
     """Print the summary.
 
     Raises:
+        InvalidArgumentError: The number of episodes to list is negative.
         DemonstrationError: The file is missing or broken.
     """
+    require_not_negative(episodes=args.episodes)
     Console().print(summary(args.file, args.episodes))
 
 

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import tyro
 
+from manifeel_ms3.arguments import require_not_negative
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.progress import progress_bar
@@ -115,7 +116,13 @@ def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
 
 
 def main(args: Args) -> int:
-    """Log the faults, and return 1 if there are any, else 0."""
+    """Log the faults, and return 1 if there are any, else 0.
+
+    Raises:
+        InvalidArgumentError: The number of replays is negative.
+        DemonstrationError: The folder has no manifest that can be read.
+    """
+    require_not_negative(replay=args.replay)
     problems = validate(args.path, args.replay)
     for problem in problems:
         log.error(problem)

@@ -8,10 +8,9 @@ import h5py
 import numpy as np
 import pytest
 
-from manifeel_ms3.demonstrations import DemonstrationError, dataset, record, render_observations, replay
+from manifeel_ms3.demonstrations import DemonstrationError, dataset, record, render_observations, replay, summary, validate
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
-from manifeel_ms3.demonstrations.validate import validate
-from manifeel_ms3.errors import MachineError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.tasks_and_marks import PEG, needs_renderer
@@ -46,7 +45,7 @@ def test_manifest_says_what_is_there(folder):
         assert entry["success"] == 2
         assert entry["env_id"] == PEG
         assert {"mani-skill", "sapien"} <= set(entry["versions"])
-    assert validate(folder, num_replays=1) == []
+    assert validate.validate(folder, num_replays=1) == []
 
 
 def test_same_command_again_does_nothing(folder):
@@ -65,6 +64,39 @@ def test_only_episodes_that_are_not_there_yet_need_room(folder, monkeypatch):
         dataset.main(dataset.Args(folder, (PEG,), num=4, **sensing))
 
 
+def test_no_more_episodes_are_rendered_than_are_asked_for(folder, tmp_path):
+    states = tmp_path / PEG / STATES
+    states.parent.mkdir()
+    for suffix in (".h5", ".json"):
+        shutil.copy((folder / PEG / STATES).with_suffix(suffix), states.with_suffix(suffix))
+    dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="tacff", cameras=(), tactile_sensors=("right",)))
+    assert [len(read_header(path)["episodes"]) for path in (states, tmp_path / PEG / OBSERVED)] == [2, 1]
+
+
+@pytest.mark.parametrize("given", [0, -1])
+def test_numbers_that_are_too_small_are_refused(folder, tmp_path, given):
+    states, small = folder / PEG / STATES, f"{given} must be at least 1"
+    with pytest.raises(InvalidArgumentError, match=f"--num-demos {small}"):
+        dataset.main(dataset.Args(tmp_path / "set", (PEG,), num=given))
+    with pytest.raises(InvalidArgumentError, match=f"--num-demos {small}"):
+        render_observations.main(render_observations.Args(states, tmp_path / "rendered.h5", num=given))
+    with pytest.raises(InvalidArgumentError, match=f"--image-size {small}"):
+        render_observations.main(render_observations.Args(states, tmp_path / "rendered.h5", image_size=given))
+    with pytest.raises(InvalidArgumentError, match=f"--num-demos {small}"):
+        replay.main(replay.Args(states, num=given))
+    with pytest.raises(InvalidArgumentError, match=f"--max-tries {small}"):
+        record.main(record.Args(PEG, 1, out=tmp_path / "recorded.h5", max_tries=given))
+    assert not list(tmp_path.iterdir())
+
+
+def test_negative_numbers_of_what_may_be_left_out_are_refused(folder):
+    states = folder / PEG / STATES
+    with pytest.raises(InvalidArgumentError, match="--replay -1 must be at least 0"):
+        validate.main(validate.Args(states, replay=-1))
+    with pytest.raises(InvalidArgumentError, match="--episodes -1 must be at least 0"):
+        summary.main(summary.Args(states, episodes=-1))
+
+
 def damaged(folder: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(folder, tmp_path / "copy"))
 
@@ -73,7 +105,7 @@ def test_a_changed_action_is_found(folder, tmp_path):
     copy = damaged(folder, tmp_path)
     with h5py.File(copy / PEG / STATES, "r+") as file:
         file["traj_1/actions"][3, 0] = 0.123
-    problems = validate(copy, num_replays=2)
+    problems = validate.validate(copy, num_replays=2)
     assert any("sha256" in problem for problem in problems)
     assert any("seed 1 does not come out as recorded" in problem for problem in problems)
 
@@ -161,7 +193,7 @@ def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
     whole = (copy / PEG / STATES).read_bytes()
     (copy / PEG / STATES).write_bytes(whole[: len(whole) // 2])
     (copy / PEG / OBSERVED).unlink()
-    problems = validate(copy)
+    problems = validate.validate(copy)
     assert any(STATES in problem and "truncated" in problem for problem in problems)
     assert any(OBSERVED in problem and "does not exist" in problem for problem in problems)
 
@@ -171,7 +203,7 @@ def test_an_unknown_key_of_a_manifest_is_named_and_hides_no_other_fault(folder, 
     manifest = json.loads((copy / "manifest.json").read_text())
     manifest["files"][f"{PEG}/{STATES}"] |= dict(licence="MIT", success=1)
     (copy / "manifest.json").write_text(json.dumps(manifest))
-    unknown, differing = validate(copy)
+    unknown, differing = validate.validate(copy)
     assert unknown.startswith(f"{PEG}/{STATES}: the manifest has the unknown key 'licence'")
     assert differing == f"{PEG}/{STATES}: success is 2, the manifest says 1"
 
@@ -184,12 +216,12 @@ def test_a_set_may_hold_files_that_do_not_say_versions_and_forces(folder, tmp_pa
     dataset.write_manifest(copy)
     entry = json.loads((copy / "manifest.json").read_text())["files"][f"{PEG}/{STATES}"]
     assert (entry["versions"], entry["peak_contact_force"]) == (None, None)
-    assert validate(copy) == []
+    assert validate.validate(copy) == []
 
 
 def test_set_without_manifest_says_what_writes_one(tmp_path):
     with pytest.raises(DemonstrationError, match="manifeel dataset"):
-        validate(tmp_path)
+        validate.validate(tmp_path)
 
 
 def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
@@ -223,7 +255,7 @@ def test_rendered_observations_are_those_of_the_recording(tmp_path):
 
 def test_sample_is_sound():
     """The sample in data/: two episodes of every task."""
-    assert validate(data_dir() / "sample") == []
+    assert validate.validate(data_dir() / "sample") == []
     files = json.loads((data_dir() / "sample" / "manifest.json").read_text())["files"]
     assert {entry["env_id"] for entry in files.values()} == set(all_tasks())
     assert all(len(entry["seeds"]) == 2 for entry in files.values())
