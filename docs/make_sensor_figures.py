@@ -61,7 +61,7 @@ def gallery() -> None:
         relief = (255 * np.clip(1 + height / 1.5e-3, 0, 1)).astype(np.uint8)
         plain = touch(mesh, load)
         sheared = touch(mesh, load, shear=(0.0, 0.3 * load), twist=1e-3)
-        field = force_field_images(sheared["force_field"][None], CONFIG.image_shape)[0].numpy()
+        field = force_field_images(sheared["force_field"][None], CONFIG.full_scale, CONFIG.image_shape)[0].numpy()
         label = np.full((240, 130, 3), 255, np.uint8)
         for k, line in enumerate([*name.split(", "), f"{load:.0f} N"]):
             cv2.putText(label, line, (4, 110 + 22 * k), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
@@ -89,7 +89,7 @@ def side_by_side() -> None:
             rays = MeshRays([[mesh]], config.gel.size, CPU, config.gel.max_sag)
             wrench = torch.tensor([[0.0, 0.3 * load, -load, 0.0, 0.0, 1e-3]], dtype=torch.float64)
             obs = TouchModel(config, 1, CPU).observe(rays, wrench)
-            field = force_field_images(obs["force_field"], config.image_shape)[0].numpy()
+            field = force_field_images(obs["force_field"], config.full_scale, config.image_shape)[0].numpy()
             row += [cv2.resize(p, PANEL[::-1], interpolation=cv2.INTER_AREA) for p in (obs["rgb"][0].numpy(), field)]
         rows.append(np.hstack(row))
     _save("sensors.png", np.vstack(rows))

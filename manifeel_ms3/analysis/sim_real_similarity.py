@@ -22,11 +22,13 @@ import tyro
 from scipy import linalg
 
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.touch_units import recorded_sensor
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import import_name
 from manifeel_ms3.files import NOT_NPZ, atomic_write, write_json
 from manifeel_ms3.progress import progress_bar
+from manifeel_ms3.sensors.imperfection_config import FULL_SCALE_FORCE
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .estimates import TAILS, Estimate
@@ -233,12 +235,15 @@ def _image(path: Path) -> np.ndarray:
 
 
 def _drawn(field: np.ndarray) -> np.ndarray:
-    return force_field_images(torch.as_tensor(field, dtype=torch.float32)[None])[0].cpu().numpy()
+    return force_field_images(torch.as_tensor(field, dtype=torch.float32)[None], FULL_SCALE_FORCE)[0].cpu().numpy()
 
 
 def _recorded(path: Path, args: Args) -> list[np.ndarray]:
     """Images of a pad in contact, at random moments."""
     kind = "rgb" if args.modality == "tacrgb" else "force_field"
+    units = recorded_sensor(read_header(path)["env_info"]["env_kwargs"], args.pad).units
+    if units != "newton":
+        raise SimilarityError(f"{path} holds force fields in the units {units!r} and not in N; record it without that option")
     with open_trajectories(path) as file:
         episodes: dict[str, Any] = dict(file.items())
         pads = {name: episode.get(f"obs/sensor_data/{args.pad}", {}) for name, episode in episodes.items()}

@@ -23,15 +23,15 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, Panda
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import MachineError
 from manifeel_ms3.network import LOOPBACK
+from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.sensors.visualisation import force_field_images
 
 from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
+from .formats.touch_units import SUMS, recorded_sensor
 
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-FORCE_NAMES = ("normal, N", "shear across the finger, N", "shear along the finger, N")
-"""Names of the components of the force on a whole pad, in the order of the force field's channels."""
 JOINTS = tuple(PandaGelSight.arm_joint_names)
 """Names of the joints of the arm."""
 JOINT_AXES = {
@@ -160,6 +160,7 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
 
     Raises:
         DemonstrationError: The file is missing or broken, or has no such episode.
+        ManifeelError: The sensor is of a package that is not installed, or the arguments of the pads are not allowed.
     """
     header = read_header(file)
     if not 0 <= episode < len(header["episodes"]):
@@ -168,8 +169,10 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
     title = f"{task_of(header)}, seed {entry['episode_seed']}"
     with open_trajectories(file) as opened:
         group = opened[f"traj_{entry['episode_id']}"]
+        touched = [name for name, data in group.get("obs/sensor_data", {}).items() if "force_field" in data]
+        sensors = {pad: recorded_sensor(header["env_info"]["env_kwargs"], pad) for pad in touched}
         names = action_names(entry["control_mode"], group["actions"].shape[1])
-        return EpisodeStreams(title, dict(_images(group)), dict(_series(group, names)))
+        return EpisodeStreams(title, dict(_images(group, sensors)), dict(_series(group, sensors, names)))
 
 
 def action_names(control_mode: str, size: int) -> list[str]:
@@ -191,22 +194,25 @@ def _blueprint(streams: EpisodeStreams) -> Any:
     return rrb.Blueprint(rrb.Vertical(views, plots) if streams.images else plots, collapse_panels=True)
 
 
-def _images(group: Any) -> Iterator[tuple[str, np.ndarray]]:
+def _images(group: Any, sensors: dict[str, TactileSensorConfig]) -> Iterator[tuple[str, np.ndarray]]:
     """Images of an episode's cameras and tactile sensors, by place; force fields are drawn."""
     for sensor, data in group.get("obs/sensor_data", {}).items():
         if "rgb" in data:
             yield f"images/{sensor}", data["rgb"][()]
         if "force_field" in data:
-            yield f"images/{sensor}_forces", force_field_images(torch.from_numpy(data["force_field"][()])).numpy()
+            fields, full_scale = torch.from_numpy(data["force_field"][()]), sensors[sensor].full_scale
+            yield f"images/{sensor}_forces", force_field_images(fields, full_scale).numpy()
 
 
-def _series(group: Any, action_names: list[str]) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
+def _series(
+    group: Any, sensors: dict[str, TactileSensorConfig], action_names: list[str]
+) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
     """Numbers over time of an episode, by place."""
     if "contact_force" in group:  # files of other programs hold no forces
         yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
-    for sensor, data in group.get("obs/sensor_data", {}).items():
-        if "force_field" in data:
-            yield f"{sensor}_force", (list(FORCE_NAMES), data["force_field"][()].sum((1, 2)))
+    for pad, sensor in sensors.items():
+        field = group[f"obs/sensor_data/{pad}/force_field"][()]
+        yield f"{pad}_force", (list(SUMS[sensor.units]), field.sum((1, 2)))
     yield "actions", (action_names, group["actions"][()])
     yield "success", (["success"], group["success"][()][:, None].astype(float))
 

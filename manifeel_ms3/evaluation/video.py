@@ -110,7 +110,8 @@ def record_episode(
     """
     outcome, actions = act_again(env_id, env_kwargs, policy, seed, step_timeout)
     with closing(film_env(env_id, env_kwargs, VIEWS)) as env:
-        return outcome, [Frame(observation_images(obs)) for obs in replayed(env, actions, seed)]
+        base: Any = env.unwrapped
+        return outcome, [Frame(observation_images(obs, base.touch_full_scales)) for obs in replayed(env, actions, seed)]
 
 
 def encode_video(frames: list[Frame]) -> bytes:

@@ -15,7 +15,7 @@ from manifeel_ms3.paths import data_dir
 
 from .config_fields import check_bounds, positive, within
 from .draws import uniform_draws
-from .imperfection_config import ImperfectionConfig
+from .imperfection_config import FULL_SCALE_FORCE, ImperfectionConfig
 
 DepthBackend = Literal["raycast", "sapien"]
 Units = Literal["newton", "tacsl"]
@@ -202,6 +202,11 @@ class TactileSensorConfig(BaseSensorConfig):
         self._check_extent("taxel_shape x taxel_pitch", self.taxel_shape, self.taxel_pitch)
         self._check_extent("image_shape x pixel_size", self.image_shape, self.pixel_size)
         self._check_dome()
+
+    @property
+    def full_scale(self) -> float:
+        """Full scale of a taxel's reading in `units`, N or m, to which imperfections and pictures refer."""
+        return FULL_SCALE_FORCE if self.units == "newton" else self.gel.max_penetration
 
     def _check_dome(self) -> None:
         gel, housing = self.gel, self.housing

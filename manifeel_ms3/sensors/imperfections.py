@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from .config import TactileSensorConfig
-from .imperfection_config import DRIFT_STEPS, FULL_SCALE_FORCE, FULL_SCALE_LEVEL
+from .imperfection_config import DRIFT_STEPS, FULL_SCALE_LEVEL
 from .optics.tacrgb import Optics
 from .warp_device import warp_device
 
@@ -46,7 +46,7 @@ class Imperfections:
 
     def __init__(self, config: TactileSensorConfig, num_pads: int, device: torch.device):
         self.config, self.device = config, device
-        self._full_scale = FULL_SCALE_FORCE if config.units == "newton" else config.gel.max_penetration
+        self._full_scale = config.full_scale
         self._drawn = {
             name: torch.as_tensor(values, device=device)
             for name, values in config.imperfections.draw(np.zeros(num_pads, int), config.taxel_shape).items()

@@ -166,5 +166,5 @@ class TactileSensor(BaseSensor):
         if "rgb" in obs:
             images["rgb"] = obs["rgb"]
         if "force_field" in obs:
-            images["force_field"] = force_field_images(obs["force_field"], self.config.image_shape)
+            images["force_field"] = force_field_images(obs["force_field"], self.config.full_scale, self.config.image_shape)
         return images

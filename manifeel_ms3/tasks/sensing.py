@@ -105,6 +105,11 @@ class SensingEnv(BaseEnv):
         cameras = super().get_sensor_params() if visual else {}
         return cameras | {name: sensor.get_params() for name, sensor in self._tactile_sensors.items()}
 
+    @property
+    def touch_full_scales(self) -> dict[str, float]:
+        """Full scale of the force field of each observed pad by name, N or m, which pictures draw at full brightness."""
+        return {name: config.full_scale for name, config in self._tactile_configs.items()}
+
     def render_sensors(self):
         images = [image for sensor in self.get_sensor_images().values() for image in sensor.values()]
         return tile_images(same_size(images), nrows=2)

@@ -72,7 +72,7 @@ def main(args: Args) -> Path:
         follow(DEVICES[args.device](), operator)
     out = args.out or Path("data/demos") / args.env_id / "human.h5"
     session = Session(env, args.env_id, kwargs, out, args.seed, operator)
-    page = Page(operator, args.env_id, args.host, args.port)
+    page = Page(operator, args.env_id, args.host, args.port, base.touch_full_scales)
     if args.host not in LOOPBACK_NAMES:
         log.warning(
             "--host %s: other machines reach the page. Whoever has the address below can watch and steer the robot, and "

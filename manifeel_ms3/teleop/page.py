@@ -2,7 +2,7 @@
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -60,10 +60,12 @@ class Page:
         title: Title of the page.
         host: Address to listen on.
         port: Port to listen on; the next free one if it is taken.
+        full_scales: Full scales of the pads that are shown, by name (`observation_images`).
     """
 
-    def __init__(self, operator: Operator, title: str, host: str, port: int):
+    def __init__(self, operator: Operator, title: str, host: str, port: int, full_scales: Mapping[str, float]):
         self.operator = operator
+        self._full_scales = full_scales
         self._server = LocalServer(host, port, title)
         self._pilot: int | None = None
         self._rights = threading.Lock()
@@ -77,7 +79,7 @@ class Page:
 
     def show(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
         """Show an observation and its `info`."""
-        mosaic = _mosaic(list(observation_images(obs).values()))
+        mosaic = _mosaic(list(observation_images(obs, self._full_scales).values()))
         self._server.scene.set_background_image(mosaic, format="jpeg", jpeg_quality=JPEG_QUALITY)
         self._forces.append(float(info.get("contact_force", 0.0)))
         self._plot.data = (np.arange(NUM_PLOTTED, dtype=float), np.array(self._forces))

@@ -25,6 +25,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import write_text
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import git_commit, machine, package_versions
+from manifeel_ms3.sensors.imperfection_config import FULL_SCALE_FORCE
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 from manifeel_ms3.sensors.visualisation import force_field_images
 
@@ -133,7 +134,7 @@ def _strip(found: Measurements) -> str:
     columns = []
     for touch in found.images:
         height, width = touch.rgb.shape[:2]
-        field = force_field_images(torch.as_tensor(touch.force_field)[None], (height, width))[0].numpy()
+        field = force_field_images(torch.as_tensor(touch.force_field)[None], FULL_SCALE_FORCE, (height, width))[0].numpy()
         columns.append(np.vstack([touch.rgb, field]))
     return base64.b64encode(cv2.imencode(".png", np.hstack(columns)[..., ::-1])[1].tobytes()).decode()
 

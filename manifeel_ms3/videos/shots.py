@@ -86,10 +86,11 @@ class VideoWrapper(gym.Wrapper):
         self._on_step()
 
     def _images(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
+        base: Any = self.unwrapped
         scene: Any = self.env.render()
         shown = (self._view.camera, PAD + self._view.pad)
         sensors = {name: data for name, data in obs["sensor_data"].items() if name in shown}
-        return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors))
+        return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors), base.touch_full_scales)
 
 
 def video_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env:

@@ -1,7 +1,9 @@
 """Distances between sets of tactile images, against cases whose answer is known."""
 
 import json
+import shutil
 from math import comb
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -89,6 +91,16 @@ def test_force_fields_and_recordings_are_compared(folders):
     assert same.fid.value == pytest.approx(0, abs=1e-6)
     with pytest.raises(SimilarityError, match="lacks tacrgb of tactile_left"):
         sim_real_similarity.main(Args(recording, recording, OWN, "tacrgb", "tactile_left", out=folders / "out"))
+
+
+def test_a_recording_in_other_units_than_newtons_is_refused(tmp_path, folders):
+    recording = observed_sample("ManiFeel-PegInsertion-v1")
+    other = Path(shutil.copy(recording, tmp_path / "trajectory.h5"))
+    header = json.loads(recording.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"]["tactile"] = {"units": "tacsl"}
+    other.with_suffix(".json").write_text(json.dumps(header))
+    with pytest.raises(SimilarityError, match="units 'tacsl' and not in N"):
+        sim_real_similarity.main(Args(other, folders / "real_fields", OWN, "tacff", out=folders / "out"))
 
 
 def test_a_resnet_from_a_folder(folders):

@@ -188,7 +188,9 @@ def test_a_file_that_is_continued_says_who_recorded_each_episode(tmp_path, finis
     assert "human, scripted" in page.getvalue()
     described = dataset.describe(path)["versions"]
     assert described["manifeel-ms3"] == f"0.0.9, {now['versions']['manifeel-ms3']}"
-    told = card(held, "Insert the peg.", dict(total_episodes=4, total_frames=8, fps=10, codebase_version="v3.0", features={}))
+    told = card(
+        held, [], "Insert the peg.", dict(total_episodes=4, total_frames=8, fps=10, codebase_version="v3.0", features={})
+    )
     assert f"manifeel_ms3 {described['manifeel-ms3']} " in told
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, view
+from manifeel_ms3.errors import UnknownNameError
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG
 
@@ -82,6 +83,37 @@ def test_forces_on_a_pad_have_the_names_of_the_pads_axes(tmp_path, channel, name
     field[4, 6, channel] = 0.5
     names, values = view.read_streams(file_with_touch(tmp_path / "touch.h5", field), 0).series["tactile_right_force"]
     assert {name: value for name, value in zip(names, values[0], strict=True) if value} == {name: 0.5}
+
+
+OWN_UNITS = dict(wrist=dict(width=64), tactile_right=dict(units="tacsl"))
+OTHER_CAMERA = {"theirs": dict(width=64)}
+
+
+@pytest.mark.parametrize("env_kwargs", [dict(tactile={"units": "tacsl"}), dict(sensor_configs=OWN_UNITS)])
+def test_touch_in_the_papers_units_has_its_own_names_and_is_seen(tmp_path, env_kwargs):
+    field = np.zeros((10, 14, 3), np.float32)
+    untouched = view.read_streams(file_with_touch(tmp_path / "untouched.h5", field, **env_kwargs), 0)
+    field[..., 0] = 2e-3  # m
+    pressed = view.read_streams(file_with_touch(tmp_path / "pressed.h5", field, **env_kwargs), 0)
+    names, values = pressed.series["tactile_right_force"]
+    assert names[0] == "penetration, m"
+    assert values[0, 0] == pytest.approx(10 * 14 * 2e-3)
+    assert not any(name.endswith(", N") for name in names)
+    dark, bright = (streams.images["images/tactile_right_forces"][0].astype(int) for streams in (untouched, pressed))
+    assert np.abs(bright - dark).max() > 150  # of 255
+
+
+@pytest.mark.parametrize("env_kwargs", [{}, dict(tactile=None, sensor_configs=None), dict(sensor_configs=OTHER_CAMERA)])
+def test_touch_is_in_newtons_where_nothing_else_was_asked_for(tmp_path, env_kwargs):
+    field = np.zeros((10, 14, 3), np.float32)
+    names, _ = view.read_streams(file_with_touch(tmp_path / "touch.h5", field, **env_kwargs), 0).series["tactile_right_force"]
+    assert names[0] == "normal, N"
+
+
+def test_the_units_of_a_sensor_that_is_not_installed_are_not_guessed(tmp_path):
+    field = np.zeros((10, 14, 3), np.float32)
+    with pytest.raises(UnknownNameError, match="'theirs' is not registered"):
+        view.read_streams(file_with_touch(tmp_path / "touch.h5", field, sensor="theirs"), 0)
 
 
 def test_actions_of_another_robot_are_numbered():

@@ -51,6 +51,37 @@ def test_the_store_names_its_task_its_arguments_and_its_units(store):
         read(store, "ManiFeel-USBInsertion-v1")
 
 
+@pytest.mark.parametrize(
+    ("given", "units"),
+    [
+        (dict(tactile={"units": "tacsl"}), "tacsl"),
+        (dict(sensor_configs=dict(tactile_right=dict(units="tacsl"))), "tacsl"),
+        (dict(tactile={"units": "tacsl"}, sensor_configs=dict(tactile_right=dict(units="newton"))), "newton"),
+        (dict(tactile=None), "newton"),
+    ],
+)
+def test_the_units_are_found_wherever_they_were_given(tmp_path, given, units):
+    assert json.loads((exported_with(given, tmp_path) / ".zattrs").read_text())["force_field_units"] == units
+
+
+def exported_with(env_kwargs: dict, folder: Path, kind: export.Format = "zarr") -> Path:
+    """An export of the sample as if it had been recorded with these arguments."""
+    recorded = Path(shutil.copy(SAMPLE, folder / "trajectory.h5"))
+    header = json.loads(SAMPLE.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"] |= env_kwargs
+    recorded.with_suffix(".json").write_text(json.dumps(header))
+    return export.main(export.Args(recorded, kind, folder / kind))
+
+
+@pytest.mark.parametrize(("given", "unit"), [({}, "in newtons"), (dict(tactile={"units": "tacsl"}), "penetration (m)")])
+def test_the_card_of_a_lerobot_dataset_says_the_units(tmp_path, given, unit):
+    pytest.importorskip("pyarrow")
+    text = (exported_with(given, tmp_path, "lerobot") / "README.md").read_text()
+    (sentence,) = [line for line in text.splitlines() if "`observation.tactile.right.force_field` holds" in line]
+    assert unit in sentence
+    assert ("newton" in sentence) == (not given)
+
+
 def test_newtons_without_their_unit_are_not_taken_for_the_papers_penetration(papers_store):
     with pytest.raises(DemonstrationError, match="does not say in which units"):
         read(papers_store)

@@ -228,6 +228,18 @@ def test_field_does_not_depend_on_control_or_physics_rate(figure):
         figure("field at other rates, share off", max(off[..., 0].max() / normal, off[..., 1:].max() / shear), at_most=0.03)
 
 
+@pytest.mark.parametrize("units", ["newton", "tacsl"])
+def test_pictures_show_a_touch_in_any_unit(units):
+    press = Press(indenter("box", half_size=[0.006, 0.006, 0.004]), upright=False, tactile={"units": units})
+    press.place(0.0042)
+    press.push(20.0)
+    touched = press.sensor.get_obs()["force_field"]
+    pictures = [press.sensor.get_images(dict(force_field=field))["force_field"] for field in (0 * touched, touched)]
+    press.close()
+    untouched, seen = (picture.numpy().astype(int) for picture in pictures)
+    assert np.abs(seen - untouched).max() > 100  # of 255
+
+
 def test_tacsl_units_give_penetration_and_speed():
     """A block that slides over the pad at a known speed v: the shear is 0.1 |v|, relative to the pad's motion."""
     press = Press(indenter("box", half_size=[0.006, 0.006, 0.004]), upright=False, tactile={"units": "tacsl"})

@@ -84,7 +84,7 @@ def page():
     from manifeel_ms3.teleop.operator import Operator
     from manifeel_ms3.teleop.page import Page
 
-    page = Page(Operator(("x", "y", "z", "gripper")), "test", "localhost", free_port())
+    page = Page(Operator(("x", "y", "z", "gripper")), "test", "localhost", free_port(), {})
     yield page
     page.stop()
 
@@ -189,7 +189,7 @@ def test_a21_each_start_has_another_token(page):
     from manifeel_ms3.teleop.operator import Operator
     from manifeel_ms3.teleop.page import Page
 
-    other = Page(Operator(("x", "gripper")), "test", "localhost", free_port())
+    other = Page(Operator(("x", "gripper")), "test", "localhost", free_port(), {})
     try:
         assert urlsplit(other.address).path != urlsplit(page.address).path
         assert len(urlsplit(page.address).path) > 20
@@ -204,7 +204,7 @@ def test_a21_a_page_for_other_machines_asks_for_the_token_too():
     from manifeel_ms3.teleop.operator import Operator
     from manifeel_ms3.teleop.page import Page
 
-    page = Page(Operator(("x", "gripper")), "test", "0.0.0.0", free_port())
+    page = Page(Operator(("x", "gripper")), "test", "0.0.0.0", free_port(), {})
     own = urlsplit(page.address)
     try:
         assert own.hostname == socket.gethostname().lower()

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.command_line import missing_extras_named
-from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .folder_checks import broken_if_fails, read_origin, require_task
 from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
+from .touch_units import recorded_units
 from .zarr_arrays import open_arrays
 
 ENDS, ACTION = "meta/episode_ends", "data/action"
@@ -30,7 +30,7 @@ ATTRIBUTES = ".zattrs"
 """File of the attributes of a store of zarr format 2."""
 ABOUT = {
     "type": "object",
-    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}, "force_field_units": {"type": "string"}},
+    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}},
 }
 """Json schema of the attributes that are read."""
 PAPERS_ARGUMENTS: dict[str, Any] = {"tactile": {"units": "tacsl"}}
@@ -170,13 +170,14 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
 
     Raises:
         DemonstrationError: The trajectory file is broken, or holds no observations.
+        ManifeelError: The sensor is of a package that is not installed, or the arguments of the pads are not allowed.
         MissingExtraError: zarr is not installed.
     """
     with missing_extras_named():
         import zarr
     keys, arrays, ends = observation_keys(path), {}, []
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
-    store.attrs.update(_about(path))
+    store.attrs.update(_about(path, keys))
     for episode in read_trajectories(path, keys, progress=progress):
         length = len(episode["actions"])
         parts = {array_name(key): _to_paper(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
@@ -189,12 +190,13 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
     store.create_array(ENDS, data=np.array(ends, np.int64))
 
 
-def _about(path: Path) -> dict[str, Any]:
-    """The attributes of a store that is written from a trajectory file."""
+def _about(path: Path, keys: list[str]) -> dict[str, Any]:
+    """The attributes of a store that is written from these observations of a trajectory file."""
     header = read_header(path)
     env_kwargs = header["env_info"]["env_kwargs"]
-    units = env_kwargs.get("tactile", {}).get("units", TactileSensorConfig.units)
-    return dict(env_id=task_of(header), env_kwargs=env_kwargs, force_field_units=units)
+    units = recorded_units(env_kwargs, keys)
+    same = len(set(units.values())) == 1
+    return dict(env_id=task_of(header), env_kwargs=env_kwargs, force_field_units=next(iter(units.values())) if same else units)
 
 
 def _from_paper(key: str, values: np.ndarray) -> np.ndarray:

@@ -3,7 +3,11 @@
 import json
 from typing import Any
 
+from manifeel_ms3.sensors.config import Units
+
+from .lerobot_layout import feature_name
 from .maniskill_h5 import origins, task_of, versions_of
+from .touch_units import MEANING, recorded_units
 
 FRONT = """---
 license: apache-2.0
@@ -31,8 +35,7 @@ The dataset has LeRobot's format {form}.
 """
 BACK = """
 `observation.state` is the pose of the tool in the robot's base frame (m, quaternion wxyz). `observation.images.tactile_*` are
-what a GelSight pad's camera sees. `observation.tactile.<side>.force_field` are the forces on the taxels, in newtons, in the
-pad's frame: normal, and shear along rows and columns. Actions are in [-1, 1]. `next.reward`, `next.success` and `next.done`
+what a GelSight pad's camera sees. {touch}Actions are in [-1, 1]. `next.reward`, `next.success` and `next.done`
 are those after the frame's action.
 
 The task was made with these arguments:
@@ -43,13 +46,18 @@ The task was made with these arguments:
 """
 
 
-def card(header: dict[str, Any], task: str, info: dict[str, Any]) -> str:
+def card(header: dict[str, Any], keys: list[str], task: str, info: dict[str, Any]) -> str:
     """The text of the card.
 
     Args:
         header: The json beside the trajectory file.
+        keys: Keys of the observations in the trajectory file.
         task: Sentence of the task.
         info: The content of meta/info.json.
+
+    Raises:
+        UnknownNameError: The sensor is of a package that is not installed, or a field is unknown.
+        InvalidArgumentError: An argument of the pads is not allowed.
     """
     about = dict(
         env_id=task_of(header),
@@ -66,5 +74,12 @@ def card(header: dict[str, Any], task: str, info: dict[str, Any]) -> str:
         f"| `{name}` | {feature['dtype']} | {' x '.join(map(str, feature['shape']))} | {', '.join(feature['names'] or ())} |\n"
         for name, feature in info["features"].items()
     ]
-    kwargs = json.dumps(header["env_info"]["env_kwargs"], indent=2)
-    return FRONT.format(**about) + "".join(rows) + BACK.format(env_kwargs=kwargs)
+    env_kwargs = header["env_info"]["env_kwargs"]
+    back = BACK.format(env_kwargs=json.dumps(env_kwargs, indent=2), touch=_touch(recorded_units(env_kwargs, keys)))
+    return FRONT.format(**about) + "".join(rows) + back
+
+
+def _touch(units: dict[str, Units]) -> str:
+    """Sentences that say what the force fields of the pads are."""
+    named = {feature_name(f"sensor_data/{pad}/force_field"): MEANING[unit] for pad, unit in units.items()}
+    return "".join(f"`{name}` holds {meaning}.\n" for name, meaning in named.items())

@@ -46,6 +46,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
 
     Raises:
         DemonstrationError: The trajectory file is broken, or holds no observations; or videos of an odd size are requested.
+        ManifeelError: The sensor is of a package that is not installed, or the arguments of the pads are not allowed.
         MissingExtraError: pyarrow or imageio is not installed.
     """
     pa, pq = pyarrow()
@@ -68,7 +69,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     pq.write_table(_tasks(task), folder / "meta/tasks.parquet")
     write_json(folder / "meta/stats.json", {name: joined_statistics(name, entries) for name in writer.features})
     info = _info(writer, len(entries), start)
-    (folder / CARD).write_text(card(header, task, info), encoding="utf-8")
+    (folder / CARD).write_text(card(header, keys, task, info), encoding="utf-8")
     write_json(folder / ORIGIN, dict(env_id=task_of(header), env_kwargs=header["env_info"]["env_kwargs"]))
     write_json(folder / INFO, info)  # last: a folder without it is not a dataset
 
