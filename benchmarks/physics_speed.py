@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 import manifeel_ms3  # noqa: F401
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header
 from manifeel_ms3.demonstrations.recording import STATES_FILE
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks
@@ -33,7 +33,7 @@ def real_time_factors(task: str) -> tuple[float, float]:
     seconds = np.zeros(3)
     episodes = read_header(path)["episodes"]
     with open_trajectories(path) as file:
-        actions = [file[f"traj_{episode['episode_id']}/actions"][()] for episode in episodes]
+        actions = [group_of(file, episode)["actions"][()] for episode in episodes]
     for episode, played in zip(episodes, actions, strict=True):
         seconds += seconds_of(task, episode["episode_seed"], played)
     simulated, engine, whole = seconds

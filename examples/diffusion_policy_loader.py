@@ -24,7 +24,7 @@ import torch
 import tyro
 from torch.utils.data import DataLoader, Dataset
 
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header
 from manifeel_ms3.wrappers import resized
 
 OBS_HORIZON, PRED_HORIZON = 2, 16  # the defaults of ManiSkill's script
@@ -55,7 +55,7 @@ class DiffusionPolicyDataset(Dataset):
 
     def __init__(self, path: Path):
         with open_trajectories(path) as file:
-            episodes = [file[f"traj_{i}"] for i in range(len(file))]
+            episodes = [group_of(file, entry) for entry in read_header(path)["episodes"]]
             self.observations = [obs_process_fn(episode["obs"]) for episode in episodes]
             self.actions = [episode["actions"][()] for episode in episodes]
         self.windows = [(i, t) for i, actions in enumerate(self.actions) for t in range(len(actions))]

@@ -1,5 +1,7 @@
 """The arrays of trajectory files, for comparisons of whole files."""
 
+import json
+import shutil
 from pathlib import Path
 
 import h5py
@@ -25,3 +27,16 @@ def arrays_of(path: Path) -> dict[str, np.ndarray]:
 def bytes_of(path: Path) -> dict[str, bytes]:
     """The same as bytes, which can be compared at once."""
     return {name: values.tobytes() for name, values in arrays_of(path).items()}
+
+
+def renumbered(path: Path, folder: Path) -> Path:
+    """A copy of a file of two episodes, the second of which has the number 0 and the first the number 4."""
+    copy = Path(shutil.copy(path, folder / path.name))
+    with h5py.File(copy, "r+") as file:
+        file.move("traj_0", "traj_4")
+        file.move("traj_1", "traj_0")
+    header = json.loads(path.with_suffix(".json").read_text())
+    for episode, number in zip(header["episodes"], (4, 0), strict=True):
+        episode["episode_id"] = number
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    return copy

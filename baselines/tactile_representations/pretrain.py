@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header, task_of
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header, task_of
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
@@ -144,9 +144,8 @@ def tacrgb_images(files: Iterable[Path], size: int, env_id: str | None = None) -
         if env_id not in (None, task := task_of(header)):
             raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demo-path")
         with open_trajectories(path) as file:
-            for i in range(len(header["episodes"])):
-                trajectory: Any = file[f"traj_{i}"]
-                sensors = trajectory.get("obs/sensor_data", {})
+            for episode in header["episodes"]:
+                sensors = group_of(file, episode).get("obs/sensor_data", {})
                 pads = [
                     sensors[name]["rgb"] for name in sensors if is_tactile(f"sensor_data/{name}") and "rgb" in sensors[name]
                 ]

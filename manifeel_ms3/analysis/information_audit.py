@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.progress import progress_bar
@@ -159,20 +159,21 @@ def run_probe(probe: Probe, env_id: str, path: Path, camera: str | None = None) 
 
 
 def _read(probe: Probe, path: Path, sensors: dict[str, str]) -> _Data:
-    recorded = len(read_header(path)["episodes"])
-    if recorded < FEWEST_EPISODES:
-        raise DemonstrationError(f"{path} holds {recorded} episodes, at least {FEWEST_EPISODES} are needed; record more")
+    recorded = read_header(path)["episodes"]
+    if len(recorded) < FEWEST_EPISODES:
+        raise DemonstrationError(f"{path} holds {len(recorded)} episodes, at least {FEWEST_EPISODES} are needed; record more")
     truth, episodes = [], []
     features: dict[str, list[np.ndarray]] = {modality: [] for modality in MODALITIES}
     with open_trajectories(path) as file:
-        for i in range(recorded):
-            for t, answer in probe.samples(file[f"traj_{i}"]):
+        for i, entry in enumerate(recorded):
+            group = group_of(file, entry)
+            for t, answer in probe.samples(group):
                 truth.append(answer)
                 episodes.append(i)
                 for modality, rows in features.items():
                     sensor = sensors[modality]
                     try:
-                        rows.append(_features(file[f"traj_{i}"], sensor, modality, t))
+                        rows.append(_features(group, sensor, modality, t))
                     except KeyError as error:
                         raise DemonstrationError(
                             f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode rgb+tacrgb+tacff, this "

@@ -30,7 +30,7 @@ from manifeel_ms3.workers import WorkerPool
 
 from .convert_actions import converted
 from .episode import run_episode
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header, task_of
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
 from .replay import pose_difference
 
@@ -157,9 +157,8 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
         None if the recording succeeds and the replay does not.
     """
     seed = recorded["episode_seed"]
-    name = f"traj_{recorded['episode_id']}"
     with open_trajectories(path) as file:
-        actions = file[name]["actions"][()]
+        actions = group_of(file, recorded)["actions"][()]
     source = recorder.source
     episode = run_episode(
         recorder.env, seed, lambda: actions if source is None else converted(actions, seed, source, recorder.env)
@@ -168,7 +167,8 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
         return None
     if source is None:
         with open_trajectories(path) as file:
-            deviation = _deviation(file[name]["env_states/actors"], episode.arrays["env_states"]["actors"], len(actions))
+            before = group_of(file, recorded)["env_states/actors"]
+            deviation = _deviation(before, episode.arrays["env_states"]["actors"], len(actions))
         if deviation or len(actions) != episode.info["elapsed_steps"]:
             episode.info[DEVIATION] = deviation
     episode.info |= _origin(recorded)

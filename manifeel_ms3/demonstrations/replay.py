@@ -19,7 +19,7 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
 from .formats.h5_checks import POSE_SIZE
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 POSITION, ROTATION = slice(0, 3), slice(3, POSE_SIZE)
@@ -64,7 +64,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     with closing(_recorded_env(path, header)) as env, progress_bar() as bar:
         base: Any = env.unwrapped
         for info in bar.track(header["episodes"][:num], description="replaying"):
-            actions, ends = _recorded(path, info["episode_id"])
+            actions, ends = _recorded(path, info)
             env.reset(seed=info["episode_seed"])
             success = False
             for action in actions:
@@ -109,10 +109,10 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
         ) from error
 
 
-def _recorded(path: Path, episode: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _recorded(path: Path, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The actions (T, A) of a recorded episode, and the last state (13,) of each object."""
     with open_trajectories(path) as file:
-        group = file[f"traj_{episode}"]
+        group = group_of(file, episode)
         actors = group["env_states/actors"]
         return group["actions"][()], {name: actors[name][-1] for name in actors}
 

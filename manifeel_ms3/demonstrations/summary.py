@@ -13,7 +13,7 @@ from rich.table import Table
 from manifeel_ms3.arguments import require_not_negative
 from manifeel_ms3.command_line import run
 
-from .formats.maniskill_h5 import open_trajectories, origins, read_header, task_of
+from .formats.maniskill_h5 import group_of, open_trajectories, origins, read_header, task_of
 
 BARS = " ▁▂▃▄▅▆▇█"
 """Characters of a sparkline, from the lowest level to the highest: Unicode's eighths of a block."""
@@ -70,8 +70,8 @@ def summary(path: Path, num_shown: int = NUM_SHOWN) -> Group:
     header = read_header(path)
     episodes = header["episodes"]
     with open_trajectories(path) as file:
-        places = [f"traj_{episode['episode_id']}/contact_force" for episode in episodes]
-        forces = [file[place][()] for place in places if place in file]  # files of other programs hold no forces
+        groups = [group_of(file, episode) for episode in episodes]
+        forces = [group["contact_force"][()] for group in groups if "contact_force" in group]  # not in other programs' files
         sizes: dict[str, int] = {}
 
         def count(name: str, item: h5py.HLObject) -> None:

@@ -20,7 +20,7 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 
 from .dataset import describe, read_manifest
-from .formats.maniskill_h5 import open_trajectories, read_header
+from .formats.maniskill_h5 import group_of, open_trajectories, read_header
 from .replay import replay
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ def _manifest_problems(found: dict[str, Any], entry: dict[str, Any]) -> list[str
 
 def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
     """Faults of one episode, given its entry in the json."""
-    group, steps = file[f"traj_{episode['episode_id']}"], episode["elapsed_steps"]
+    group, steps = group_of(file, episode), episode["elapsed_steps"]
     problems = []
     if not group["success"][-1]:
         problems.append("it does not end in success")

@@ -26,7 +26,7 @@ from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header, task_of
 from .formats.touch_units import SUMS, recorded_sensor
 
 log = logging.getLogger(__name__)
@@ -168,7 +168,7 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
     entry = header["episodes"][episode]
     title = f"{task_of(header)}, seed {entry['episode_seed']}"
     with open_trajectories(file) as opened:
-        group = opened[f"traj_{entry['episode_id']}"]
+        group = group_of(opened, entry)
         touched = [name for name, data in group.get("obs/sensor_data", {}).items() if "force_field" in data]
         sensors = {pad: recorded_sensor(header["env_info"]["env_kwargs"], pad) for pad in touched}
         names = action_names(entry["control_mode"], group["actions"].shape[1])

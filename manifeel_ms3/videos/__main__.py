@@ -26,7 +26,7 @@ import tyro
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Policy, PolicySource
 from manifeel_ms3.evaluation.result import read_result
@@ -191,7 +191,7 @@ def _actions(source: Source, args: Args) -> Iterable[np.ndarray]:
         policy = _policy(source.path, source.result, args)
         return act_again(source.env_id, source.env_kwargs, policy, source.seed)[1]
     with open_trajectories(source.path.with_suffix(".h5")) as file:
-        return file[f"traj_{source.entry['episode_id']}/actions"][()]
+        return group_of(file, source.entry)["actions"][()]
 
 
 def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:

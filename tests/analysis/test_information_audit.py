@@ -102,6 +102,19 @@ def test_audit_writes_table_figure_and_numbers(recorded, tmp_path):
     assert len(json.loads((tmp_path / "out/audit.json").read_text())) == len(answers)
 
 
+def test_audit_finds_episodes_by_their_numbers(recorded, tmp_path):
+    path = recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5"
+    header = json.loads(path.with_suffix(".json").read_text())
+    with h5py.File(path, "r+") as file:
+        for episode in header["episodes"]:
+            number = EPISODES + 3 * episode["episode_id"]  # with gaps
+            file.move(f"traj_{episode['episode_id']}", f"traj_{number}")
+            episode["episode_id"] = number
+    path.with_suffix(".json").write_text(json.dumps(header))
+    answers = information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+    assert [answer.score for answer in answers if "before" in answer.question and answer.modality == "tacff"] == [1.0]
+
+
 def test_audit_asks_another_camera(recorded, tmp_path):
     another = information_audit.Args(recorded, tmp_path / "out", camera="wrist")
     with pytest.raises(DemonstrationError, match="lacks camera of wrist"):

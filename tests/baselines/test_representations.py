@@ -1,6 +1,7 @@
 """Tactile representations: they have the published sizes, images alone can train them, policies can use them."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -109,6 +110,16 @@ def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
     with pytest.raises(InvalidArgumentError, match="--total-iters 0 must be at least 1"):
         trained("t3", pictures, out, steps=0)
     assert not out.exists()
+
+
+def test_episodes_are_found_by_their_numbers(pictures, tmp_path):
+    other = Path(shutil.copy(pictures, tmp_path / "trajectory.h5"))
+    with h5py.File(other, "r+") as file:
+        file.move("traj_0", "traj_7")
+    other.with_suffix(".json").write_text(
+        pictures.with_suffix(".json").read_text().replace('"episode_id": 0', '"episode_id": 7')
+    )
+    assert np.array_equal(pretrain.tacrgb_images([other], 32), pretrain.tacrgb_images([pictures], 32))
 
 
 def test_a_recording_of_ours_is_of_its_task(tmp_path):

@@ -17,6 +17,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.sample import KEYS, observed_sample, states_sample
 from tests.tasks_and_marks import PEG
+from tests.trajectories import renumbered
 
 SAMPLE = observed_sample(PEG)
 
@@ -55,6 +56,28 @@ def test_lerobot(tmp_path):
     assert np.allclose(stats["observation.state"]["std"], poses.std(0), atol=1e-6)
     images = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
     assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
+
+
+def test_episodes_are_found_by_their_numbers(tmp_path):
+    other = renumbered(SAMPLE, tmp_path)
+    assert sorted(observation_keys(other)) == sorted(KEYS)
+    for episode, original in zip(read_demonstrations(other, KEYS), read_demonstrations(SAMPLE, KEYS), strict=True):
+        assert all(np.array_equal(episode[name], values) for name, values in original.items())
+
+
+def test_an_episode_that_the_json_names_and_the_file_lacks_is_said(tmp_path):
+    other = renumbered(SAMPLE, tmp_path)
+    other.with_suffix(".json").write_bytes(SAMPLE.with_suffix(".json").read_bytes())
+    with pytest.raises(DemonstrationError, match="lacks traj_1, which its json names"):
+        read_demonstrations(other, KEYS)
+
+
+def test_a_file_without_episodes_has_nothing_to_export(tmp_path):
+    other = renumbered(SAMPLE, tmp_path)
+    header = json.loads(other.with_suffix(".json").read_text())
+    other.with_suffix(".json").write_text(json.dumps(header | dict(episodes=[])))
+    with pytest.raises(DemonstrationError, match="holds no episode"):
+        observation_keys(other)
 
 
 def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):

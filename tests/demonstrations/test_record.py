@@ -27,8 +27,9 @@ from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
+from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
-from tests.trajectories import bytes_of
+from tests.trajectories import bytes_of, renumbered
 from tests.trust.kills import worker_processes
 
 EASY = dict(fit="paper", render_backend="none")
@@ -192,6 +193,17 @@ def test_a_file_that_is_continued_says_who_recorded_each_episode(tmp_path, finis
         held, [], "Insert the peg.", dict(total_episodes=4, total_frames=8, fps=10, codebase_version="v3.0", features={})
     )
     assert f"manifeel_ms3 {described['manifeel-ms3']} " in told
+
+
+def test_a_file_with_other_numbers_of_episodes_can_be_continued(tmp_path):
+    path, header = renumbered(states_sample(PEG), tmp_path), read_header(states_sample(PEG))
+    add_episode(path, 9, {name: value for name, value in header.items() if name != "episodes"})
+    assert [(episode["episode_id"], episode["episode_seed"]) for episode in read_header(path)["episodes"]] == [
+        *((i, episode["episode_seed"]) for i, episode in enumerate(header["episodes"])),
+        (2, 9),
+    ]
+    before, after = bytes_of(states_sample(PEG)), bytes_of(path)
+    assert {name: after[name] for name in before} == before
 
 
 def test_a_file_without_episodes_is_of_the_session_that_records_into_it(tmp_path):

@@ -9,10 +9,13 @@ from rich.console import Console
 
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
+from manifeel_ms3.demonstrations.view import read_streams
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG
+from tests.trajectories import renumbered
 
 SAMPLE = observed_sample(PEG)
 
@@ -60,6 +63,22 @@ def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
     Console(width=160, file=page).print(summary(tmp_path / "theirs.h5"))
     assert "2 on average" in page.getvalue()
     assert validate(tmp_path / "theirs.h5") == ["seed 3: it does not end in success"]
+
+
+def test_episodes_are_found_by_their_numbers(tmp_path):
+    other = renumbered(SAMPLE, tmp_path)
+    assert validate(other) == []
+    assert all(replayed.success for replayed in replay(other))
+    page = io.StringIO()
+    Console(width=160, file=page).print(summary(other))
+    lengths = [episode["elapsed_steps"] for episode in read_header(SAMPLE)["episodes"]]
+    assert lengths[0] != lengths[1]
+    assert [len(read_streams(other, i).series["actions"][1]) for i in range(2)] == lengths
+    with open_trajectories(SAMPLE) as file:
+        peak = file["traj_0/contact_force"][()].max()
+    assert any(
+        row.split("│")[1].strip() == "4" and f" {peak:.1f} " in row for row in page.getvalue().splitlines() if "│" in row
+    )
 
 
 def test_one_file_is_validated_by_itself():

@@ -138,6 +138,24 @@ def open_trajectories(path: Path) -> Iterator[Any]:
         ) from error
 
 
+def group_of(file: Any, episode: dict[str, Any]) -> Any:
+    """The group of an episode in an opened trajectory file; other programs may number episodes from any number, and with gaps.
+
+    Args:
+        file: The opened file.
+        episode: The episode's entry in the json.
+
+    Raises:
+        DemonstrationError: The file lacks the episode.
+    """
+    name = f"traj_{episode['episode_id']}"
+    if name not in file:
+        raise DemonstrationError(
+            f"{file.filename} lacks {name}, which its json names; copy both files again, or record them again"
+        )
+    return file[name]
+
+
 def _is_of_h5py(error: Exception) -> bool:
     """Whether h5py raised an error, as it does for damaged files, and not the code that works with what it read."""
     *_, (frame, _line) = traceback.walk_tb(error.__traceback__)
@@ -200,21 +218,26 @@ def read_trajectories(
         )
     with open_trajectories(path) as file:
         for i in progress(range(count)):
-            yield _read_episode(file, i, keys, path, header) | _outcomes(file[f"traj_{i}"], outcomes)
+            entry = header["episodes"][i]
+            yield _read_episode(file, entry, keys, path, header) | _outcomes(group_of(file, entry), outcomes)
 
 
 def observation_keys(path: Path) -> list[str]:
     """Keys of a file's observations that policies use: images, force fields, and the pose of the tool.
 
     Raises:
-        DemonstrationError: The file holds states and actions alone.
+        DemonstrationError: The file holds states and actions alone, or no episode.
     """
+    episodes = read_header(path)["episodes"]
+    if not episodes:
+        raise DemonstrationError(f"{path} holds no episode; record some with `manifeel record`")
     with open_trajectories(path) as file:
-        sensors = file.get("traj_0/obs/sensor_data", {})
+        group = group_of(file, episodes[0])
+        sensors = group.get("obs/sensor_data", {})
         keys = [
             f"sensor_data/{sensor}/{kind}" for sensor in sensors for kind in ("rgb", "force_field") if kind in sensors[sensor]
         ]
-        if "traj_0/obs/extra/tcp_pose" not in file:
+        if "obs/extra/tcp_pose" not in group:
             raise DemonstrationError(f"{path} holds states and actions alone; `manifeel render-observations` adds observations")
     return [*keys, "extra/tcp_pose"]
 
@@ -225,8 +248,8 @@ def _outcomes(group: Any, names: tuple[str, ...]) -> Demonstration:
     return {name: values for name, values in found.items() if values.shape == group["actions"].shape[:1]}
 
 
-def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) -> Demonstration:
-    group = file[f"traj_{i}"]
+def _read_episode(file: Any, entry: dict[str, Any], keys: list[str], path: Path, header: dict) -> Demonstration:
+    group = group_of(file, entry)
     missing = [key for key in keys if f"obs/{key}" not in group]
     if missing:
         mode = header["env_info"]["env_kwargs"].get("obs_mode")
@@ -238,7 +261,8 @@ def _read_episode(file: Any, i: int, keys: list[str], path: Path, header: dict) 
     steps = len(episode["actions"])
     if wrong := [key for key in keys if episode[key].ndim < 2 or len(episode[key]) != steps + 1]:
         raise DemonstrationError(
-            f"{path} has {steps} actions in traj_{i}, and {wrong} of another length than {steps + 1}; record it again"
+            f"{path} has {steps} actions in traj_{entry['episode_id']}, and {wrong} of another length than {steps + 1}; record "
+            "it again"
         )
     return episode
 

@@ -22,7 +22,7 @@ import h5py
 
 from manifeel_ms3.files import atomic_folder, atomic_write, read_json, remove_folder, write_json
 
-from .maniskill_h5 import DemonstrationError, episode_folder, open_trajectories, read_header
+from .maniskill_h5 import DemonstrationError, episode_folder, group_of, open_trajectories, read_header
 
 COMPRESSION_LEVEL = 4
 """Level of gzip, which is lossless; 4 is h5py's default."""
@@ -146,17 +146,16 @@ def separate(path: Path) -> None:
     episodes = read_header(path)["episodes"]
     infos = {info["episode_seed"]: info for info in episodes}
     with open_trajectories(path) as whole:
-        if len(infos) < len(episodes) or any(f"traj_{i}" not in whole for i in range(len(episodes))):
-            raise DemonstrationError(
-                f"{path} lacks an episode that its json names, or holds two of one seed, so that none can be added; give "
-                "another --out"
-            )
+        for info in episodes:
+            group_of(whole, info)
+    if len(infos) < len(episodes):
+        raise DemonstrationError(f"{path} holds two episodes of one seed, so that none can be added; give another --out")
     folder = episode_folder(path)
     remove_folder(folder)  # left over from a process that was killed
     with h5py.File(path, "r") as whole, atomic_folder(folder) as draft:
-        for i, (seed, info) in enumerate(infos.items()):
+        for seed, info in infos.items():
             with _new_h5(episode_file(draft, seed)) as file:
-                whole.copy(f"traj_{i}", file, "traj_0")
+                whole.copy(group_of(whole, info), file, "traj_0")
             write_json(episode_file(draft, seed).with_suffix(".json"), info)
 
 
