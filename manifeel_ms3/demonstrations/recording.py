@@ -196,8 +196,9 @@ class Recording:
 
     def _keep_origin(self, before: dict[str, Any]) -> None:
         """Let the file's header say of its episodes what it said before this session."""
-        others = {name: value for name, value in self._header.items() if name not in ORIGIN}
-        self._header = others | {name: before[name] for name in ORIGIN if name in before}
+        unsaid = set(ORIGIN) - before.keys()
+        kept = {name: value for name, value in self._header.items() if name not in unsaid}
+        self._header = kept | {name: before[name] for name in ORIGIN if name in before}
 
     @property
     def num_finished(self) -> int:
