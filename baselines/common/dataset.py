@@ -53,6 +53,20 @@ def _prepared(spec: ObservationSpec, episode: Demonstration) -> Demonstration:
     return {key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"])
 
 
+def recorded_task(files: Iterable[Path]) -> str:
+    """Id of the task of which the first file that says it says that its episodes are.
+
+    Raises:
+        DemonstrationError: No file says it, or one is broken.
+    """
+    files = list(files)
+    for file in files:
+        read = format_of(file).env_id
+        if read is not None and (found := read(file)) is not None:
+            return found
+    raise DemonstrationError(f"{', '.join(map(str, files))}: no file says of which task it is; give --env-id")
+
+
 def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     """The arguments of the task with which demonstrations were recorded, such as its lighting or fit; evaluation uses them.
 

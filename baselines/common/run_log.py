@@ -49,11 +49,12 @@ def wandb_run_of(args: TrainArgs, policy: str) -> WandbRun | None:
     """The run in Weights & Biases, described as ManiSkill's baselines describe theirs; None if it is not asked for.
 
     Args:
-        args: Settings of the run, with its name.
+        args: Settings of the run, with its name and its task.
         policy: Registered name of the policy.
     """
     if not args.track:
         return None
+    assert args.env_id is not None
     evaluated_on = dict(env_id=args.env_id, env_kwargs=json.loads(args.eval_env_kwargs), num_envs=args.num_eval_envs)
     tags = (policy, short_name(args.env_id), args.obs_mode)
     about = dict(eval_env_cfg=evaluated_on)

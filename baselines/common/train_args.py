@@ -13,6 +13,7 @@ from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
+from .dataset import recorded_task
 from .observation import CameraView, PoseForm
 from .policy import PolicyConfig
 
@@ -30,8 +31,8 @@ class TrainArgs:
 
     demos: Annotated[tuple[Path, ...], arg(name="demo-path", aliases=["--demos"])]
     """Trajectory files with observations, folders of LeRobot datasets, or zarr stores of the paper's layout."""
-    env_id: str = "ManiFeel-PegInsertion-v1"
-    """Environment id of the task in the demonstrations."""
+    env_id: str | None = None
+    """Environment id of the task; that which the demonstrations name if not given."""
     obs_mode: str = "rgb+tacff"
     """Modalities that the policy observes: "rgb", "rgb+tacrgb", "rgb+tacff", "rgb+tacrgb+tacff", "tacff", ..."""
     cameras: tuple[str, ...] | None = None
@@ -123,8 +124,9 @@ class TrainArgs:
 
         Raises:
             UnknownNameError: The task is not registered.
+            DemonstrationError: Neither the settings nor the demonstrations name the task.
         """
-        task = task_spec(self.env_id)
+        task = task_spec(self.env_id or recorded_task(self.demos))
         return replace(self, env_id=task.env_id, cameras=(task.policy_camera,) if self.cameras is None else self.cameras)
 
 
@@ -170,9 +172,10 @@ def default_exp_name(args: TrainArgs, policy: str) -> str:
     """Name of a new run, after what it trains and the present time.
 
     Args:
-        args: Settings of the run.
+        args: Settings of the run, with its task.
         policy: Registered name of the policy.
     """
+    assert args.env_id is not None
     now = datetime.now().strftime("%Y%m%d-%H%M%S")
     return f"{policy}/{short_name(args.env_id)}-{args.obs_mode}-seed{args.seed}-{now}"
 

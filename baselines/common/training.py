@@ -110,7 +110,8 @@ class Trainer:
         assert args.run_dir is not None
         self.run_dir, self.processes = args.run_dir, processes
         lr = args.public_code_lr() if args.lr is None else args.lr
-        self.args = args = replace(args, lr=lr)
+        self.args = args = replace(args, lr=lr).with_task_defaults()
+        assert args.env_id is not None
         self.device = processes.device
         keep_freed_memory(self.device)
         seed_everything(args.seed)
@@ -367,6 +368,7 @@ def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset:
         InvalidArgumentError: The policy cannot learn actions of the control mode of its data.
         DemonstrationError: Two files were recorded with different arguments.
     """
+    assert args.env_id is not None
     env_kwargs = recorded_env_kwargs(args.demos)
     mode = env_kwargs.get("control_mode") or task_spec(args.env_id).env_class.default_control_mode
     if policy_class.control_modes is not None and mode not in policy_class.control_modes:

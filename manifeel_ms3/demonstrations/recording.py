@@ -169,6 +169,8 @@ class Recording:
 
     def _load(self) -> None:
         before = read_header(self.path)
+        if not before["episodes"] and not finished_episodes(self._folder):
+            return  # a session that ended before its first episode has left nothing to which others could be added
         for name in ("env_info", "revision"):
             if before.get(name, self._header[name]) != self._header[name]:
                 raise DemonstrationError(

@@ -55,7 +55,7 @@ class TaskSpec:
     """Tables of the paper that report the task: "I", "II", "III"."""
     revision: int = 1
     """Number of the task's version, raised whenever its outcomes change; results of different revisions cannot be compared."""
-    demo_megabytes: float = 13.0
+    demo_megabytes: float = 15.0
     """Size of one demonstration with every observation, in MB, rounded up, by which free disk space is checked."""
     force_limit: float | None = None
     """Largest contact force of a gentle success, in N: twice the median of the demonstrations' largest forces; None if not

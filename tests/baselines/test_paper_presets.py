@@ -27,7 +27,7 @@ CAMERA, FIELD = "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field"
 @SPECS
 def test_networks_take_the_papers_observations(spec):
     """On the device "meta", which computes shapes alone."""
-    args = dataclasses.replace(spec.presets["paper"].args, obs_mode="rgb+tacrgb+tacff").with_task_defaults()
+    args = dataclasses.replace(spec.presets["paper"].args, obs_mode="rgb+tacrgb+tacff", env_id=PEG).with_task_defaults()
     observed, horizon, batch = spec_of(vars(args)), args.policy.obs_horizon, args.batch_size
     with torch.device("meta"):
         policy = spec.policy_class(args.policy, observed, 6)

@@ -20,6 +20,8 @@ from baselines.common.training import RecentLosses, Trainer, TrainingError, fast
 from baselines.diffusion_policy import train as diffusion
 from baselines.registry import PolicySpec, require_distinct
 from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
+from tests.sample import states_sample
+from tests.tasks_and_marks import PEG
 
 from .two_processes import end_before_the_evaluation, in_two_processes, resume_and_compare
 
@@ -53,6 +55,13 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
 def test_numbers_that_no_run_can_meet_are_refused(settings, said):
     with pytest.raises(InvalidArgumentError, match=said):
         check_run(TrainArgs((), **settings))
+
+
+def test_the_task_is_that_of_the_demonstrations_unless_another_is_named():
+    gear = "ManiFeel-GearAssembly-v1"
+    args = TrainArgs((states_sample(gear),)).with_task_defaults()
+    assert (args.env_id, args.cameras) == (gear, ("wrist",))
+    assert TrainArgs((states_sample(gear),), env_id="PegInsertion").with_task_defaults().env_id == PEG
 
 
 def test_each_epoch_holds_every_sample_once():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from baselines.common.dataset import read_episodes, recorded_env_kwargs
+from baselines.common.dataset import read_episodes, recorded_env_kwargs, recorded_task
 from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
@@ -83,7 +83,8 @@ def test_a_file_without_episodes_has_nothing_to_export(tmp_path):
 def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):
     folder = exported("lerobot", tmp_path)
     assert recorded_env_kwargs([folder]) == recorded_env_kwargs([SAMPLE])
-    with pytest.raises(DemonstrationError, match="of ManiFeel-PegInsertion-v1, not of ManiFeel-BallSorting-v1"):
+    assert recorded_task([folder]) == PEG
+    with pytest.raises(DemonstrationError, match="of ManiFeel-PegInsertion-v1, not of ManiFeel-BallSorting-v1; ask for"):
         list(lerobot.read_lerobot(folder, KEYS, env_id="ManiFeel-BallSorting-v1"))
     origin = folder / "meta/manifeel.json"
     origin.write_text(json.dumps(dict(env_id=PEG, env_kwargs=dict(fit="tight"))))

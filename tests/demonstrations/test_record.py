@@ -23,7 +23,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpi
 from manifeel_ms3.demonstrations.recording import make_header, open_recording
 from manifeel_ms3.demonstrations.summary import summary
 from manifeel_ms3.demonstrations.validate import validate
-from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
+from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
@@ -311,6 +311,16 @@ def test_evaluation_seeds_are_refused(tmp_path, seed, num):
     with pytest.raises(InvalidArgumentError, match="from 100000 on are for evaluation"):
         run(tmp_path / "trajectory.h5", num, seed=seed)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_was_refused_does_not_stand_in_the_way_of_the_next(recorded, tmp_path):
+    """What a session leaves that ended before its first episode has other arguments and no episodes."""
+    path = tmp_path / "trajectory.h5"
+    with pytest.raises(ManifeelError, match=r"foo.* is unknown"):
+        record.main(record.Args(PEG, 1, out=path, obs_mode="tacff", env_kwargs='{"randomization": {"foo": 1}}'))
+    assert read_header(path)["episodes"] == []
+    run(path, num=1)
+    assert len(read_header(path)["episodes"]) == 1
 
 
 def test_another_revision_of_the_task_does_not_mix_into_a_file(recorded, tmp_path):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines.common.dataset import recorded_env_kwargs
+from baselines.common.dataset import recorded_env_kwargs, recorded_task
 from manifeel_ms3.demonstrations import DemonstrationError, export
 from manifeel_ms3.demonstrations.formats.diffusion_policy_zarr import recorded_arguments
 from manifeel_ms3.errors import InvalidArgumentError
@@ -41,11 +41,17 @@ def read(folder: Path, env_id: str | None = None) -> np.ndarray:
     return episode[FIELD]
 
 
+def test_the_task_of_the_papers_own_data_must_be_named(papers_store):
+    with pytest.raises(DemonstrationError, match="no file says of which task it is; give --env-id"):
+        recorded_task([papers_store])
+
+
 def test_the_store_names_its_task_its_arguments_and_its_units(store):
     about = json.loads((store / ".zattrs").read_text())
     assert (about["env_id"], about["force_field_units"]) == (PEG, "newton")
     assert recorded_arguments(store) == json.loads(SAMPLE.with_suffix(".json").read_text())["env_info"]["env_kwargs"]
     assert recorded_env_kwargs([store, SAMPLE]) == recorded_env_kwargs([SAMPLE])
+    assert recorded_task([store]) == PEG
     assert read(store, PEG)[..., 0].max() > 0.02  # N
     with pytest.raises(DemonstrationError, match="not of ManiFeel-USBInsertion-v1"):
         read(store, "ManiFeel-USBInsertion-v1")

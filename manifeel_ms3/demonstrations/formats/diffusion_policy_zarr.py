@@ -219,4 +219,6 @@ def _to_paper(key: str, values: np.ndarray) -> np.ndarray:
     return values
 
 
-DIFFUSION_POLICY_ZARR = DemonstrationFormat("zarr", is_zarr, count_episodes, read_zarr, write_zarr, recorded_arguments)
+DIFFUSION_POLICY_ZARR = DemonstrationFormat(
+    "zarr", is_zarr, count_episodes, read_zarr, write_zarr, recorded_arguments, lambda folder: _attributes(folder).get("env_id")
+)

@@ -56,7 +56,9 @@ def require_task(folder: Path, origin: dict[str, Any], env_id: str | None) -> No
         DemonstrationError: The data set is of another task.
     """
     if env_id not in (None, found := origin.get("env_id", env_id)):
-        raise DemonstrationError(f"{folder} holds demonstrations of {found}, not of {env_id}; give those of {env_id}")
+        raise DemonstrationError(
+            f"{folder} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
+        )
 
 
 @contextmanager

@@ -273,4 +273,12 @@ def _decode(path: Path, shape: list[int]) -> Iterator[np.ndarray]:
         yield from reader.iter_data()
 
 
-LEROBOT = DemonstrationFormat("lerobot", is_lerobot, count_episodes, read_lerobot, write_lerobot, recorded_arguments)
+LEROBOT = DemonstrationFormat(
+    "lerobot",
+    is_lerobot,
+    count_episodes,
+    read_lerobot,
+    write_lerobot,
+    recorded_arguments,
+    lambda folder: _origin(folder).get("env_id"),
+)

@@ -210,7 +210,9 @@ def read_trajectories(
     header = read_header(path)
     found = task_of(header)
     if env_id is not None and found != env_id:
-        raise DemonstrationError(f"{path} holds demonstrations of {found}, not of {env_id}; give one recorded for {env_id}")
+        raise DemonstrationError(
+            f"{path} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
+        )
     count = len(header["episodes"]) if num is None else num
     if not 0 < count <= len(header["episodes"]):
         raise DemonstrationError(
@@ -272,5 +274,6 @@ MANISKILL_H5 = DemonstrationFormat(
     matches=lambda path: not Path(path).is_dir(),
     count=count_episodes,
     read=read_trajectories,
+    env_id=lambda path: task_of(read_header(path)),
     env_kwargs=lambda path: read_header(path)["env_info"]["env_kwargs"],
 )

@@ -65,6 +65,7 @@ class ObjectSearchRewardConfig:
     category="exploration",
     paper_demos=50,
     paper_tables=("I", "II", "III"),
+    demo_megabytes=10.0,
     demo_steps=71,
     revision=4,
     force_limit=8.0,

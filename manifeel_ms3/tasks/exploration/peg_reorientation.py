@@ -47,6 +47,7 @@ class PegReorientationRandomization(InsertionRandomization):
     paper_demos=50,
     paper_tables=("I",),
     revision=3,
+    demo_megabytes=26.0,
     demo_steps=135,
     force_limit=38.0,
 )

@@ -36,6 +36,7 @@ class GearRandomization(InsertionRandomization):
     category="insertion",
     paper_demos=100,
     paper_tables=("I", "II", "III"),
+    demo_megabytes=22.0,
     demo_steps=131,
     revision=4,
     force_limit=27.0,

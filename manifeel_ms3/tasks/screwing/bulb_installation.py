@@ -48,7 +48,7 @@ class BulbRandomization(ScrewingRandomization):
     category="screwing",
     paper_demos=20,
     paper_tables=("I", "II"),
-    demo_megabytes=70.0,
+    demo_megabytes=120.0,
     demo_steps=419,
     revision=4,
     force_limit=36.0,
