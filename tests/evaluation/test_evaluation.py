@@ -127,6 +127,24 @@ def test_every_task_says_what_a_policy_that_stands_still_lacks(spec):
     assert sum(bool(holds) for holds in missing.values()) >= 1  # else an episode would end in a mere time-out
 
 
+@pytest.mark.parametrize(
+    ("task", "changed", "lacks"),
+    [
+        (PEG, dict(gap=0.03), "beside or above the hole"),
+        (PEG, dict(gap=0.005), "in the hole, not pressed home"),
+        (PEG, dict(tilt=0.3), "pressed home, not upright or not for long enough"),
+        ("ManiFeel-GearAssembly-v1", dict(neighbours_off=0.1), "a neighbouring gear pushed off its shaft"),
+    ],
+)
+def test_an_insertion_that_fails_is_said_to_lack_what_it_lacks(make_env, task, changed, lacks):
+    env = make_env(task, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    measures = {name: torch.zeros_like(values) for name, values in env.unwrapped.measure().items()}
+    measures |= {name: torch.full_like(measures[name], value) for name, value in changed.items()}
+    missing = env.unwrapped.shortcomings(measures)
+    assert next(name for name, holds in missing.items() if holds) == lacks
+
+
 def test_same_policy_and_seed_give_the_same_outcome(make_env):
     env = make_env(**BARE)
     first = evaluate_episode(env, ExpertPolicy(env, 2), seed=2)
