@@ -78,6 +78,26 @@ class RestorableEnv(SensingEnv):
         self._touch_is_stale[running] = were_stale
 
 
+def take_given_state(options: dict[str, Any]) -> Any:
+    """Take the state in which an episode is to begin out of the options of a reset.
+
+    Returns:
+        The tree or the vectors that ManiSkill's option `reset_to_env_states` holds; None if it is not given.
+
+    Raises:
+        InvalidArgumentError: The option holds no state.
+    """
+    given = options.pop("reset_to_env_states", None)
+    if given is None:
+        return None
+    if not isinstance(given, Mapping) or "env_states" not in given:
+        raise InvalidArgumentError(
+            "the option reset_to_env_states holds no env_states; give dict(reset_to_env_states=dict(env_states=state)) with a "
+            "state of get_state_dict or get_state"
+        )
+    return given["env_states"]
+
+
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:
     """Tree of tensors (N, D) that a flat state holds side by side, in the tree's order.
 

@@ -31,7 +31,7 @@ from .checks import check_argument_names, check_num_envs, check_seed, checked_ra
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
-from .states import RestorableEnv
+from .states import RestorableEnv, take_given_state
 
 CONTROL_FREQ = 10
 """Control steps per second, in Hz (public code of the paper)."""
@@ -308,7 +308,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
         check_seed(seed)
-        given = options.pop("reset_to_env_states", None)
+        state = take_given_state(options)
         if seed is not None:
             self._episodes_of_seed = np.zeros(self.num_envs, np.int64)
             if self.num_envs == 1:
@@ -318,11 +318,12 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             options["env_idx"] = env_idx  # a list is accepted, too
         with self._others_unchanged(env_idx):
             _, info = super().reset(seed=seed, options=options)
-            if given is None:
+            if state is None:
                 self._settle()
+            elif isinstance(state, Mapping):
+                self.set_state_dict(state, env_idx)
             else:
-                set_state = self.set_state_dict if isinstance(given["env_states"], Mapping) else self.set_state
-                set_state(given["env_states"], env_idx)
+                self.set_state(state, env_idx)
         self._touch_is_stale[env_idx] = True
         for sensor in self._tactile_sensors.values():
             sensor.forget_readings(env_idx)  # which are from before the grip had settled

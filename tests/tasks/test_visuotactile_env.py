@@ -355,6 +355,8 @@ def test_an_episode_that_begins_in_a_given_state_begins_anew(make_env, seed, fla
     assert not info["success"]
     assert info["elapsed_steps"] == 0
     assert base.get_state() == pytest.approx(vector, abs=1e-6)
+    with pytest.raises(InvalidArgumentError, match="holds no env_states; give"):
+        env.reset(options=dict(reset_to_env_states=tree))
 
 
 def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):
