@@ -18,8 +18,8 @@ STREAM_STRIDE = 1 << 20
 
 
 EPISODE_STRIDE = 0x9E3779B1
-"""Odd number by whose multiples the seeds of episodes differ that have the same seed of a reset: Knuth's multiplicative hash,
-2^32 divided by the golden ratio."""
+"""Factor of the multiplicative hash by which the seeds of episodes differ that have the same seed of a reset: the prime near
+2^32 divided by the golden ratio (Knuth, The Art of Computer Programming 3, 6.4)."""
 UNCHANGED = "tactile_right"
 """Pad that draws from the episode's seed itself, as it did before the pads' draws were told apart."""
 
