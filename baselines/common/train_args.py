@@ -13,7 +13,6 @@ from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
-from .dataset import recorded_task
 from .observation import CameraView, PoseForm
 from .policy import PolicyConfig
 
@@ -126,6 +125,8 @@ class TrainArgs:
             UnknownNameError: The task is not registered.
             DemonstrationError: Neither the settings nor the demonstrations name the task.
         """
+        from .dataset import recorded_task  # imported here, because it loads h5py, which changes what a fork does
+
         task = task_spec(self.env_id or recorded_task(self.demos))
         return replace(self, env_id=task.env_id, cameras=(task.policy_camera,) if self.cameras is None else self.cameras)
 

@@ -23,7 +23,7 @@ from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
 from .command_lines import OBS_MODE, device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
@@ -300,7 +300,9 @@ def inference(policy: str, *flags: str) -> float:
 def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, torch.Tensor], torch.Tensor]:
     """An untrained policy, its training arguments, and a batch of random observations and actions, on the CPU a small one."""
     preset, *rest = flags
-    args = preset_cli(policy_spec(policy), [preset, "--demo-path", "-", *rest]).with_task_defaults()
+    any_task = next(iter(all_tasks()))
+    asked = [preset, "--demo-path", "-", "--env-id", any_task, *rest]
+    args = preset_cli(policy_spec(policy), asked).with_task_defaults()
     spec, horizon = spec_of(vars(args)), args.policy.obs_horizon
     batch = min(args.batch_size, TRIAL_BATCH) if args.device == "cpu" else args.batch_size
     network = policy_spec(policy).policy_class(args.policy, spec, ACTION_SIZE).to(args.device)

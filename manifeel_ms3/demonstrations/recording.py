@@ -9,7 +9,7 @@ from uuid import uuid4
 
 import gymnasium as gym
 
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, ManifeelError
 from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
@@ -128,7 +128,12 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
         MachineError: The folder cannot be written.
     """
     with owned(path):
-        yield Recording(path, header, order)
+        recording = Recording(path, header, order)
+        try:
+            yield recording
+        except ManifeelError:
+            recording.withdraw()
+            raise
 
 
 class Recording:
@@ -153,6 +158,7 @@ class Recording:
         """Seeds whose episodes failed."""
         self.is_complete = False
         """Whether the file holds its episodes itself and is not an index."""
+        self._is_new = not path.exists()
         self._waiting: dict[int, dict[str, Any]] = {}
         self._header, self._order = header, order
         self._origin = {name: header.get(name) for name in ORIGIN}
@@ -169,8 +175,6 @@ class Recording:
 
     def _load(self) -> None:
         before = read_header(self.path)
-        if not before["episodes"] and not finished_episodes(self._folder):
-            return  # a session that ended before its first episode has left nothing to which others could be added
         for name in ("env_info", "revision"):
             if before.get(name, self._header[name]) != self._header[name]:
                 raise DemonstrationError(
@@ -220,6 +224,13 @@ class Recording:
         for stale in self._folder.glob(f"{SESSION}*"):  # left by sessions that were killed
             remove_folder(stale)
         self.drafts.mkdir(parents=True)
+
+    def withdraw(self) -> None:
+        """Delete what this session has begun, if it holds nothing yet: it would refuse the corrected arguments."""
+        if self._is_new and not (self.infos or self._waiting or self.failed):
+            remove_folder(self._folder)
+            for path in (self.path, self.path.with_suffix(".json")):
+                path.unlink(missing_ok=True)
 
     def accept(self, seed: int, info: dict[str, Any]) -> int:
         """Take over an episode that lies among the drafts.
