@@ -105,7 +105,7 @@ def _file_table(path: Path, header: dict) -> Table:
 
 
 def _force_table(forces: list[np.ndarray]) -> Table:
-    """Numbers of steps by the contact force of the held part on the world."""
+    """Numbers of steps by the contact force, which is that of the hand on the held part."""
     table = Table("contact force, N", "steps", "", title="contact forces")
     everything = np.concatenate(forces) if forces else np.zeros(0)
     counts, _ = np.histogram(everything, FORCE_EDGES)

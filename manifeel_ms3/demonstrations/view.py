@@ -171,7 +171,7 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
         group = group_of(opened, entry)
         touched = [name for name, data in group.get("obs/sensor_data", {}).items() if "force_field" in data]
         sensors = {pad: recorded_sensor(header["env_info"]["env_kwargs"], pad) for pad in touched}
-        names = action_names(entry["control_mode"], group["actions"].shape[1])
+        names = action_names(entry.get("control_mode", ""), group["actions"].shape[1])
         return EpisodeStreams(title, dict(_images(group, sensors)), dict(_series(group, sensors, names)))
 
 
@@ -209,7 +209,7 @@ def _series(
 ) -> Iterator[tuple[str, tuple[list[str], np.ndarray]]]:
     """Numbers over time of an episode, by place."""
     if "contact_force" in group:  # files of other programs hold no forces
-        yield "contact_force", (["of the held part on the world, N"], group["contact_force"][()][:, None])
+        yield "contact_force", (["of the hand on the held part, N"], group["contact_force"][()][:, None])
     for pad, sensor in sensors.items():
         field = group[f"obs/sensor_data/{pad}/force_field"][()]
         yield f"{pad}_force", (list(SUMS[sensor.units]), field.sum((1, 2)))

@@ -116,5 +116,16 @@ def test_the_units_of_a_sensor_that_is_not_installed_are_not_guessed(tmp_path):
         view.read_streams(file_with_touch(tmp_path / "touch.h5", field, sensor="theirs"), 0)
 
 
+def test_actions_of_a_file_without_a_control_mode_are_numbered(tmp_path):
+    file = file_with_touch(tmp_path / "touch.h5", np.zeros((10, 14, 3), np.float32))
+    about = file.with_suffix(".json")
+    header = json.loads(about.read_text())
+    for entry in header["episodes"]:
+        entry.pop("control_mode")
+    about.write_text(json.dumps(header))
+    names, values = view.read_streams(file, 0).series["actions"]
+    assert names == [str(i) for i in range(values.shape[1])]
+
+
 def test_actions_of_another_robot_are_numbered():
     assert view.action_names("pd_joint_delta_pos_of_another_robot", 2) == ["0", "1"]
