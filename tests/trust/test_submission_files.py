@@ -28,6 +28,11 @@ COPY = ".theirs.*.partial"
 """Pattern of the folder that a submission is copied to before it takes its name."""
 
 
+def num_copied(board: Path) -> int:
+    """Number of files in the copy of a submission, which may take its name, and so disappear, while they are counted."""
+    return sum(len(names) for copy in board.glob(COPY) for _, _, names in os.walk(copy))  # `os.walk` passes over what is gone
+
+
 def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> bool:
     """Take a submission in a process that is killed a moment after this many files; return whether it was still at work."""
     submission = read_submission(folder)
@@ -37,7 +42,7 @@ def taken_until_killed(folder: Path, board: Path, files: int, delay: float) -> b
         finally:
             os._exit(0)
     ended = (0, 0)
-    while not ended[0] and sum(path.is_file() for path in board.glob(f"{COPY}/**/*")) < files:
+    while not ended[0] and num_copied(board) < files:
         ended = os.waitpid(child, os.WNOHANG)
     time.sleep(delay)
     if not ended[0]:
