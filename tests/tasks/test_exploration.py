@@ -45,6 +45,28 @@ def test_balls_swap_and_rest_in_their_seats(make_env):
     assert 5 <= sum(sides) <= 15
 
 
+@pytest.mark.parametrize(("golf", "tennis", "goal"), [(0.0, 0.0, False), (0.11, 0.0, True), (0.0, 0.11, False)])
+def test_a_state_with_the_balls_the_other_way_round_has_its_own_seats(make_env, golf, tennis, goal):
+    one, other = (make_env(SORTING, obs_mode="none", render_backend="none").unwrapped for _ in range(2))
+    one.reset(seed=0)
+    lift(one.golf, golf)
+    lift(one.tennis, tennis)
+    other.reset(seed=2)
+    assert bool(one.swapped) is not bool(other.swapped)
+    other.set_state_dict(one.get_state_dict())
+    assert {name: value.item() for name, value in other.measure().items()} == pytest.approx(
+        {name: value.item() for name, value in one.measure().items()}, abs=1e-6
+    )
+    assert bool(other.goal_reached(other.measure())) is goal
+    seats = other.swapped.clone()
+    lift(other.golf, 0.2)
+    lift(other.tennis, 0.2)
+    away = other.get_state_dict()
+    other.reset(seed=2, options=dict(reset_to_env_states=dict(env_states=one.get_state_dict())))
+    other.set_state_dict(away)  # neither ball shows the seats, which stay those of the last state
+    assert torch.equal(other.swapped, seats)
+
+
 def test_golf_ball_has_its_dimples():
     radius = np.linalg.norm(golf_ball_mesh().vertices, axis=1)
     assert radius.max() == pytest.approx(BALL_RADIUS, abs=1e-6)

@@ -140,6 +140,17 @@ class BallSortingEnv(VisuotactileEnv):
         start = start_pose(n, START_XYZ, (ranges.start_xy, ranges.start_xy, ranges.start_z), 0.0)
         self.agent.reset_tool(start)
 
+    def _state_has_changed(self, changed: torch.Tensor | slice, joint_forces: torch.Tensor | None) -> None:
+        """Also let the seats be those of the new state, which may be from an episode with the balls the other way round.
+
+        No state holds the seats: they follow from the balls that lie in them. Where neither ball does, they stay as they are.
+        """
+        golf_seat, tennis_seat = self._seats()
+        places = ((self.golf, tennis_seat), (self.tennis, golf_seat))
+        in_others = [torch.linalg.norm(ball.pose.p - seat, dim=1) < IN_PLACE for ball, seat in places]
+        self.swapped[changed] ^= (in_others[0] | in_others[1])[changed]
+        super()._state_has_changed(changed, joint_forces)
+
     def _seats(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Positions (N, 3), in m, that the centres of the golf ball and of the other ball have in their seats."""
         middle = self.stand.pose.p + torch.tensor([0.0, 0.0, SEAT_HEIGHT], device=self.device)
