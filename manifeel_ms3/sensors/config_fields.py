@@ -63,43 +63,43 @@ def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
             raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be a number, or a pair (least, most)")
 
 
-def with_option(config: Any, path: Sequence[str], value: Any, name: str) -> Any:
-    """Copy of a dataclass with one field changed.
-
-    Args:
-        config: The dataclass.
-        path: Names that lead to the field, from the outermost dataclass inwards.
-        value: New value.
-        name: Name of the option in messages.
-
-    Raises:
-        UnknownNameError: The field does not exist; the message lists those that do.
-        InvalidArgumentError: The value is of another type than the field's.
-    """
-    known = {entry.name: entry for entry in dataclasses.fields(config)} if dataclasses.is_dataclass(config) else {}
-    if path[0] not in known:
-        raise UnknownNameError(f"tactile option {name!r}: {path[0]!r} is not a field; choose from {list(known)}")
-    present = getattr(config, path[0])
-    if known[path[0]].metadata.get("amount") and is_number(value):
-        value = (value, value)
-    if len(path) > 1:
-        value = with_option(present, path[1:], value, name)
-    elif not _is_like(value, present):
-        raise InvalidArgumentError(f"tactile option {name!r}: expected a value like {present!r}, not {value!r}")
-    changed: dict[str, Any] = {path[0]: tuple(value) if isinstance(present, tuple) else value}
-    return dataclasses.replace(cast(Any, config), **changed)
-
-
 def with_options(config: Any, options: Mapping[str, Any]) -> Any:
     """Copy of a dataclass with some fields changed, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
 
+    The fields are changed together, so that their order does not matter, and only the result must be sound.
+
     Raises:
-        UnknownNameError: A name is not that of a field.
-        InvalidArgumentError: A value is not allowed.
+        UnknownNameError: A name is not that of a field; the message lists those that exist.
+        InvalidArgumentError: A value is of another type than the field's, or is not allowed.
     """
-    for name, value in by_name("tactile", options, '{"units": "tacsl", "optics.noise": 2.0}').items():
-        config = with_option(config, name.split("."), value, name)
-    return config
+    given = by_name("tactile", options, '{"units": "tacsl", "optics.noise": 2.0}')
+    return _changed(config, {tuple(name.split(".")): value for name, value in given.items()}, ())
+
+
+def _changed(config: Any, options: Mapping[tuple[str, ...], Any], outer: tuple[str, ...]) -> Any:
+    """Copy of a dataclass with the fields changed to which paths lead; `outer` leads to the dataclass, for messages."""
+    known = {entry.name: entry for entry in dataclasses.fields(config)} if dataclasses.is_dataclass(config) else {}
+    for path in options:
+        if path[0] not in known:
+            name = ".".join((*outer, *path))
+            raise UnknownNameError(f"tactile option {name!r}: {path[0]!r} is not a field; choose from {list(known)}")
+    whole = {path[0]: value for path, value in options.items() if len(path) == 1}
+    changed = {
+        name: _value_of(known[name], getattr(config, name), value, ".".join((*outer, name))) for name, value in whole.items()
+    }
+    for first in dict.fromkeys(path[0] for path in options if len(path) > 1):
+        inner = {path[1:]: value for path, value in options.items() if path[0] == first and len(path) > 1}
+        changed[first] = _changed(changed.get(first, getattr(config, first)), inner, (*outer, first))
+    return dataclasses.replace(cast(Any, config), **changed)
+
+
+def _value_of(entry: dataclasses.Field, present: Any, value: Any, name: str) -> Any:
+    """The value that a field takes, if it is of the field's type; the option's name is for messages."""
+    if entry.metadata.get("amount") and is_number(value):
+        value = (value, value)
+    if not _is_like(value, present):
+        raise InvalidArgumentError(f"tactile option {name!r}: expected a value like {present!r}, not {value!r}")
+    return tuple(value) if isinstance(present, tuple) else value
 
 
 def _is_like(value: Any, present: Any) -> bool:

@@ -60,6 +60,19 @@ def test_options_by_dotted_name():
         with_options(config, {"gel.thickness": -1.0})
 
 
+def test_options_are_changed_together_in_any_order():
+    small = {"gel.size": (0.016, 0.020), "taxel_shape": [9, 12], "image_shape": (180, 224)}
+    dome = {"gel.curvature": (25.0, 25.0), "housing.protrusion": 0.008}
+    config = gelsight_r15("a", "b")
+    for options in (small, dome):
+        assert with_options(config, options) == with_options(config, dict([*options.items()][::-1]))
+    assert with_options(config, small).taxel_shape == (9, 12)
+    whole = with_options(config, {"gel.thickness": 0.003, "gel": GelConfig(size=(0.03, 0.04))}).gel
+    assert (whole.thickness, whole.size) == (0.003, (0.03, 0.04))
+    with pytest.raises(InvalidArgumentError, match="taxel_shape x taxel_pitch"):
+        with_options(config, {"image_shape": (180, 224), "gel.size": (0.016, 0.020)})
+
+
 def test_sensors_by_name():
     assert sensor_names()[:3] == ["gelsight_r15", "gelsight_mini", "digit"]
     mini, digit = (sensor_config(name, "a", "b") for name in ("gelsight_mini", "digit"))
