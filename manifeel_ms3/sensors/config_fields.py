@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import UnionType
 from typing import Any, cast
 
 from manifeel_ms3.arguments import by_name, is_number
@@ -95,6 +96,10 @@ def _changed(config: Any, options: Mapping[tuple[str, ...], Any], outer: tuple[s
 
 def _value_of(entry: dataclasses.Field, present: Any, value: Any, name: str) -> Any:
     """The value that a field takes, if it is of the field's type; the option's name is for messages."""
+    if isinstance(entry.type, UnionType):  # a part that may be absent
+        if not isinstance(value, entry.type):
+            raise InvalidArgumentError(f"tactile option {name!r}: expected {entry.type}, not {value!r}")
+        return value
     if entry.metadata.get("amount") and is_number(value):
         value = (value, value)
     if not _is_like(value, present):

@@ -131,6 +131,11 @@ def task_sensor(
         InvalidArgumentError: A value is not allowed.
     """
     config = with_options(sensor_config(name, uid, link), options or {})
+    if "optics.calibration" in (options or {}) and config.optics.lights is not None:
+        raise InvalidArgumentError(
+            f"tactile option 'optics.calibration': the colours of sensor {name!r} are computed from its lamps, and no "
+            "calibration would be read; give 'optics.lights': None, too"
+        )
     known = [entry.name for entry in dataclasses.fields(config.imperfections)]
     if not isinstance(imperfections or {}, Mapping):
         raise InvalidArgumentError(f"imperfections={imperfections!r} must be a dict of amounts by name; names are {known}")

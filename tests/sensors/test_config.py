@@ -73,6 +73,18 @@ def test_options_are_changed_together_in_any_order():
         with_options(config, {"image_shape": (180, 224), "gel.size": (0.016, 0.020)})
 
 
+def test_a_sensor_with_lamps_takes_a_calibration_only_instead_of_them():
+    shader = OpticsConfig().calibration
+    with pytest.raises(InvalidArgumentError, match=r"optics\.calibration.*'digit'.*'optics\.lights': None"):
+        task_sensor("digit", "a", "b", {"optics.calibration": shader}, None)
+    calibrated = task_sensor("digit", "a", "b", {"optics.calibration": shader, "optics.lights": None}, None)
+    assert (calibrated.optics.calibration, calibrated.optics.lights) == (shader, None)
+    lamps = sensor_config("digit", "a", "b").optics.lights
+    assert with_options(gelsight_r15("a", "b"), {"optics.lights": lamps}).optics.lights == lamps
+    with pytest.raises(InvalidArgumentError, match=r"optics\.lights.*expected.*LightsConfig \| None, not 3"):
+        with_options(gelsight_r15("a", "b"), {"optics.lights": 3})
+
+
 def test_sensors_by_name():
     assert sensor_names()[:3] == ["gelsight_r15", "gelsight_mini", "digit"]
     mini, digit = (sensor_config(name, "a", "b") for name in ("gelsight_mini", "digit"))
