@@ -196,6 +196,16 @@ def test_taxim_table_can_be_given_with_any_number_of_bins(optics, table_file, tm
     assert (other.shade(surface).int() - expected).abs().float().mean() < 1.0
 
 
+def test_a_calibration_that_is_written_anew_is_read_anew(tmp_path):
+    path = tmp_path / "shader.npz"
+    shader = Shader.load(CONFIG.optics.calibration)
+    levels = []
+    for brightness in (1.0, 0.5):
+        Shader(shader.weights, brightness * shader.background).save(path)
+        levels.append(make_optics(**{"optics.calibration": path}).levels)
+    assert torch.allclose(levels[1], 0.5 * levels[0])
+
+
 @pytest.mark.parametrize("press", ["ball", "rod", "wedge"])
 def test_height_comes_back_from_the_picture(optics, press, figure):
     surface = pressed(optics, press)

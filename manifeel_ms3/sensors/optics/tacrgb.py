@@ -189,7 +189,9 @@ class Optics:
         self.config, self.device = config, device
         optics, shape = config.optics, config.image_shape
         coarse, cell = (shape[0] // COARSE, shape[1] // COARSE), COARSE * config.pixel_size
-        recipe = (Path(optics.calibration), optics.lights, config.gel.curvature, tuple(shape), config.pixel_size)
+        calibration = Path(optics.calibration)
+        file = (calibration, calibration.stat().st_mtime_ns if calibration.is_file() else 0)
+        recipe = (file, optics.lights, config.gel.curvature, tuple(shape), config.pixel_size)
         self._response, self._background, to_light = _shading_maps(*recipe, device)
         self._to_light = wp.array(to_light, dtype=wp.vec2f, device=warp_device(device))
         self._knots = wp.array(KNOTS.astype(np.float32), dtype=wp.float32, device=warp_device(device))
@@ -312,7 +314,7 @@ def _shader(
 
 @functools.lru_cache(maxsize=CACHED_SHADERS)
 def _shading_maps(
-    calibration: Path,
+    file: tuple[Path, int],
     lights: LightsConfig | None,
     curvature: tuple[float, float],
     image_shape: tuple[int, int],
@@ -321,11 +323,13 @@ def _shading_maps(
 ) -> tuple[wp.array, wp.array, np.ndarray]:
     """The shader at every pixel.
 
+    `file` is the path of the calibration and the time of its last change, so that a file that is written anew is read anew.
+
     Returns:
         Response (H, W, knot, Fourier term) and background (H, W), RGB each, and the direction (3, 2), along rows and columns,
         from which each channel's light comes.
     """
-    shader = _shader(calibration, lights, curvature, image_shape, pixel_size)
+    shader = _shader(file[0], lights, curvature, image_shape, pixel_size)
     rows, cols = image_shape
     place = place_terms(*np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, cols), indexing="ij"))
     response = np.zeros((rows, cols, len(KNOTS), FOURIER_TERMS, 3), np.float32)
