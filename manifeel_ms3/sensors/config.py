@@ -88,22 +88,44 @@ class HousingConfig:
 
 @dataclass(frozen=True)
 class Light:
-    """A small lamp, or a point of a bar of lamps, that lights the gel from behind."""
+    """A small lamp, or a point of a bar of lamps, that lights the gel from behind.
+
+    Raises:
+        InvalidArgumentError: The lamp is not behind the face.
+    """
 
     position: tuple[float, float, float]
     """Position in the pad frame, m; behind the face, so that its z is negative."""
     colour: tuple[float, float, float]
     """Brightness in red, green and blue, in any unit that is the same for all lamps."""
 
+    def __post_init__(self):
+        for name in ("position", "colour"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # a list would not do as a key of the cached colours
+        if len(self.position) != 3 or not self.position[2] < 0:
+            raise InvalidArgumentError(
+                f"position={self.position} of a lamp must be three coordinates in the pad frame, in m, the last one negative: "
+                "lamps are behind the face, whose z is 0"
+            )
+
 
 @dataclass(frozen=True)
 class LightsConfig:
-    """Lamps from which the colours are computed (see `optics.lights`)."""
+    """Lamps from which the colours are computed (see `optics.lights`).
+
+    Raises:
+        InvalidArgumentError: There is no lamp.
+    """
 
     lamps: tuple[Light, ...]
     """All lamps."""
     level: float = within(110.0, 1.0, 255.0)
     """Mean level of each lit channel of the untouched gel, grey levels of 255: what a camera's exposure control would set."""
+
+    def __post_init__(self):
+        object.__setattr__(self, "lamps", tuple(self.lamps))
+        if not self.lamps:
+            raise InvalidArgumentError("lamps=() leaves the gel dark; give at least one Light, or a calibration instead")
 
 
 @dataclass

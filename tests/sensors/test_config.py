@@ -8,6 +8,8 @@ from manifeel_ms3.sensors import (
     GelConfig,
     HousingConfig,
     ImperfectionConfig,
+    Light,
+    LightsConfig,
     OpticsConfig,
     TouchRandomization,
     gelsight_r15,
@@ -83,6 +85,18 @@ def test_a_sensor_with_lamps_takes_a_calibration_only_instead_of_them():
     assert with_options(gelsight_r15("a", "b"), {"optics.lights": lamps}).optics.lights == lamps
     with pytest.raises(InvalidArgumentError, match=r"optics\.lights.*expected.*LightsConfig \| None, not 3"):
         with_options(gelsight_r15("a", "b"), {"optics.lights": 3})
+
+
+def test_lamps_light_the_gel_from_behind():
+    with pytest.raises(InvalidArgumentError, match=r"position=\(0\.02, 0\.0, 0\.017\).*negative"):
+        Light((0.02, 0.0, 0.017), (1.0, 1.0, 1.0))
+    with pytest.raises(InvalidArgumentError, match="three coordinates"):
+        Light((0.02, -0.017), (1.0, 1.0, 1.0))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidArgumentError, match="at least one Light"):
+        LightsConfig(())
+    listed = LightsConfig([Light(np.array([0.02, 0.0, -0.017]), [1.0, 1.0, 1.0])])  # pyright: ignore[reportArgumentType]
+    assert listed == LightsConfig((Light((0.02, 0.0, -0.017), (1.0, 1.0, 1.0)),))
+    assert hash(listed) == hash(LightsConfig((Light((0.02, 0.0, -0.017), (1.0, 1.0, 1.0)),)))
 
 
 def test_sensors_by_name():
