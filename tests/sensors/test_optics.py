@@ -26,8 +26,10 @@ def optics():
     return make_optics()
 
 
-def ball(radius: float, depth: float, x: float = 0.0, y: float = 0.0) -> torch.Tensor:
-    rows, cols = CONFIG.image_shape
+def ball(
+    radius: float, depth: float, x: float = 0.0, y: float = 0.0, shape: tuple[int, int] = CONFIG.image_shape
+) -> torch.Tensor:
+    rows, cols = shape
     xx = (torch.arange(rows) - (rows - 1) / 2) * CONFIG.pixel_size - x
     yy = (torch.arange(cols) - (cols - 1) / 2) * CONFIG.pixel_size - y
     r2 = xx[:, None] ** 2 + yy[None] ** 2
@@ -69,6 +71,25 @@ def test_surface_has_a_skirt_that_falls_from_the_contact(optics):
     right = surface[160:]
     assert (right.diff() <= 1e-9).all()
     assert surface[0] < 1e-6
+
+
+@pytest.mark.parametrize("shape", [(183, 229), (182, 228), (201, 203)])
+def test_an_image_may_have_any_number_of_rows_and_columns(shape):
+    odd = make_optics(**{"image_shape": shape, "optics.shadow": 0.6, "optics.markers": True})
+    surface = odd.surface(ball(0.004, 8e-4, shape=shape))
+    for axis in (1, 2):
+        assert (surface - surface.flip(axis)).abs().max() < 5e-6  # m; the ball presses in the middle
+    still = torch.zeros(1, len(GRID.x), 2, dtype=torch.float64)
+    places, _ = dots(odd.shade(surface, still)[0])
+    middle = (np.array(shape[::-1]) - 1) / 2
+    around = places[np.abs(np.linalg.norm(places - middle, axis=1) - 26) < 4]
+    assert len(around) == 4
+    assert around.mean(0) == pytest.approx(middle, abs=0.15)  # pixels
+
+
+def test_an_image_may_be_a_single_pixel():
+    single = make_optics(image_shape=(1, 1))
+    assert single.shade(single.surface(torch.zeros(1, 1, 1))).shape == (1, 1, 1, 3)
 
 
 def test_noise_is_seeded():

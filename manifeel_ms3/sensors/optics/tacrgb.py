@@ -4,7 +4,6 @@
 """From the height of what presses to TacRGB: the gel's surface around the contact, and the compact shader as a warp kernel."""
 
 import functools
-import math
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from manifeel_ms3.sensors.config import LightsConfig, TactileSensorConfig
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.warp_device import launch_split, warp_device
 
+from .blur import GaussianBlur
 from .lights import lamp_shader
 from .shader import FOURIER_TERMS, KNOTS, Shader, place_terms, slope_terms
 from .taxim_table import TABLE_CHANNELS, fit_table, read_table
@@ -27,8 +27,6 @@ COARSE = 4  # pixels along each side of a coarse cell; the wide blurs vary littl
 # Standard deviations, m: the larger kernels of Taxim's pyramid at its 0.0295 mm per pixel
 WIDE_SIGMAS = (0.9e-3, 0.46e-3)
 NARROW_SIGMA = 0.24e-3
-BLUR_REACH = 2.5  # standard deviations after which a blur's kernel ends: 4 % of its peak is left there
-BAND = 80  # samples of a blur that one matrix product computes (see `GaussianBlur`)
 SEGMENTS = len(KNOTS) - 1
 SHADOW_STEPS = 12  # coarse cells: greatest length of a shadow, 4.2 mm on the R1.5
 # Gradients of the rays from a light bar's lowest and highest point: 3 mm high at 15 mm, 6 mm high at 12 mm (chosen)
@@ -188,7 +186,7 @@ class Optics:
     def __init__(self, config: TactileSensorConfig, grid: ContactGrid, num_pads: int, device: torch.device):
         self.config, self.device = config, device
         optics, shape = config.optics, config.image_shape
-        coarse, cell = (shape[0] // COARSE, shape[1] // COARSE), COARSE * config.pixel_size
+        coarse, cell = tuple(-(-pixels // COARSE) for pixels in shape), COARSE * config.pixel_size
         calibration = Path(optics.calibration)
         file = (calibration, calibration.stat().st_mtime_ns if calibration.is_file() else 0)
         recipe = (file, optics.lights, config.gel.curvature, tuple(shape), config.pixel_size)
@@ -201,7 +199,8 @@ class Optics:
         self._narrow = GaussianBlur(shape, NARROW_SIGMA / config.pixel_size, device)
         self._coat = GaussianBlur(shape, optics.smoothing, device) if optics.smoothing > 0 else None
         drag = config.gel.thickness * MARKER_SPREAD
-        self._drag = [_spread(x, n, cell, drag, device) for x, n in zip(_axes(grid), coarse, strict=True)]
+        centres = [_cell_centres(pixels, config.pixel_size) for pixels in shape]
+        self._drag = [_spread(x, at, drag, device) for x, at in zip(_axes(grid), centres, strict=True)]
         self._gain = torch.ones(num_pads, 3, device=device)
         self._phase = torch.tensor([[1.0, 0.0]], device=device).repeat(num_pads, 1)
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
@@ -231,12 +230,13 @@ class Optics:
         each of which the object pushes the gel down to its own depth (after Taxim's pyramid; by the maximum, so that the rim
         of a shallow contact hangs in the skirt of a deep one). The wide blurs are smooth and computed on coarse cells.
         """
-        coarse = F.avg_pool2d(penetration[:, None], COARSE)[:, 0]
+        coarse = _coarse(penetration)
         skirt = coarse
         for blur in self._wide:
             skirt = torch.maximum(coarse, blur(skirt))
-        surface = F.interpolate(skirt[:, None], size=penetration.shape[1:], mode="bilinear", align_corners=False)[:, 0]
-        surface = torch.maximum(penetration, surface)
+        pixels = [COARSE * cells for cells in skirt.shape[1:]]
+        fine = F.interpolate(skirt[:, None], size=pixels, mode="bilinear", align_corners=False)[:, 0]
+        surface = torch.maximum(penetration, fine[:, : penetration.shape[1], : penetration.shape[2]])
         surface = torch.maximum(penetration, self._narrow(surface))
         return surface if self._coat is None else self._coat(surface)
 
@@ -252,7 +252,7 @@ class Optics:
             )
         optics, pixel = self.config.optics, self.config.pixel_size
         image = torch.empty(*surface.shape, 3, dtype=torch.uint8, device=self.device)
-        coarse = F.avg_pool2d(surface[:, None], COARSE)[:, 0] if optics.shadow > 0 or optics.markers else surface[:0]
+        coarse = _coarse(surface) if optics.shadow > 0 or optics.markers else surface[:0]
         light = self._light(coarse) if optics.shadow > 0 else surface.new_empty(0, 0, 0, 3)
         moved = self._skin(coarse, bristle) if optics.markers and bristle is not None else surface.new_empty(0, 0, 0, 3)
         inputs = [
@@ -343,47 +343,26 @@ def _shading_maps(
     return *maps, to_light.astype(np.float32)
 
 
-class GaussianBlur:
-    """Gaussian blur of images (N, H, W) along both axes, the values at the rim repeated beyond it.
-
-    Each axis is blurred by products with stretches of the band matrix: 0.29 ms for 240 x 320 pixels and a sigma of 2.7 on one
-    CPU core, against 0.68 ms with the whole matrix and 1.2 ms with two calls of `conv2d`.
-
-    Args:
-        shape: Rows H and columns W of the images.
-        sigma: Standard deviation, samples.
-        device: Device of the images.
-    """
-
-    def __init__(self, shape: tuple[int, int], sigma: float, device: torch.device):
-        self._rows, self._cols = (_blur_bands(count, sigma, device) for count in shape)
-
-    def __call__(self, image: torch.Tensor) -> torch.Tensor:
-        image = torch.cat([matrix @ image[:, low:high] for low, high, matrix in self._rows], dim=1)
-        return torch.cat([image[:, :, low:high] @ matrix.T for low, high, matrix in self._cols], dim=2)
-
-
-def _blur_bands(count: int, sigma: float, device: torch.device) -> list[tuple[int, int, torch.Tensor]]:
-    """Blur of `count` samples: first and last sample that each stretch of the result needs, and its matrix."""
-    reach = max(1, round(BLUR_REACH * sigma))
-    matrix = np.zeros((count, count))
-    for offset in range(-reach, reach + 1):
-        matrix[np.arange(count), np.clip(np.arange(count) + offset, 0, count - 1)] += math.exp(-0.5 * (offset / sigma) ** 2)
-    weights = torch.as_tensor(matrix / matrix.sum(1, keepdims=True), dtype=torch.float32, device=device)
-    bands = []
-    for start in range(0, count, BAND):
-        low, high = max(0, start - reach), min(count, start + BAND + reach)
-        bands.append((low, high, weights[start : start + BAND, low:high].contiguous()))
-    return bands
-
-
 def _axes(grid: ContactGrid) -> tuple[np.ndarray, np.ndarray]:
     """Places of the cells' rows and columns, m."""
     return grid.x.view(grid.shape)[:, 0].cpu().numpy(), grid.y.view(grid.shape)[0].cpu().numpy()
 
 
-def _spread(points: np.ndarray, count: int, cell: float, sigma: float, device: torch.device) -> torch.Tensor:
-    """Weights (count, points) of a Gaussian average over points, m, around the centres of `count` cells centred on zero."""
-    centres = (np.arange(count) - (count - 1) / 2) * cell
+def _coarse(image: torch.Tensor) -> torch.Tensor:
+    """Means (N, h, w) of images (N, H, W) over the coarse cells; the rim is repeated where the last cells reach beyond it."""
+    beyond = (0, -image.shape[2] % COARSE, 0, -image.shape[1] % COARSE)
+    whole = F.pad(image[:, None], beyond, mode="replicate") if any(beyond) else image[:, None]
+    return F.avg_pool2d(whole, COARSE)[:, 0]
+
+
+def _cell_centres(pixels: int, pixel_size: float) -> np.ndarray:
+    """Centres of the coarse cells along a side of the image, m from its middle."""
+    count = -(-pixels // COARSE)
+    beyond = (COARSE * count - pixels) * pixel_size
+    return (np.arange(count) - (count - 1) / 2) * (COARSE * pixel_size) + beyond / 2
+
+
+def _spread(points: np.ndarray, centres: np.ndarray, sigma: float, device: torch.device) -> torch.Tensor:
+    """Weights (centres, points) of a Gaussian average over points around centres, all in m."""
     weights = np.exp(-0.5 * ((centres[:, None] - points[None]) / sigma) ** 2)
     return torch.as_tensor(weights / weights.sum(1, keepdims=True), dtype=torch.float32, device=device)
