@@ -32,7 +32,7 @@ from manifeel_ms3.errors import MachineError, WorkFailedError
 from manifeel_ms3.network import LOOPBACK
 
 from . import cost
-from .command_lines import shell_command
+from .command_lines import require_valid_flags, shell_command
 from .jobs import FAILED, STARTED, Status, is_done, perform_in, read_status, restore_child_signals, status_of
 from .publish import publish
 from .study import KINDS, Job, Kind, Resources, Study, jobs_of, read_study
@@ -92,11 +92,13 @@ def main(args: Args) -> None:
 
     Raises:
         StudyError: The study's file cannot be used.
+        InvalidArgumentError: Two settings of a training contradict each other.
         MachineError: The study asks for more than the machine has, or the folder of the jobs cannot be written.
         StudyFailed: Some jobs failed; the others are done.
     """
     study = read_study(args.study)
     jobs = jobs_of(study)
+    require_valid_flags(jobs)
     console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
     if args.print_commands:
         for job in jobs:

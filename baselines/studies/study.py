@@ -92,7 +92,7 @@ class Grid:
     preset: str = "paper"
     """Preset of training."""
     train: dict[str, Any] = field(default_factory=dict)
-    """Further flags of `manifeel train`, such as {steps: 2000, batch-size: 16}."""
+    """Further flags of `manifeel train`, such as {steps: 2000, policy.public-code: true}."""
     encoder_flags: dict[str, dict[str, Any]] = field(default_factory=dict)
     """Flags of `manifeel train` that one encoder of TacRGB needs, such as {t3: {tacrgb-weights: weights/t3_medium}}."""
     pretrain: dict[str, str] = field(default_factory=dict)

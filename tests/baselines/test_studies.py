@@ -21,7 +21,7 @@ from baselines.common.observation import observation_spec
 from baselines.common.train_args import default_steps
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
-from baselines.studies.command_lines import shell_command, training_args
+from baselines.studies.command_lines import require_valid_flags, shell_command, training_args
 from baselines.studies.jobs import is_done, perform
 from baselines.studies.study import Job, Resources, StudyError, jobs_of, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
@@ -91,6 +91,26 @@ def test_a_run_is_the_same_job_however_its_flags_are_written(study):
     for short, long in ((" {steps", " {total-iters"), ("save-every", "save_freq"), ("batch-size", "batch_size")):
         study.write_text(TINY.replace(short, long))
         assert [job.key for job in jobs_of(read_study(study))] == keys
+
+
+def test_flags_that_are_on_or_off_reach_the_training(study):
+    on_and_off = "policy.encoder.freeze-tacrgb: true, policy.public-code: false, compile: true"
+    study.write_text(
+        f"grids: [{{tasks: [ManiFeel-PegInsertion-v1], policies: [flow_matching], train: {{{on_and_off}}}, seeds: [0]}}]"
+    )
+    jobs = jobs_of(read_study(study))
+    require_valid_flags(jobs)
+    args = next(training_args(job) for job in jobs if job.kind == "train")
+    assert (args.policy.encoder.freeze_tacrgb, args.policy.public_code, args.compile) == (True, False, True)
+
+
+@pytest.mark.parametrize("flags", ["no-such: 3", "batch-size: many", "policy.pred-horizon: 2"])
+def test_a_flag_that_no_training_takes_is_refused_before_any_job_begins(study, flags, tmp_path, capsys):
+    study.write_text(TINY.replace("batch-size: 4", flags))
+    with pytest.raises(StudyError, match="does not take one of its flags"):
+        study_command.main(study_command.Args(study, root=tmp_path / "root"))
+    assert not list(tmp_path.glob("root/*/*"))
+    assert flags.partition(":")[0].removeprefix("policy.").replace("-", "_") in capsys.readouterr().err.replace("-", "_")
 
 
 @pytest.mark.parametrize("path", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda path: path.stem)
