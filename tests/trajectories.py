@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -38,5 +39,19 @@ def renumbered(path: Path, folder: Path) -> Path:
     header = json.loads(path.with_suffix(".json").read_text())
     for episode, number in zip(header["episodes"], (4, 0), strict=True):
         episode["episode_id"] = number
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    return copy
+
+
+def changed_copy(path: Path, folder: Path, key: str, change: Callable[[np.ndarray], np.ndarray], **env_kwargs: object) -> Path:
+    """A copy of a file with an array of its last episode changed, which says that its task had these arguments, too."""
+    copy = Path(shutil.copy(path, folder / f"changed_{path.name}"))
+    with h5py.File(copy, "r+") as file:
+        place = f"{list(file)[-1]}/{key}"
+        values = change(file[place][()])
+        del file[place]
+        file[place] = values
+    header = json.loads(path.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"] |= env_kwargs
     copy.with_suffix(".json").write_text(json.dumps(header))
     return copy

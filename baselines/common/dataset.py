@@ -15,7 +15,7 @@ from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
 from manifeel_ms3.progress import progress_bar
 
 from .memory import return_freed_memory
-from .observation import ObservationSpec, prepare
+from .observation import POSE, ObservationSpec, prepare
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Demonstration]:
@@ -28,7 +28,8 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
         num_demos: Number of episodes over all files; all episodes if None.
 
     Raises:
-        DemonstrationError: A file is missing, broken, of another task or observation mode, or there are too few episodes.
+        DemonstrationError: A file is missing, broken, of another task or observation mode, holds NaN or arrays of another shape
+            than the first episode, or there are too few episodes.
     """
     files, episodes = list(files), []
     formats = [format_of(file) for file in files]
@@ -45,12 +46,42 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
                 break
             track = partial(bar.track, description=f"reading {file.name}")
             recorded = known.read(file, spec.keys, num=left, progress=track, env_id=env_id)
-            episodes.extend(map(partial(_prepared, spec), recorded))  # unlike a loop, `map` holds no episode while it reads
+            # unlike a loop, `map` holds no episode while it reads
+            episodes.extend(map(partial(_prepared, spec, file), range(left), recorded))
+            _require_same_shapes(file, episodes[0], episodes[-left:])
     return episodes
 
 
-def _prepared(spec: ObservationSpec, episode: Demonstration) -> Demonstration:
-    return {key: prepare(key, episode[key], spec) for key in spec.keys} | dict(actions=episode["actions"])
+def _prepared(spec: ObservationSpec, file: Path, number: int, recorded: Demonstration) -> Demonstration:
+    """Episode `number` of a file as networks take it.
+
+    Raises:
+        DemonstrationError: A number is not finite.
+    """
+    episode = {key: prepare(key, recorded[key], spec) for key in spec.keys} | dict(actions=recorded["actions"])
+    for key in ("actions", POSE, *spec.force_fields):
+        finite = np.isfinite(episode[key]).reshape(len(episode[key]), -1).all(1)
+        if not finite.all():  # the ranges by which all demonstrations are scaled would not be finite either
+            raise DemonstrationError(
+                f"{file}: {key!r} of episode {number}, counted from 0, is NaN or infinite at step {finite.argmin()}; record it "
+                "again, or leave the file out"
+            )
+    return episode
+
+
+def _require_same_shapes(file: Path, first: Demonstration, episodes: list[Demonstration]) -> None:
+    """Check that the episodes of a file have arrays of the same shapes as the first episode of all files.
+
+    Raises:
+        DemonstrationError: They do not.
+    """
+    for number, episode in enumerate(episodes):
+        for key, values in episode.items():
+            if (found := values.shape[1:]) != (expected := first[key].shape[1:]):
+                raise DemonstrationError(
+                    f"{file}: {key!r} of episode {number}, counted from 0, has the shape {found} at a step, and {expected} in "
+                    "the first episode; train on files that were recorded with the same sensors and control mode"
+                )
 
 
 def recorded_task(files: Iterable[Path]) -> str:

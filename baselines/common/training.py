@@ -117,6 +117,7 @@ class Trainer:
         seed_everything(args.seed)
 
         spec = spec_of(vars(args))
+        env_kwargs = learnable_task(args, policy_class)
         episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
         spec = with_taxel_shape(spec, episodes[0])
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
@@ -125,7 +126,7 @@ class Trainer:
         usual = default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
         self.total_steps = usual if args.steps is None else args.steps
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
-        self.config = run_config(args, policy_class, self.dataset) | amount
+        self.config = run_config(args, policy_class, self.dataset, env_kwargs) | amount
 
         self.policy = self._make_policy(policy_class)
         self.optimizer = torch.optim.AdamW(self.policy.parameters(), lr, args.betas, weight_decay=args.weight_decay, fused=True)
@@ -361,11 +362,11 @@ def with_taxel_shape(spec: ObservationSpec, episode: Demonstration) -> Observati
     return replace(spec, taxel_shape=shapes.pop()) if shapes else spec
 
 
-def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset) -> dict:
-    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json can hold.
+def learnable_task(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> dict:
+    """The arguments of the task with which the demonstrations were recorded.
 
     Raises:
-        InvalidArgumentError: The policy cannot learn actions of the control mode of its data.
+        InvalidArgumentError: The policy cannot learn actions of their control mode.
         DemonstrationError: Two files were recorded with different arguments.
     """
     assert args.env_id is not None
@@ -376,6 +377,11 @@ def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset:
             f"the actions of {', '.join(map(str, args.demos))} are of the control mode {mode!r}, which the policy "
             f"{policy_class.name!r} cannot learn; record them in one of {list(policy_class.control_modes)}, or train another"
         )
+    return env_kwargs
+
+
+def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset, env_kwargs: dict) -> dict:
+    """The settings of a run, and the facts of its data that policy and evaluation depend on, in types that json can hold."""
     settings = {name: value for name, value in as_json(args).items() if name != "wandb_entity"}  # personal, so not published
     return settings | dict(
         policy_name=policy_class.name,

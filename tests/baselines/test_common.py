@@ -18,6 +18,7 @@ from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG
+from tests.trajectories import changed_copy
 
 SPEC = observation_spec("tacff", (), ("right",), 64)
 FIELD = SPEC.force_fields[0]
@@ -96,6 +97,25 @@ def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
     with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, but the files hold"):
         read_episodes([demos], PEG, SPEC, 9)
+
+
+@pytest.mark.parametrize("key", ["actions", "obs/extra/tcp_pose", f"obs/{SPEC.force_fields[0]}"])
+def test_an_episode_that_is_not_finite_is_named_before_it_spoils_the_ranges_of_all(demos, tmp_path, key):
+    def with_nan(values):
+        values[3].flat[0] = np.nan
+        return values
+
+    copy = changed_copy(demos, tmp_path, key, with_nan)
+    number = len(read_episodes([demos], PEG, SPEC, None)) - 1
+    with pytest.raises(DemonstrationError, match=rf"{copy.name}: .*{key[4:]}.* of episode {number}, .* at step 3"):
+        read_episodes([demos, copy], PEG, SPEC, None)
+
+
+@pytest.mark.parametrize("key", ["actions", f"obs/{SPEC.force_fields[0]}"])
+def test_files_of_another_sensor_or_controller_are_refused(demos, tmp_path, key):
+    copy = changed_copy(demos, tmp_path, key, lambda values: values[:, 1:])
+    with pytest.raises(DemonstrationError, match=rf"{copy.name}: .* has the shape \(\d.*\) at a step, and \(\d"):
+        read_episodes([demos, copy], PEG, SPEC, None)
 
 
 def test_one_episode_at_its_recorded_size_is_in_memory():

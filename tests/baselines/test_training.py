@@ -22,9 +22,10 @@ from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from baselines.references import MeanAction, Untrained
 from baselines.registry import PolicySpec
-from manifeel_ms3.demonstrations import read_demonstrations
+from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config, samples_per_step
 from tests.tasks_and_marks import PEG
+from tests.trajectories import changed_copy
 from tests.trust.running_evaluations import wait_for_episodes
 
 POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
@@ -149,6 +150,15 @@ def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkey
     whole, second = read_tensors(checkpoint / "model.safetensors"), read_tensors(resumed / "model.safetensors")
     assert all(torch.equal(whole[name], second[name]) for name in whole)
     assert log_of(tmp_path) == log_of(run.args.run_dir)
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_files_of_two_sensors_are_refused_by_the_name_of_what_differs(run, tmp_path):
+    (demos,) = run.args.demos
+    field = "obs/sensor_data/tactile_right/force_field"
+    other = changed_copy(demos, tmp_path, field, lambda values: values[:, :8, :10], sensor="digit")
+    with pytest.raises(DemonstrationError, match=r"sensor=None, .* with sensor='digit'"):
+        run.again(demos=(demos, other), run_dir=tmp_path / "run")
 
 
 @pytest.mark.parametrize("run", QUICK, indirect=True)
