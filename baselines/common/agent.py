@@ -105,9 +105,9 @@ class PolicyAgent(EpisodePolicy):
         self.device, self.seed, self.batch_size = torch.device(device or "cpu"), seed, batch_size or 1
         self.policy = build_policy(self.config, policy_class).to(self.device).eval()
         load_weights(self.policy, weights, checkpoint)
-        steps = inference_steps or self.config.get("inference_steps")
-        if not isinstance(steps, int) or steps < 1:
-            raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a positive whole number")
+        steps, least = inference_steps or self.config.get("inference_steps"), self.policy.config.least_inference_steps
+        if not isinstance(steps, int) or steps < least:
+            raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of at least {least}")
         self.inference_steps = steps
         self.make_episode_part = partial(ActionChunks, self.policy.spec, self.policy.config.obs_horizon)
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])

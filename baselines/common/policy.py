@@ -59,6 +59,11 @@ class PolicyConfig:
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
+    @property
+    def least_inference_steps(self) -> int:
+        """Smallest number of generation steps that leads to the actions that the policy has learnt."""
+        return 1
+
     def __post_init__(self):
         if self.obs_horizon < 1 or self.action_horizon < 1:
             raise InvalidArgumentError(

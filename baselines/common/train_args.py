@@ -159,6 +159,8 @@ def check_run(args: TrainArgs) -> None:
         inference_steps=args.inference_steps,
         log_freq=args.log_freq,
     )
+    if args.inference_steps < (least := args.policy.least_inference_steps):
+        raise InvalidArgumentError(f"--inference-steps {args.inference_steps}: this policy needs at least {least} to generate")
     if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):
         raise InvalidArgumentError(
             "--resume needs --run-dir or --exp-name, the folder or the name of the run to continue, and excludes --overwrite"

@@ -123,8 +123,7 @@ class Trainer:
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
         self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
-        usual = default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
-        self.total_steps = usual if args.steps is None else args.steps
+        self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
         self.config = run_config(args, policy_class, self.dataset, env_kwargs) | amount
 

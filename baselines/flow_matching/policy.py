@@ -35,6 +35,10 @@ class FlowConfig(PolicyConfig):
     """Reproduce two traits of the paper's public code: generation starts from noise that is uniform in [0, 1], though training
     draws Gaussian noise, and the network is given the time in [0, 1] instead of [0, 100]."""
 
+    @property
+    def least_inference_steps(self):
+        return self.segments if self.consistency else 1
+
 
 class FlowMatchingPolicy(VisuotactilePolicy):
     """Flow Matching (Lipman et al. 2023): learns the velocity v(x, t) at which noise (t = 0) flows into actions (t = 1)."""

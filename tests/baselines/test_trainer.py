@@ -18,6 +18,7 @@ from baselines.common.processes import Processes
 from baselines.common.train_args import PAPER_EPOCHS, TrainArgs, check_run, default_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
+from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
 from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
 from tests.sample import states_sample
@@ -50,6 +51,10 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
         (dict(inference_steps=0), "--inference-steps 0 must be at least 1"),  # else the first evaluation fails, hours later
         (dict(log_freq=0), "--log-freq 0 must be at least 1"),
         (dict(save_freq=4, eval_freq=6), "--eval-freq 6 must be a multiple of --save-freq 4"),
+        (
+            dict(policy=FlowConfig(consistency=True, segments=2), inference_steps=1),  # would stop short of the actions
+            "--inference-steps 1: this policy needs at least 2 to generate",
+        ),
     ],
 )
 def test_numbers_that_no_run_can_meet_are_refused(settings, said):

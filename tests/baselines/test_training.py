@@ -161,6 +161,18 @@ def test_files_of_two_sensors_are_refused_by_the_name_of_what_differs(run, tmp_p
         run.again(demos=(demos, other), run_dir=tmp_path / "run")
 
 
+@pytest.mark.parametrize("run", ["consistency"], indirect=True)
+def test_a_policy_of_several_segments_is_not_evaluated_with_fewer_steps(run, checkpoint, tmp_path):
+    copy = Path(shutil.copytree(checkpoint, tmp_path / "copy"))
+    config = checkpoint_config(copy)
+    config["policy"]["segments"] = 4
+    (copy / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="inference_steps=3 must be a whole number of at least 4"):
+        run.spec.load(copy, inference_steps=3)
+    assert run.spec.load(copy, inference_steps=4).inference_steps == 4
+    assert run.spec.load(checkpoint, inference_steps=1).inference_steps == 1
+
+
 @pytest.mark.parametrize("run", QUICK, indirect=True)
 def test_the_seed_fixes_everything(run, tmp_path):
     losses = []
