@@ -25,7 +25,7 @@ import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.files import atomic_write
+from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
@@ -304,6 +304,9 @@ def next_step(_args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     episodes = read_result(made)["episodes"]
     outcome = f"{made}: {sum(episode['success_once'] for episode in episodes)} of {len(episodes)} episodes succeed"
+    if errors := [episode["error"] for episode in episodes if episode["error"]]:
+        first = " ".join("".join(letter if letter.isprintable() else " " for letter in errors[0]).split())[:SHOWN_LENGTH]
+        outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {first})"
     return f"{outcome}; `manifeel film {made} --out FILE.mp4` shows one, `manifeel results` sets all results beside the paper's"
 
 

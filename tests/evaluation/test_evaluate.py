@@ -12,12 +12,13 @@ import pytest
 
 from manifeel_ms3.errors import ServerError, UnknownNameError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from manifeel_ms3.evaluation.evaluate import Args, main
+from manifeel_ms3.evaluation.evaluate import Args, main, next_step
 from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.tasks_and_marks import PEG
+from tests.trust.files_of_strangers import rewrite_json
 from tests.trust.listening import free_port
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=12))
@@ -71,6 +72,19 @@ def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_pat
 def test_a_wrong_number_of_actions_is_named(tmp_path):
     result = evaluated("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
     assert "shape (9,), the task takes (6,)" in result["episodes"][0]["error"]
+
+
+def test_the_command_says_how_many_episodes_the_policy_failed_by_an_error(tmp_path):
+    out = tmp_path / "evaluation.json"
+    evaluated("Raises", tmp_path)
+    said = next_step(Args(), out)
+    assert "0 of 2 episodes succeed, and 2 failed because of an error of the policy" in said
+    assert "(the first: step 0: RuntimeError: out of ideas)" in said
+    rewrite_json(out, lambda result: result["episodes"][0].update(error="step 0: <html>\n\x1b[31m" + "x" * 999))
+    assert "(the first: step 0: <html> [31mxxx" in (said := next_step(Args(), out))
+    assert len(said) < 600
+    evaluated("StandStill", tmp_path)
+    assert "0 of 2 episodes succeed; " in next_step(Args(), out)
 
 
 def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
