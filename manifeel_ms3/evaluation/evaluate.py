@@ -224,7 +224,8 @@ def evaluation_from_args(args: Args) -> Evaluation:
     Raises:
         CheckpointError: The checkpoint's configuration is missing or incomplete.
         UnknownNameError: The task is not registered.
-        InvalidArgumentError: Neither a checkpoint nor a policy is given, or both, or a policy without its task.
+        InvalidArgumentError: Neither a checkpoint nor a policy is given, or both, or a policy without its task, or arguments
+            of the task with other observations than the policy's.
     """
     if (args.checkpoint is None) == (args.policy is None):
         raise InvalidArgumentError("give either --checkpoint, or --policy with --env-id and --obs-mode")
@@ -239,6 +240,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
             f"{_flags(unused)} are for a --checkpoint; give them to a --policy of your own by --policy-kwargs"
         )
     env_id = task_spec(args.env_id).env_id
+    _require_obs_mode(args.obs_mode, given)
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs, answer_timeout=args.step_timeout)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
@@ -262,6 +264,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
             f"--sensor {args.sensor}: the demonstrations of {checkpoint} were recorded with {learnt}; leave it out, or give "
             f'--env-kwargs \'{{"sensor": "{args.sensor}"}}\' if another sensor is meant'
         )
+    _require_obs_mode(config["obs_mode"], given)
     _name_differences(trained | sensing, given)
     device = checked_device(args.device)
     if args.batch_size is not None and args.batch_size < 1:
@@ -270,6 +273,19 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     # not the link `last`, which training may move meanwhile
     source = PolicySource(checkpoint.resolve(), None, json.dumps(kwargs), device, batch_size)
     return Evaluation(source, env_id, trained | sensing | BACKEND | given, config, args.stop_at_success, args.step_timeout)
+
+
+def _require_obs_mode(obs_mode: str, given: dict[str, Any]) -> None:
+    """Check that --env-kwargs do not make the task with other observations than those that the result names.
+
+    Raises:
+        InvalidArgumentError: They have another observation mode than the policy.
+    """
+    if (other := given.get("obs_mode", obs_mode)) != obs_mode:
+        raise InvalidArgumentError(
+            f"--env-kwargs have obs_mode {other!r}, but the policy observes {obs_mode!r}; leave it out there, and choose the "
+            "observations of a --policy by --obs-mode"
+        )
 
 
 def _name_differences(trained: dict[str, Any], given: dict[str, Any]) -> None:

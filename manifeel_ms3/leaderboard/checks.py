@@ -95,7 +95,7 @@ def _faults(result: dict[str, Any]) -> list[str]:
 
 
 def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
-    """What is wrong with the episodes and the revision of the task of a result."""
+    """What is wrong with the episodes, the observations and the revision of the task of a result."""
     env_id, faults = result["env_id"], []
     seeds, here = evaluation_seeds(EPISODES), task_spec(env_id).revision
     given = [episode["seed"] for episode in result["episodes"]]
@@ -104,6 +104,11 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
         faults.append(
             f"its {len(given)} episodes are not those of the {EPISODES} evaluation seeds from {seeds[0]} on (missing "
             f"{missing[:SHOWN]}, foreign {foreign[:SHOWN]}, or in another order); evaluate with --num-eval-episodes {EPISODES}"
+        )
+    if (observed := result["env_kwargs"].get("obs_mode")) != result["obs_mode"]:
+        faults.append(
+            f"it is of obs_mode {result['obs_mode']!r}, but its env_kwargs have obs_mode {observed!r}, with which its episodes "
+            "are run; evaluate again with the --obs-mode of the policy"
         )
     if result["revision"] != here:
         faults.append(

@@ -44,6 +44,8 @@ SEED_BITS = 63
 """Number of random bits in the seed of a draw, which fits into a signed integer of 64 bits."""
 NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num_demos", "policy")
 """Entries of a policy's configuration that a result must share with its checkpoint."""
+SHOWN_AS = {"obs_mode": "obs_mode", "policy": "policy_name", "training_seed": "seed"}
+"""Entries of a result that the page shows, and the entries of its checkpoint's configuration that they must be equal to."""
 
 
 @cache
@@ -168,7 +170,11 @@ def policy_sources(submission: Submission, policy: str, kwargs: str) -> dict[Pat
 
 
 def _differing_settings(result: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    return [name for name in NAMED_BY if result["config"].get(name) != config.get(name)]
+    """Names of what a result says of its policy, and what the configuration of a checkpoint does not."""
+    return [
+        *(name for name in NAMED_BY if result["config"].get(name) != config.get(name)),
+        *(shown for shown, name in SHOWN_AS.items() if result[shown] != config.get(name)),
+    ]
 
 
 def draw(submission: Submission, most: int | None, seed: int) -> dict[Path, list[int]]:

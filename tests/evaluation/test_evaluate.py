@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.errors import ServerError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, ServerError, UnknownNameError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.evaluate import Args, main, next_step
 from manifeel_ms3.evaluation.policy import PolicyError
@@ -106,6 +106,15 @@ def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
 def test_what_is_missing_is_named(settings, word):
     with pytest.raises(ValueError, match=word):
         main(Args(**settings))
+
+
+def test_the_task_is_made_with_the_observations_that_the_result_names(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="have obs_mode 'state', but the policy observes 'tacff'"):
+        evaluated("StandStill", tmp_path, env_kwargs=json.dumps(dict(obs_mode="state")))
+    config = dict(policy_name="diffusion_policy", env_id=PEG, obs_mode="rgb", cameras=[], tactile_sensors=[])
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(InvalidArgumentError, match="have obs_mode 'state', but the policy observes 'rgb'"):
+        main(Args(tmp_path, env_kwargs=json.dumps(dict(obs_mode="state"))))
 
 
 def test_an_unknown_task_is_named_before_anything_is_made(tmp_path):

@@ -27,6 +27,6 @@ def made_up(folder: Path, name: str, task: str, mode: str, won: int, seeds: int 
     for seed in range(seeds):
         for step in range(100, 100 * steps + 1, 100):
             config = dict(policy_name="diffusion_policy", obs_mode=mode, seed=seed, step=step, num_demos=50)
-            result = result_of(f"ManiFeel-{task}-v1", dict(cameras=["wrist"]), config, outcomes_of(won, rng))
+            result = result_of(f"ManiFeel-{task}-v1", dict(obs_mode=mode, cameras=["wrist"]), config, outcomes_of(won, rng))
             write_result(result, folder / f"results/{seed}/{step:08d}.json")
     return folder

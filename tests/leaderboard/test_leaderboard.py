@@ -86,6 +86,9 @@ def change(folder: Path, edit) -> None:
         (lambda r: r.update(stop_at_success=True), "evaluate without --stop-at-success"),
         (lambda r: r.update(episode_len=5.0), "episode_len says 5.0"),
         (lambda r: r.update(env_id="ManiFeel-Knitting-v1"), "is no task of this leaderboard"),
+        (lambda r: r.update(obs_mode="rgb"), "of obs_mode 'rgb', but its env_kwargs have obs_mode 'tacff'"),
+        (lambda r: r["env_kwargs"].update(obs_mode="state"), "of obs_mode 'tacff', but its env_kwargs have obs_mode 'state'"),
+        (lambda r: r["env_kwargs"].pop("obs_mode"), "its env_kwargs have obs_mode None"),
     ],
 )
 def test_what_is_wrong_with_a_result_is_said(submission, edit, word):

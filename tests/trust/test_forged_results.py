@@ -151,6 +151,22 @@ def test_a16_results_are_of_the_checkpoints_that_the_submission_names(folder, tm
     assert not (tmp_path / "board").exists()
 
 
+@pytest.mark.parametrize(
+    ("forged", "shown"),
+    [
+        (dict(policy="human"), "policy"),
+        (dict(training_seed=7), "training_seed"),
+        (dict(obs_mode="state", env_kwargs=dict(obs_mode="state", cameras=["wrist"])), "obs_mode"),
+    ],
+)
+def test_a16_what_the_page_shows_is_what_the_checkpoint_says(folder, tmp_path, forged, shown):
+    runs = checkpoints_of(folder, tmp_path / "runs")
+    main(Hash(folder, checkpoint=(runs,)))
+    rewrite_json(folder / FIRST, lambda result: result.update(forged))
+    with pytest.raises(SubmissionError, match=rf"differ in \['{shown}'\]"):
+        main(Submit(folder, checkpoint=(runs,), board=tmp_path / "board"))
+
+
 def test_a16_one_checkpoint_cannot_stand_for_two_results(folder, tmp_path):
     runs = checkpoints_of(folder, tmp_path / "runs")
     main(Hash(folder, checkpoint=(runs,)))

@@ -78,7 +78,7 @@ def test_a15_texts_of_a_submission_are_no_markup(folder, tmp_path):
             lambda result: result.update(
                 policy=NASTY + "\n| forged | row |",
                 obs_mode="rgb+tacrgb" + NASTY,
-                env_kwargs=dict(cameras=[NASTY], fit=NASTY),
+                env_kwargs=dict(obs_mode="rgb+tacrgb" + NASTY, cameras=[NASTY], fit=NASTY),
                 config=result["config"] | dict(policy=dict(encoder=dict(image=NASTY[:90], tacrgb=NASTY[:90]))),
             ),
         )
