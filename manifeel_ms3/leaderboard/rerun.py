@@ -24,6 +24,7 @@ from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS, checkpoint_config, published_hash
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.evaluation.redaction import redacted
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.provenance import package_versions
 
@@ -157,13 +158,18 @@ def policy_sources(submission: Submission, policy: str, kwargs: str) -> dict[Pat
         kwargs: Keyword arguments of the policy, as json.
 
     Raises:
-        SubmissionError: A result is of another policy.
+        SubmissionError: A result is of another policy, or of other arguments of the policy.
     """
-    faults = [
-        f"{quoted(path)} is not of {policy}, but of {result['policy']!r}; submit it with that policy"
-        for path, result in submission.results.items()
-        if result["policy"] != policy
-    ]
+    name, given, faults = redacted(policy), redacted(json.loads(kwargs)), []  # as results have them
+    for path, result in submission.results.items():
+        evaluated = result["config"].get("policy_kwargs", {})
+        if result["policy"] != name:
+            faults.append(f"{quoted(path)} is not of {name}, but of {result['policy']!r}; submit it with that policy")
+        elif evaluated != given:
+            faults.append(
+                f"{quoted(path)} was evaluated with --policy-kwargs '{json.dumps(evaluated)}', and would be run again with "
+                f"'{json.dumps(given)}'; give the same"
+            )
     if faults:
         raise SubmissionError(submission.folder, faults)
     return dict.fromkeys(submission.results, PolicySource(policy=policy, kwargs=kwargs))

@@ -16,6 +16,7 @@ from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.page import rows_on
+from manifeel_ms3.leaderboard.rerun import policy_sources
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from tests.browser import browser_program
 from tests.leaderboard.made_up import made_up
@@ -135,6 +136,21 @@ def test_foreign_and_broken_files_are_all_named(submission, tmp_path):
 def test_a_result_of_another_policy_is_not_run_for_this_one(submission, tmp_path):
     with pytest.raises(SubmissionError, match=r"is not of tests\.evaluation\.policies:Raises, but of '.*StandStill'"):
         main(Submit(submission, policy="tests.evaluation.policies:Raises", board=tmp_path / "board"))
+
+
+def test_a_policy_is_run_again_with_the_arguments_of_its_evaluation(submission, tmp_path):
+    change(submission, lambda result: result["config"].update(policy_kwargs=dict(gain=0.3, api_key="(redacted)")))
+    named = """was evaluated with --policy-kwargs '{"gain": 0.3, "api_key": "(redacted)"}', .* with '{}'; give the same"""
+    with pytest.raises(SubmissionError, match=re.escape(named).replace(r"\.\*", ".*")):
+        submit(submission, tmp_path / "board", rerun=1)
+    given = json.dumps(dict(gain=0.3, api_key="1234567"))
+    assert len(policy_sources(read_submission(submission), POLICY, given)) == 1
+
+
+def test_a_server_with_a_password_is_asked_again(submission):
+    change(submission, lambda result: result.update(policy="http://(redacted)@localhost:8000"))
+    (source,) = policy_sources(read_submission(submission), "http://me:1234567@localhost:8000", "{}").values()
+    assert source.policy == "http://me:1234567@localhost:8000"
 
 
 def test_a_submission_needs_a_policy_from_the_command_line(submission, tmp_path):
