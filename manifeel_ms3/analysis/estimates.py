@@ -25,8 +25,8 @@ SIGNIFICANT = 0.05
 """Largest p-value of a difference that counts as one."""
 FEWEST_SEEDS = 3
 """Number of training seeds of a condition from which a difference says something about training, as many as in the paper's
-protocol. Two runs that differ in their seed alone differ as much as two conditions often do: of 27 pairs of such runs of ours,
-7 had a p-value below 0.05 on the same 50 initial states."""
+protocol. Two runs that differ in their seed alone differ as much as two conditions often do: of the pairs of such runs in
+leaderboard/cpu, about one in five has a p-value below 0.05 on the same 50 initial states."""
 SMALLEST_SHOWN = 0.001
 """Smallest p-value that tables show as a number."""
 NO_SPREAD = 1e-12

@@ -38,8 +38,8 @@ CHANCE = 0.01
 """Largest probability that such a row is not detected."""
 COINCIDENCE = 0.1
 """Assumed probability that an invented episode has the same outcome as its repetition, that is, the same success and forces
-within 0.01 N. In all but two of the results under leaderboard/cpu, at most 3 of the 50 episodes have forces so near to any one
-value; in that of ObjectSearch with rgb, 13 episodes do, all of them failures. An invented success agrees only where the policy
+within 0.01 N. In nine of ten results in this repository, at most 3 of the 50 episodes have forces so near to any one value; in
+one of ObjectSearch with rgb, 13 episodes do, all of them failures. An invented success agrees only where the policy
 succeeds, too."""
 SEED_BITS = 63
 """Number of random bits in the seed of a draw, which fits into a signed integer of 64 bits."""

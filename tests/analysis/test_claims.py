@@ -2,23 +2,27 @@
 
 import json
 import re
-from itertools import product
+from dataclasses import replace
+from itertools import combinations, product
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from manifeel_ms3.analysis import claims
 from manifeel_ms3.analysis.condition import Condition
 from manifeel_ms3.analysis.encoder_ranking import rankings, verdict_on
-from manifeel_ms3.analysis.estimates import Estimate, holm
+from manifeel_ms3.analysis.estimates import Estimate, difference, holm
 from manifeel_ms3.analysis.paper import MODES, TABLE_II, TABLE_III, TACFF, TACRGB, VISION, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
-from manifeel_ms3.analysis.protocol import collect, of_the_protocol
+from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
 from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import PEG
 
 from .made_up import TOTAL_STEPS, page_of, write_run
 
+ROOT = Path(__file__).parents[2]
 WEIGHTS = dict(unit="unit.safetensors", t3="t3_medium", anytouch="anytouch.pth")
 NEEDS = {name: dict(tacrgb_weights=file) for name, file in WEIGHTS.items()}
 for vit in ("t3", "anytouch"):
@@ -43,6 +47,29 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
     page = (tmp_path / "claims.md").read_text()
     assert "| PegInsertion | rgb+tacff over rgb (wrist, diffusion_policy, 50 demonstrations) | +30 [" in page
     assert page.count("| not run |") == len(answers) - 1
+
+
+def published() -> dict[Condition, ConditionResults]:
+    return collect(results_in(ROOT / "leaderboard/cpu", ROOT / "docs/table_ii"))
+
+
+def test_what_the_readme_says_of_touch_is_what_the_published_results_say():
+    (bound,) = re.findall(r"TacRGB adds \d+ points .* \(p < ([\d.]+) after\s+correction", (ROOT / "README.md").read_text())
+    outcomes = claims.results_of_claims(of_the_protocol(published()))
+    said = "2. TacRGB is above vision in exploration"
+    p_values = [one.p_holm for asked, found in outcomes.items() if asked.claim == said for one in found if one.p_holm]
+    assert len(p_values) == 2
+    assert max(p_values) < float(bound)
+
+
+def test_about_one_in_five_pairs_of_published_runs_differs_by_its_seed_alone():
+    p_values = [
+        difference(*(replace(results, success=results.success[[seed]]) for seed in pair))[1]
+        for results in published().values()
+        for pair in combinations(range(len(results.success)), 2)
+    ]
+    assert len(p_values) > 50
+    assert np.mean(np.array(p_values) < 0.05) == pytest.approx(1 / 5, abs=1 / 20)
 
 
 def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
