@@ -41,9 +41,9 @@ from .policy import STEP_TIMEOUT, PolicyUnavailableError
 
 EPISODE = "X-Episode"
 """Header that names the episode."""
-UNAVAILABLE = (*range(300, 400), 401, 403, 407, 410, 502, 503, 504)
-"""HTTP statuses that are no fault of the policy: the server has moved, refuses the password or has forgotten the episode, or a
-proxy cannot reach it."""
+UNAVAILABLE = (*range(300, 400), 401, 403, 404, 405, 407, 410, 501, 502, 503, 504)
+"""HTTP statuses that are no fault of the policy: the server has moved, refuses the password, serves no policy here, or has
+forgotten the episode; or a proxy cannot reach it."""
 LONGEST_MESSAGE = 500
 """Number of characters of a server's error message that are shown; the rest, often a page of HTML, is cut off. Set once, not
 tuned."""

@@ -163,7 +163,7 @@ def test_b04_an_evaluation_goes_on_when_its_server_is_back(tmp_path):
     assert [episode["error"] for episode in episodes] == [None, None]
 
 
-@pytest.mark.parametrize("status", [302, 401, 410, 502, 503])
+@pytest.mark.parametrize("status", [302, 401, 404, 405, 410, 501, 502, 503])
 def test_b04_what_is_not_the_policys_fault_ends_the_evaluation(status):
     class Says(BaseHTTPRequestHandler):
         def do_POST(self):
