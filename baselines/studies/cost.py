@@ -10,7 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 
@@ -23,7 +22,7 @@ from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
-from manifeel_ms3.tasks.registry import all_tasks, task_spec
+from manifeel_ms3.tasks.registry import all_tasks, make_env, task_spec
 
 from .command_lines import OBS_MODE, device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
@@ -244,7 +243,7 @@ def simulation_step(env_id: str, obs_mode: str, camera: str, env_kwargs: str) ->
         env_kwargs: Further arguments of the task, as json.
     """
     sensing = dict(obs_mode=obs_mode, cameras=(camera,), tactile_sensors=("right",), sim_backend="physx_cpu")
-    env = gym.make(task_spec(env_id).env_id, **sensing | json.loads(env_kwargs))
+    env = make_env(env_id, **sensing | json.loads(env_kwargs))
     env.reset(seed=0)
     seconds = _seconds(lambda: env.step(env.action_space.sample()), SIMULATION_STEPS)
     env.close()

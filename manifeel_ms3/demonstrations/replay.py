@@ -14,7 +14,7 @@ from mani_skill.utils import common
 
 from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
-from manifeel_ms3.errors import ManifeelError
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
@@ -101,12 +101,10 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
     env_id, kwargs = header["env_info"]["env_id"], header["env_info"]["env_kwargs"]
     try:
         return make_env(env_id, **kwargs | dict(obs_mode="none", render_backend="none"))
-    except ManifeelError:
+    except UnknownNameError:
         raise
-    except Exception as error:  # for arguments from a file, ManiSkill raises errors of many types
-        raise DemonstrationError(
-            f"{path}: {env_id} cannot be made with {kwargs} ({type(error).__name__}: {error}); record it again"
-        ) from error
+    except InvalidArgumentError as error:
+        raise DemonstrationError(f"{path}: {error}, or record the file again") from error
 
 
 def _recorded(path: Path, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:

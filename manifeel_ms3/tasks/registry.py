@@ -21,7 +21,7 @@ import gymnasium as gym
 from mani_skill.utils.registration import register_env
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.errors import InvalidArgumentError, PluginError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, PluginError, UnknownNameError
 
 log = logging.getLogger(__name__)
 Class = TypeVar("Class", bound=type)
@@ -162,17 +162,27 @@ def description_of(env_class: type) -> str:
     return "\n\n".join(documented[: next(described, 0) + 1])
 
 
-def make_env(env_id: str, **kwargs: Any) -> gym.Env:
+def make_env(env_id: str, /, **kwargs: Any) -> gym.Env:
     """Make a task's environment, as `gym.make` does, also in a process that has not loaded the tasks of other packages.
 
     Args:
         env_id: Id of the task, with or without a module before a colon.
-        kwargs: Arguments of the environment.
+        kwargs: Arguments of the environment, which often come from a file.
 
     Raises:
         UnknownNameError: The task is not registered; the message lists those that are.
+        InvalidArgumentError: The environment cannot be made with the arguments.
+        MachineError: The machine lacks what the environment needs.
     """
-    return gym.make(task_spec(env_id).env_id, **kwargs)
+    spec = task_spec(env_id)
+    try:
+        return gym.make(spec.env_id, **kwargs)
+    except ManifeelError:
+        raise
+    except Exception as error:  # ManiSkill and SAPIEN raise errors of many types for arguments that they pass on
+        raise InvalidArgumentError(
+            f"{spec.env_id} cannot be made with the arguments {kwargs} ({type(error).__name__}: {error}); change one of them"
+        ) from error
 
 
 def all_tasks() -> dict[str, TaskSpec]:

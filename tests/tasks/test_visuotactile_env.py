@@ -14,7 +14,7 @@ from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
-from manifeel_ms3.tasks import visuotactile_env
+from manifeel_ms3.tasks import registry, visuotactile_env
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from tests.tasks_and_marks import needs_renderer
 
@@ -120,6 +120,25 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
 def test_bad_arguments_name_what_is_allowed(make_env, kwargs, word):
     with pytest.raises(ValueError, match=word):
         make_env(render_backend="none", **kwargs)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        dict(reward_mode="kind"),
+        dict(control_mode="telepathy"),
+        dict(max_episode_steps=0),
+        dict(sim_config=5),
+        dict(sim_config=dict(control_freq=0)),
+        dict(id="ManiFeel-Knitting-v1"),
+        dict(env_id="ManiFeel-Knitting-v1"),
+    ],
+    ids=str,
+)
+def test_arguments_that_only_maniskill_refuses_are_an_error_of_one_kind(kwargs):
+    """They come from files of strangers, too, whose commands must end without a traceback."""
+    with pytest.raises(InvalidArgumentError, match=next(iter(kwargs))):
+        registry.make_env("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none", **kwargs)
 
 
 def test_images_without_a_renderer_say_what_to_install(make_env, monkeypatch):
