@@ -184,6 +184,9 @@ def test_results_that_are_not_of_the_published_form_are_refused(result_file):
         (good | dict(success_once=dict(rate=1.5, low=0, high=1)), "success_once/rate"),
         ({name: value for name, value in good.items() if name != "episodes"}, "'episodes' is a required property"),
         (good | dict(episodes=[good["episodes"][0] | dict(episode_len="long")]), "episodes/0/episode_len"),
+        (good | dict(config=good["config"] | dict(step=None)), "config/step"),
+        (good | dict(config=good["config"] | dict(training_seconds="3 h")), "config/training_seconds"),
+        (good | dict(config=good["config"] | dict(trained_on=dict(gpu="H100"))), "config/trained_on"),
         ([1], "has the schema None"),
     ):
         result_file.write_text(json.dumps(broken))
