@@ -123,10 +123,13 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
         order: Seeds in the order in which their episodes enter the file; the order in which they finish if not given.
 
     Raises:
+        InvalidArgumentError: The file's name does not end in .h5.
         InUseError: Another process records into the file; the message names it.
         DemonstrationError: The file was recorded with other arguments or another revision of the task, or is damaged.
         MachineError: The folder cannot be written.
     """
+    if path.suffix != ".h5":  # peg.h5 and peg.hdf5 would share peg.json
+        raise InvalidArgumentError(f"{path} is not a path of a trajectory file; give one that ends in .h5")
     with owned(path):
         recording = Recording(path, header, order)
         try:

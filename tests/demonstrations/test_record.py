@@ -313,6 +313,16 @@ def test_evaluation_seeds_are_refused(tmp_path, seed, num):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("name", ["trajectory.hdf5", "trajectory"])
+def test_a_file_whose_json_would_be_that_of_another_file_is_refused(recorded, tmp_path, name):
+    for path in (recorded, recorded.with_suffix(".json")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with pytest.raises(InvalidArgumentError, match=r"give one that ends in \.h5"):
+        run(tmp_path / name, num=1, seed=7)
+    assert validate(tmp_path / recorded.name) == []
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_a_run_that_was_refused_does_not_stand_in_the_way_of_the_next(recorded, tmp_path):
     path = tmp_path / "trajectory.h5"
     with pytest.raises(ManifeelError, match=r"foo.* is unknown"):
