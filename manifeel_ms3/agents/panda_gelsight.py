@@ -20,6 +20,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Actor, Pose
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.rendering.shader_pack import camera_shader
@@ -127,6 +128,15 @@ class PandaGelSight(BaseAgent):
     @property
     def urdf_path(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         return panda_gelsight_urdf(self.scene.can_render(), self.finger)
+
+    def set_control_mode(self, control_mode: str | None = None) -> None:
+        """Choose the controller by its name; the default one if it is not given.
+
+        Raises:
+            InvalidArgumentError: The robot has no such controller; ManiSkill's own method fails by an assertion.
+        """
+        wanted = self._default_control_mode if control_mode is None else control_mode
+        super().set_control_mode(one_of("control_mode", wanted, self.supported_control_modes))
 
     def set_action(self, action: torch.Tensor) -> None:
         """Pass an action on to the controller.

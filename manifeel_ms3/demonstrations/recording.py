@@ -9,7 +9,7 @@ from uuid import uuid4
 
 import gymnasium as gym
 
-from manifeel_ms3.errors import InvalidArgumentError, ManifeelError
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
@@ -134,7 +134,7 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
         recording = Recording(path, header, order)
         try:
             yield recording
-        except ManifeelError:
+        except Exception:
             recording.withdraw()
             raise
 

@@ -1,14 +1,16 @@
 """Checks of the arguments that a task's environment is made and reset with."""
 
 import inspect
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.system.backend import render_backend_name_mapping, sim_backend_name_mapping
 from mani_skill.sensors.camera import CameraConfig
 
-from manifeel_ms3.arguments import by_name, is_number
+from manifeel_ms3.arguments import by_name, is_number, one_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 
 Limits = Mapping[str, tuple[float, str]]
@@ -60,13 +62,38 @@ def check_argument_names(task: type, given: Collection[str]) -> None:
         raise InvalidArgumentError(f"{task.__name__} has no arguments {unknown}; choose from {sorted(known)}")
 
 
-def check_num_envs(num_envs: Any) -> None:
-    """Check the number of environments that are simulated at once.
+def check_base_arguments(task: type[BaseEnv], render_backend: Any, given: Mapping[str, Any]) -> None:
+    """Check arguments of ManiSkill's `BaseEnv`, which fails on their values by other errors, late, or not at all.
+
+    Args:
+        task: Class of the task.
+        render_backend: Its argument `render_backend`.
+        given: The other arguments of `BaseEnv` that are given.
 
     Raises:
-        InvalidArgumentError: The number is not a whole number of at least 1.
-        MachineError: The number is more than 1, and this machine has no CUDA GPU.
+        InvalidArgumentError: A value is not allowed; the message lists those that are.
+        MachineError: A simulation on a GPU is asked for, and this machine has no CUDA GPU.
     """
+    _check_num_envs(given.get("num_envs", 1))
+    one_of("reward_mode", given.get("reward_mode"), (None, *task.SUPPORTED_REWARD_MODES))
+    one_of("render_mode", given.get("render_mode"), (None, *task.metadata["render_modes"]))
+    _check_backend("render_backend", render_backend, ("auto", "none", *render_backend_name_mapping), ("pci",))
+    sim_backend = given.get("sim_backend", "auto")
+    name = _check_backend("sim_backend", sim_backend, ("auto", *sim_backend_name_mapping))
+    if sim_backend_name_mapping.get(name) == "physx_cuda" and not torch.cuda.is_available():
+        raise MachineError(f"sim_backend={sim_backend!r} needs a CUDA GPU, and torch finds none; leave it out to use the CPU")
+
+
+def _check_backend(argument: str, given: Any, allowed: Sequence[str], with_device: Sequence[str] = ()) -> str:
+    """The name of a backend without the device that may follow it, as in "cuda:1"; others must have a device."""
+    name, *device = str(given).split(":")
+    if name not in (*allowed, *(with_device if device else ())):
+        raise InvalidArgumentError(f"{argument}={given!r} is unknown; choose from {list(allowed)}")
+    return name
+
+
+def _check_num_envs(num_envs: Any) -> None:
+    """Check the number of environments that are simulated at once."""
     if type(num_envs) is not int or num_envs < 1:
         raise InvalidArgumentError(f"num_envs={num_envs!r} must be a whole number of at least 1")
     if num_envs > 1 and not torch.cuda.is_available():

@@ -27,7 +27,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .checks import check_argument_names, check_num_envs, check_seed, checked_randomization, split_sensor_configs
+from .checks import check_argument_names, check_base_arguments, check_seed, checked_randomization, split_sensor_configs
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
@@ -169,7 +169,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             type(self).__name__, self.Randomization, randomization or {}, self._largest_ranges()
         )
         one_of("robot_uids", robot_uids, self.SUPPORTED_ROBOTS)
-        check_num_envs(kwargs.get("num_envs", 1))
+        check_base_arguments(type(self), render_backend, kwargs)
         restrict_torch_after_fork()
         backend = available_render_backend(render_backend)
         if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):

@@ -323,10 +323,11 @@ def test_a_file_whose_json_would_be_that_of_another_file_is_refused(recorded, tm
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_run_that_was_refused_does_not_stand_in_the_way_of_the_next(recorded, tmp_path):
+@pytest.mark.parametrize("kwargs", ['{"randomization": {"foo": 1}}', '{"control_mode": "foo"}', '{"max_episode_steps": "foo"}'])
+def test_a_run_that_was_refused_does_not_stand_in_the_way_of_the_next(recorded, tmp_path, kwargs):
     path = tmp_path / "trajectory.h5"
-    with pytest.raises(ManifeelError, match=r"foo.* is unknown"):
-        record.main(record.Args(PEG, 1, out=path, obs_mode="tacff", env_kwargs='{"randomization": {"foo": 1}}'))
+    with pytest.raises((ManifeelError, TypeError), match=r"foo.* is unknown|integer"):
+        record.main(record.Args(PEG, 1, out=path, obs_mode="tacff", env_kwargs=kwargs))
     assert [left.name for left in tmp_path.iterdir() if not left.name.endswith(".lock")] == []
     run(path, num=1)
     assert len(read_header(path)["episodes"]) == 1

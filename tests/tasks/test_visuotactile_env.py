@@ -11,7 +11,7 @@ import torch
 from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.arguments import checked_action
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks import registry, visuotactile_env
@@ -115,11 +115,24 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(randomization=dict(colour=1.0)), "socket_xy"),
         (dict(randomization=dict(socket_xy=-1.0)), "socket_xy"),
         (dict(randomization=dict(socket_xy=float("nan"))), "finite"),
+        (dict(control_mode="pd_ee_delta_pos"), r"control_mode='pd_ee_delta_pos' is unknown.*'pd_ee_delta_pose'"),
+        (dict(reward_mode="dens"), r"reward_mode='dens' is unknown.*'normalized_dense'"),
+        (dict(render_mode="rgb"), r"render_mode='rgb' is unknown.*'rgb_array'"),
+        (dict(render_backend="vulkan"), r"render_backend='vulkan' is unknown.*'cpu'"),
+        (dict(sim_backend="mujoco"), r"sim_backend='mujoco' is unknown.*'physx_cpu'"),
+        (dict(sim_backend=None), "sim_backend=None is unknown"),
     ],
 )
 def test_bad_arguments_name_what_is_allowed(make_env, kwargs, word):
     with pytest.raises(ValueError, match=word):
-        make_env(render_backend="none", **kwargs)
+        make_env(**dict(render_backend="none") | kwargs)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+@pytest.mark.parametrize("backend", ["gpu", "physx_cuda", "cuda:1"])
+def test_a_simulation_on_a_gpu_that_is_missing_says_so(make_env, backend):
+    with pytest.raises(MachineError, match=f"sim_backend='{backend}' needs a CUDA GPU"):
+        make_env(sim_backend=backend, render_backend="none")
 
 
 @pytest.mark.parametrize(
