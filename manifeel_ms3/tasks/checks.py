@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.system.backend import render_backend_name_mapping, sim_backend_name_mapping
+from mani_skill.render import PREBUILT_SHADER_CONFIGS
 from mani_skill.sensors.camera import CameraConfig
 
 from manifeel_ms3.arguments import by_name, is_number, one_of
@@ -143,6 +144,7 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
                 raise InvalidArgumentError(
                     f"sensor_configs[{name!r}]: {unknown} are not fields of a camera; choose from {fields}"
                 )
+            _check_shader_pack(f"sensor_configs[{name!r}]", value)
         elif name in fields:
             of_cameras[name] = value
         else:
@@ -150,7 +152,13 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
                 f"sensor_configs[{name!r}] is neither a sensor of this environment {[*cameras, *pads]} nor a field of every "
                 f"camera {fields}"
             )
+    _check_shader_pack("sensor_configs", of_cameras)
     return of_cameras, of_pads
+
+
+def _check_shader_pack(argument: str, fields: Mapping[str, Any]) -> None:
+    if "shader_pack" in fields:
+        one_of(f"{argument}['shader_pack']", fields["shader_pack"], PREBUILT_SHADER_CONFIGS)
 
 
 def _dotted(options: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -117,6 +117,23 @@ class SceneryEnv(SensingEnv):
     def _setup_sensors(self, options: dict):
         set_picture_formats()
         super()._setup_sensors(options)
+        self._require_textures()
+
+    def _require_textures(self) -> None:
+        """Check that the cameras' shaders draw every texture of the observation mode; ManiSkill leaves out the others.
+
+        Raises:
+            InvalidArgumentError: They do not.
+        """
+        wanted = {name for name, is_wanted in vars(self.obs_mode_struct.visual).items() if is_wanted}
+        for name in self._camera_names:
+            pictures = self._sensors[name].config.shader_config.texture_names
+            drawn = {texture for textures in pictures.values() for texture in textures}
+            if missing := sorted(wanted - drawn):
+                raise InvalidArgumentError(
+                    f"obs_mode={self.obs_mode!r}: the shaders of the camera {name!r} draw no {', no '.join(missing)}, only "
+                    f"{sorted(drawn)}; sensor_configs=dict(shader_pack='default') draws all textures, more slowly"
+                )
 
     def _make_random_looks(self) -> None:
         """Remember how the scene looks: random looks are drawn around that."""

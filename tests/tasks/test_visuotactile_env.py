@@ -109,6 +109,8 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(sensor_configs=dict(tactile_left=dict(units="tacsl"))), r"neither a sensor.*'wrist', 'tactile_right'"),
         (dict(sensor_configs=dict(tactile_right=dict(optics=dict(nose=1.0)))), "optics.nose"),
         (dict(sensor_configs=dict(wrist=dict(widht=64))), "'widht'. are not fields of a camera; choose from"),
+        (dict(sensor_configs=dict(wrist=dict(shader_pack="fast"))), r"'wrist'.*shader_pack.*'fast' is unknown.*'default'"),
+        (dict(sensor_configs=dict(shader_pack="fast")), r"sensor_configs\['shader_pack'\]='fast' is unknown.*'default'"),
         (dict(occlusion=True), "nothing that could occlude"),
         (dict(fit="snug"), "tight"),
         (dict(randomisation={}), r"no arguments \['randomisation'\]; choose from .*'fit'.*'randomization'.*'reward_mode'"),
@@ -152,6 +154,16 @@ def test_arguments_that_only_maniskill_refuses_are_an_error_of_one_kind(kwargs):
     """They come from files of strangers, too, whose commands must end without a traceback."""
     with pytest.raises(InvalidArgumentError, match=next(iter(kwargs))):
         registry.make_env("ManiFeel-PegInsertion-v1", obs_mode="none", render_backend="none", **kwargs)
+
+
+@needs_renderer
+@pytest.mark.parametrize("mode", ["normal+tacff", "rgb+albedo"])
+def test_textures_that_the_shaders_do_not_draw_are_refused(make_env, mode):
+    with pytest.raises(InvalidArgumentError, match=r"draw no (normal|albedo), only .*'rgb'.*shader_pack='default'"):
+        make_env(obs_mode=mode)
+    small = dict(shader_pack="default", width=16, height=16)
+    observation, _ = make_env(obs_mode=mode, sensor_configs=small).reset(seed=0)
+    assert set(mode.split("+")) <= {*observation["sensor_data"]["wrist"], "tacff"}
 
 
 def test_images_without_a_renderer_say_what_to_install(make_env, monkeypatch):
