@@ -26,7 +26,7 @@ SIGNIFICANT = 0.05
 FEWEST_SEEDS = 3
 """Number of training seeds of a condition from which a difference says something about training, as many as in the paper's
 protocol. Two runs that differ in their seed alone differ as much as two conditions often do: of the pairs of such runs in
-leaderboard/cpu, about one in five has a p-value below 0.05 on the same 50 initial states."""
+leaderboard/cpu, more than one in ten have a p-value below 0.05 on the same 50 initial states."""
 SMALLEST_SHOWN = 0.001
 """Smallest p-value that tables show as a number."""
 NO_SPREAD = 1e-12

