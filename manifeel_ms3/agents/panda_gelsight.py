@@ -302,7 +302,7 @@ class PandaGelSight(BaseAgent):
         return Kinematics(self.urdf_path, self.ee_link_name, self.robot, arm.active_joint_indices)
 
     def pad_wrench(self, side: str) -> torch.Tensor:
-        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; TacFF adds up to it."""
+        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; what TacFF adds up to."""
         return self._gauges[side].read()
 
     def held_object_force(self, joint_forces: torch.Tensor) -> torch.Tensor:

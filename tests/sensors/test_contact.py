@@ -174,6 +174,18 @@ def test_taxels_keep_the_moment_about_the_normal_even_beyond_their_centres(x, y)
     assert (torch.linalg.norm(forces[..., 1:], dim=-1) <= GEL.friction * forces[..., 0] + 1e-9).all()
 
 
+def test_a_twist_that_slips_costs_little_of_the_shear():
+    """A plate under a twist near what friction holds: taxels at the cone's edge are cut, and the sums lose some shear."""
+    face = torch.where((GRID.x.abs() < 10e-3) & (GRID.y.abs() < 15e-3), 0.0, -5e-3)[None].float()
+    load = wrench(20.0, fx=2.7, fy=-0.6, mz=-0.15)
+    field = pressure(face, load)
+    (q,) = shear_of_loads(field, [load])
+    assert q.sum(1)[0].tolist() == pytest.approx([2.7, -0.6], abs=1e-6)
+    off = (TAXELS.forces(field, q, MU).sum((0, 1, 2)) - torch.tensor([20.0, 2.7, -0.6])) / 20.0
+    assert off[0].item() == pytest.approx(0.0, abs=1e-9)
+    assert 0.001 < torch.linalg.norm(off[1:]).item() < 0.03
+
+
 def test_tacsl_field_is_penetration_and_bounded_speed():
     """f_n = d, f_t = -min(0.1 |v|, 2 d) v / |v| (Akinola et al. 2024, with the gains of the paper's public code)."""
     depth = torch.tensor([[1e-3, 1e-4, 0.0]])

@@ -18,8 +18,8 @@ class Taxels:
     """A grid of taxels centred on the pad; the taxels at its border also take the rest of the gel.
 
     A cell's force is shared linearly between the taxel centres around it. This keeps sums and first moments, except those of
-    forces outside the outermost centres: a swirl of shear restores the cells' moment about the normal, as far as Coulomb's
-    cone allows.
+    forces outside the outermost centres: a swirl of shear restores the cells' moment about the normal. Each taxel's shear is
+    then cut at Coulomb's cone, which costs a little of the sum where much of the contact slips.
 
     Args:
         grid: Cells of the gel.
