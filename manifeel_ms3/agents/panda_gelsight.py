@@ -49,6 +49,8 @@ GRIPPER_FORCE_LIMIT = 40.0
 """Largest force of a finger, in N, that a policy can command. Set once; not tuned."""
 GRASP_FORCE = 0.5
 """Smallest force of each pad on a body, in N, with which the hand grasps it (ManiSkill's Panda)."""
+STILL = 0.2
+"""Largest speed of a joint of an arm that is still, in rad/s (ManiSkill's Panda)."""
 FINGER_RANGE = (-0.01, 0.04)
 """Range of a finger's commanded distance from the middle, in m. A command beyond the surface of a held object is a force:
 1 kN/m times the distance."""
@@ -279,6 +281,11 @@ class PandaGelSight(BaseAgent):
         return dict(qpos=self.robot.get_qpos(), qvel=self.robot.get_qvel())  # no controller internals
 
     @property
+    def tcp_pose(self) -> Pose:
+        """Pose of the tool centre point in the world, for ManiSkill's tasks."""
+        return self.tcp.pose
+
+    @property
     def tcp_pose_at_base(self) -> Pose:
         """Pose of the tool centre point in the robot's base frame."""
         return self.robot.pose.inv() * self.tcp.pose
@@ -319,6 +326,10 @@ class PandaGelSight(BaseAgent):
         """Whether both pads press on a body, each with at least `min_force`, in N; (N,) bool."""
         forces = [self.scene.get_pairwise_contact_forces(gel, body) for gel in self.gels.values()]
         return torch.stack([torch.linalg.norm(force, dim=1) >= min_force for force in forces]).all(dim=0)
+
+    def is_static(self, threshold: float = STILL) -> torch.Tensor:
+        """Whether no joint of the arm is faster than `threshold`, in rad/s, for ManiSkill's tasks; (N,) bool."""
+        return self.robot.get_qvel()[:, : len(self.arm_joint_names)].abs().amax(dim=1) <= threshold
 
     def torque_on_held(self, point: torch.Tensor) -> torch.Tensor:
         """Torque (N,), in N m, of both pads on the held object about the vertical through `point` (N, 3).

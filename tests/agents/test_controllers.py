@@ -1,10 +1,13 @@
 """Controllers: what an action means, in the air and in contact."""
 
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401 (registers its tasks)
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.errors import InvalidArgumentError
 
 ACTION_DIMS = {
@@ -139,6 +142,21 @@ def test_the_robot_refuses_nan_also_in_tasks_that_do_not(env):
     env.reset(seed=0)
     with pytest.raises(InvalidArgumentError, match=r"^the action holds NaN: \[\[nan, 0.5\]\]; give finite numbers$"):
         env.unwrapped.agent.set_action(torch.tensor([[np.nan, 0.5]]))
+
+
+def test_maniskills_own_tasks_can_have_the_robot():
+    """PickCube asks whether the robot holds the cube and whether it stands still."""
+    env = gym.make("PickCube-v1", robot_uids="panda_gelsight", obs_mode="state", render_backend="none")
+    agent: PandaGelSight = env.get_wrapper_attr("agent")
+    env.reset(seed=0)
+    still, ahead = np.zeros(7, np.float32), np.eye(7, dtype=np.float32)[0]
+    found = []
+    for action in (still, ahead, still):
+        for _ in range(12):
+            *_, info = env.step(action)
+        found.append((agent.is_static().item(), info["is_robot_static"].item(), info["is_grasped"].item()))
+    env.close()
+    assert found == [(True, True, False), (False, False, False), (True, True, False)]
 
 
 def test_wrong_shape_is_refused(env):
