@@ -64,6 +64,13 @@ def test_every_entry_of_info_and_of_the_state_is_explained(spec):
     assert [name for name in obs["extra"] if not name.endswith("_pose")] == []
 
 
+def test_what_the_bowls_add_to_info_is_explained():
+    page = (REPOSITORY / "docs" / "observations.md").read_text()
+    with closing(gym.make("ManiFeel-BallSorting-v1", obs_mode="state", render_backend="none", goal="bowls")) as env:
+        _, info = env.reset(seed=0)
+    assert [name for name in info if f"`{name}`" not in page] == ["reconfigure"]
+
+
 @pytest.mark.parametrize("line", SHOWN)
 def test_a_shown_command_and_its_flags_exist(line, capsys):
     words = shlex.split(line, comments=True)
