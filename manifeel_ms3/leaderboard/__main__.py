@@ -24,7 +24,7 @@ from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.files import write_json
 
 from .adding import take
-from .checks import check
+from .checks import check, check_is_new
 from .page import rows_on, write_page
 from .rerun import about_with_checkpoints, checkpoint_sources, name_checkpoints, policy_sources, run_again
 from .submission import ABOUT, Submission, read_submission
@@ -101,6 +101,7 @@ def main(args: Hash | Submit | Build) -> Path:
         log.info("%s names the checkpoints of %d results", args.folder / ABOUT, len(named))
         return args.folder / ABOUT
     check(submission)
+    check_is_new(submission, args.board)
     rerun = None
     if args.rerun != 0:
         rerun = run_again(submission, _sources(submission, args), args.rerun, args.seed, args.workers)

@@ -1,6 +1,8 @@
 """Checks of a submission that need no simulator: its episodes, its numbers, and copies among its results."""
 
+import logging
 from collections import Counter
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -9,14 +11,16 @@ import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.protocol import FEWEST_EPISODES
+from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
 
 from .rerun import INVENTED
-from .submission import Submission, SubmissionError
+from .submission import Submission, SubmissionError, read_submission
 from .untrusted import quoted
 
+log = logging.getLogger(__name__)
 EPISODES = FEWEST_EPISODES
 """Number of evaluation episodes of a result: that of the paper's protocol."""
 SIMULATOR = ("mani-skill", "sapien")
@@ -53,12 +57,38 @@ def check(submission: Submission, to_take: bool = True) -> None:
         raise SubmissionError(submission.folder, faults)
 
 
-def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
-    """Results that stand for the same checkpoint twice, or have the outcomes of another result of their task.
+def submissions_on(board: Path) -> Iterator[Submission]:
+    """The submissions in a leaderboard's folder; a broken one is named in the log, and left out."""
+    for folder in sorted(path for path in board.glob("*") if path.is_dir() and not path.name.startswith(".")):
+        try:
+            submission = read_submission(folder)
+            check(submission, to_take=False)
+        except InvalidFileError as error:
+            log.warning("left out: %s", " ".join(str(error).split()))
+        else:
+            yield submission
 
-    Two results are copies where more than a share of 1 - `INVENTED` of their episodes are the same. A copy with more changes
-    has so many invented episodes that running some of them again finds one.
+
+def check_is_new(submission: Submission, board: Path) -> None:
+    """Check that no result is a copy of one that is on the leaderboard already.
+
+    An earlier submission in a folder of the same name is no obstacle here, because it prevents the taking of this one.
+
+    Args:
+        submission: A submission that `check` has found without faults.
+        board: Folder of the leaderboard.
+
+    Raises:
+        SubmissionError: Some results are copies; the message says of which.
     """
+    others = (other for other in submissions_on(board) if other.folder.name != submission.folder.resolve().name)
+    known = {other.folder / path: result for other in others for path, result in other.results.items()}
+    if faults := _faults_of_copying(submission.results, known):
+        raise SubmissionError(submission.folder, [*faults, "delete the earlier submission if this one is to replace it"])
+
+
+def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
+    """Results that stand for the same checkpoint twice, or have the outcomes of another result of their task."""
     places = Counter(
         (condition_of(result), result["training_seed"], result["config"].get("step", 0)) for result in results.values()
     )
@@ -67,12 +97,22 @@ def _faults_of_repetition(results: dict[Path, dict[str, Any]]) -> list[str]:
         for (one, seed, step), count in places.items()
         if count > 1
     ]
+    return faults + _faults_of_copying(results, {})
+
+
+def _faults_of_copying(results: dict[Path, dict[str, Any]], known: dict[Path, dict[str, Any]]) -> list[str]:
+    """Results that have the outcomes of a known result of their task, or of one of the results before them.
+
+    Two results are copies where more than a share of 1 - `INVENTED` of their episodes are the same. A copy with more changes
+    has so many invented episodes that running some of them again finds one.
+    """
+    faults, everything = [], known | results
     for env_id in sorted({result["env_id"] for result in results.values()}):
-        paths = [path for path, result in results.items() if result["env_id"] == env_id]
-        outcomes = np.array([_outcomes(results[path]) for path in paths])
+        paths = [path for path, result in everything.items() if result["env_id"] == env_id]
+        outcomes = np.array([_outcomes(everything[path]) for path in paths])
         for k, path in enumerate(paths):
             same = (np.abs(outcomes[:k] - outcomes[k]) <= SAME_OUTCOME).all(-1).mean(-1)
-            if (same > 1 - INVENTED).any():
+            if path in results and (same > 1 - INVENTED).any():
                 original = paths[int(same.argmax())]
                 faults.append(
                     f"{quoted(path)} has the outcomes of {quoted(original)} in {same.max():.0%} of its episodes; different "

@@ -5,7 +5,6 @@ The page has plotly's figures, which a reader can zoom and hover over in a brows
 
 import base64
 import json
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,15 +17,14 @@ from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.analysis.protocol import LAST, ConditionResults, collect
 from manifeel_ms3.command_line import missing_extras_named
-from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.floors import Floor, highest_floor
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import task_spec
 
-from .checks import EPISODES, check
+from .checks import EPISODES, submissions_on
 from .rerun import episodes_to_run_again, rerun_of
-from .submission import Submission, read_submission
+from .submission import Submission
 from .text import markdown_text, one_line
 
 with missing_extras_named():
@@ -34,7 +32,6 @@ with missing_extras_named():
     import plotly.offline
     from markupsafe import Markup
 
-log = logging.getLogger(__name__)
 PAGE, TABLE = "index.html", "README.md"
 """Files of the leaderboard's page and of its table."""
 TEMPLATE = Path(__file__).with_name("page.html.j2")
@@ -107,15 +104,7 @@ def _paths(submission: Submission, condition: Condition) -> list[Path]:
 
 def rows_on(board: Path) -> list[Row]:
     """The rows of all submissions in a leaderboard's folder; a broken submission is named in the log, and left out."""
-    rows = []
-    for folder in sorted(path for path in board.glob("*") if path.is_dir() and not path.name.startswith(".")):
-        try:
-            submission = read_submission(folder)
-            check(submission, to_take=False)
-            rows += rows_of(submission)
-        except InvalidFileError as error:
-            log.warning("left out: %s", " ".join(str(error).split()))
-    return ranked(rows)
+    return ranked([row for submission in submissions_on(board) for row in rows_of(submission)])
 
 
 def ranked(rows: list[Row]) -> list[Row]:

@@ -151,6 +151,19 @@ def test_a16_results_are_of_the_checkpoints_that_the_submission_names(folder, tm
     assert not (tmp_path / "board").exists()
 
 
+def test_a16_results_of_another_submission_are_refused(folder, tmp_path):
+    board = tmp_path / "board"
+    main(Submit(folder, rerun=0, board=board))
+    mine = tmp_path / "mine"
+    (mine / "x").mkdir(parents=True)
+    shutil.copy(folder / FIRST, mine / "x")
+    (mine / "submission.json").write_text(json.dumps(dict(name="Mine", authors="Me")))
+    with pytest.raises(SubmissionError, match=rf"x/00000100.json has the outcomes of {board}/theirs/{FIRST} in 100%"):
+        main(Submit(mine, rerun=0, board=board, check_only=True))
+    shutil.rmtree(board / "theirs")
+    main(Submit(mine, rerun=0, board=board))
+
+
 @pytest.mark.parametrize(
     ("forged", "shown"),
     [
