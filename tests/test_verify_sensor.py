@@ -1,6 +1,7 @@
 """`manifeel verify-sensor`: the page, the bounds and the exit code."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from manifeel_ms3.sensors import GelConfig
 from manifeel_ms3.sensors.registry import task_sensor
 from manifeel_ms3.verification.__main__ import Args, main
 from manifeel_ms3.verification.checks import Check, checks_of, loop_area
-from manifeel_ms3.verification.loads import KNOWN_LIMITS, SHAPES, ball_depth, measure
+from manifeel_ms3.verification.loads import KNOWN_LIMITS, SHAPES, Measurements, Reading, ball_depth, measure
 
 pytest.importorskip("jinja2")
 
@@ -91,6 +92,16 @@ def test_value_that_is_no_number_breaks_a_bound():
     assert not Check("", float("nan"), 1.0, "", at_least=True).holds
     assert Check("", 0.95, 0.9, "", at_least=True).holds
     assert Check("", 1e9, None, "mm").holds  # a known limit is not judged
+
+
+def test_a_reading_that_is_no_number_breaks_its_bound_wherever_it_is():
+    load = np.array([1.0, 0.0, 0.0, 0.0])
+    readings = [Reading("ball, 10 mm", load, load, load, 0.0, 1.0) for _ in range(3)]
+    readings[1] = replace(readings[1], reported=load * np.nan, centre_error=np.nan)
+    loop = np.array([(0, 0), (5, 5), (10, 10), (5, 5), (0, 0)], float)
+    found = Measurements(readings, [], loop, np.array([(1.0, 1e-4, 1e-4)]))
+    checks = checks_of(found, task_sensor("digit", "a", "b", {}, {}))
+    assert [check.holds for check in checks] == [False] * 5 + [True] * 2
 
 
 def test_area_of_a_loop():

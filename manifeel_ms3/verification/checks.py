@@ -60,22 +60,23 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
     """
     if not found.readings:
         raise InvalidArgumentError(f"nothing was measured: {'; '.join(found.left_out)}; choose other --loads")
-    normal = [abs(r.reported[0] / r.applied[0] - 1) for r in found.readings]
-    shear = [np.abs(r.reported[1:3] - r.applied[1:3]).max() / r.applied[0] for r in found.readings]
-    pad = [np.abs(r.reported[:3] - r.on_pad[:3]).max() / r.applied[0] for r in found.readings]
-    moment = [abs(r.reported[3] - r.applied[3]) / r.applied[0] for r in found.readings]
+    normal = _worst([abs(r.reported[0] / r.applied[0] - 1) for r in found.readings])
+    shear = _worst([np.abs(r.reported[1:3] - r.applied[1:3]).max() / r.applied[0] for r in found.readings])
+    pad = _worst([np.abs(r.reported[:3] - r.on_pad[:3]).max() / r.applied[0] for r in found.readings])
+    moment = _worst([abs(r.reported[3] - r.applied[3]) / r.applied[0] for r in found.readings])
     balls = [r.centre_error for r in found.readings if r.is_ball]
     others = [r.centre_error for r in found.readings if not r.is_ball]
     depth = np.abs(found.depths[:, 1] - found.depths[:, 2])
     checks = [
-        Check("normal force: sum of the field against the load applied", 100 * max(normal), 100 * FORCE_BOUND, "%"),
+        Check("normal force: sum of the field against the load applied", 100 * normal, 100 * FORCE_BOUND, "%"),
+        Check("shear: sums of the field against the load applied, of the normal load", 100 * shear, 100 * FORCE_BOUND, "%"),
         Check(
-            "shear: sums of the field against the load applied, of the normal load", 100 * max(shear), 100 * FORCE_BOUND, "%"
+            "force: sums of the field against the force on the pad, of the normal load",
+            100 * pad,
+            100 * FORCE_BOUND,
+            "%",
         ),
-        Check(
-            "force: sums of the field against the force on the pad, of the normal load", 100 * max(pad), 100 * FORCE_BOUND, "%"
-        ),
-        Check("moment about the normal against the moment applied, over the load", 1e3 * max(moment), 1e3 * CENTRE_BOUND, "mm"),
+        Check("moment about the normal against the moment applied, over the load", 1e3 * moment, 1e3 * CENTRE_BOUND, "mm"),
         *_centre("centre of pressure of balls against the ball's middle", balls),
         *_centre("centre of pressure of box, plate and rod against the force on the pad", others),
         Check("loading and unloading: area of the loop", 100 * loop_area(found.loop), 100 * LOOP_BOUND, "%"),
@@ -97,9 +98,14 @@ def _known_limits(readings: list[Reading]) -> list[Check]:
     ]
 
 
+def _worst(errors: list[float]) -> float:
+    """The largest of some errors; NaN if one of them is NaN, which Python's `max` may pass over."""
+    return float(np.max(errors))
+
+
 def _centre(claim: str, errors: list[float]) -> list[Check]:
     """The check of errors of the centre of pressure, m, if there are any."""
-    return [Check(claim, 1e3 * max(errors), 1e3 * CENTRE_BOUND, "mm")] if errors else []
+    return [Check(claim, 1e3 * _worst(errors), 1e3 * CENTRE_BOUND, "mm")] if errors else []
 
 
 def loop_area(loop: np.ndarray) -> float:

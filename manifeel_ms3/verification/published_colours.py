@@ -149,4 +149,4 @@ def worst_similarity(config: TactileSensorConfig) -> float:
     cpu = torch.device("cpu")
     optics = Optics(config, ContactGrid.covering(config.gel.size, CONTACT_CELL, cpu), 1, cpu)
     table = published_table()
-    return min(ssim(*change_images(optics, height, table)) for height in pressed_shapes(config).values())
+    return float(np.min([ssim(*change_images(optics, height, table)) for height in pressed_shapes(config).values()]))
