@@ -42,6 +42,8 @@ OF_THE_STUDY = {
 """Flags of `manifeel train` that a study sets itself, and what it takes them from."""
 MOST_VALUES = 10_000
 """Largest number of values in a study's file with its aliases expanded; set once, not tuned."""
+LEAST = {"demos": 1, "num_demos": 1, "episodes": 1, "checkpoints": 1, "cpus": 0.1, "gpus": 0}
+"""Smallest numbers that entries of a grid and of `resources` can have."""
 TABLE = "table "
 """Prefix of `tasks` if it names a table of the paper instead of listing tasks: "table I"."""
 
@@ -168,10 +170,9 @@ def read_study(path: Path, _including: tuple[Path, ...] = ()) -> Study:
         raise StudyError(f"{path} has no grids; see configs/ for examples")
     given = content.get("resources", {})
     _require_known(given, set(KINDS), f"{path}: resources")
-    given: dict[str, Any] = dict(pretrain=given.get("train", {})) | given
-    resources: dict[Kind, Resources] = {
-        kind: _section(Resources, given.get(kind, {}), f"{path}: resources/{kind}") for kind in KINDS
-    }
+    asked = {kind: _section(Resources, entry, f"{path}: resources/{kind}") for kind, entry in given.items()}
+    asked.setdefault("pretrain", asked.get("train", Resources()))
+    resources: dict[Kind, Resources] = {kind: asked.get(kind, Resources()) for kind in KINDS}
     return Study(path.stem, tuple(grids), resources)
 
 
@@ -276,6 +277,11 @@ def _section(kind: type, entry: Any, place: str) -> Any:
     for name, value in entry.items():
         if not _is_of(value, types[name]):
             raise StudyError(f"{place}: `{name}` has the wrong type: {_shown(value)}; see configs/ for examples")
+        numbers = value if isinstance(value, list) else [value]
+        if not numbers:
+            raise StudyError(f"{place}: `{name}` is empty, so that there would be no job; leave it out, or list a choice")
+        if name in LEAST and (wrong := [number for number in numbers if number is not None and not number >= LEAST[name]]):
+            raise StudyError(f"{place}: `{name}` is {_shown(wrong[0])}; at least {LEAST[name]} is needed")
     try:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
     except TypeError as error:
