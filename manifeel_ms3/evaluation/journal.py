@@ -1,8 +1,8 @@
 """The finished episodes of an evaluation that has not ended yet, so that an interruption loses at most the running ones.
 
-The file `<name of the result>.episodes.jsonl` lies beside the result. Its first line says what is evaluated, every other line
-is the outcome of an episode and reaches the disk as soon as the episode ends. The file is deleted once the result, which holds
-all of it, is written.
+The file `<name of the result without .json>.episodes.jsonl` lies beside the result. Its first line says what is evaluated,
+every other line is the outcome of an episode and reaches the disk as soon as the episode ends. The file is deleted once the
+result, which holds all of it, is written.
 """
 
 import json
@@ -52,7 +52,8 @@ class Journal:
         overwrite: bool = False,
         overwrite_other: bool = False,
     ):
-        self.path = result.with_name(f"{result.stem}.episodes.jsonl")
+        name = result.name.removesuffix(".json")  # not the stem, which policy_0.3 and policy_0.5 would share
+        self.path = result.with_name(f"{name}.episodes.jsonl")
         self.seeds = seeds
         self._first_line = json.dumps(evaluation | dict(seeds=seeds), default=str, allow_nan=False)
         self.outcomes: dict[int, EpisodeOutcome] = {}

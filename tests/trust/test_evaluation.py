@@ -130,6 +130,12 @@ def evaluate_without_simulator(out: Path, seeds: list[int], report: int) -> None
         write_result(result_of(PEG, {}, dict(policy_name="a:B", obs_mode="rgb"), journal.in_order), out)
 
 
+def test_results_whose_names_have_a_dot_have_journals_of_their_own(tmp_path):
+    for gain in (0.3, 0.5):  # both at the same time
+        Journal(tmp_path / f"policy_{gain}", dict(gain=gain), [1]).add(outcome(1))
+    assert list(Journal(tmp_path / "policy_0.3", dict(gain=0.3), [1]).outcomes) == [1]
+
+
 @pytest.mark.parametrize("kills", [10, pytest.param(100, marks=pytest.mark.slow)])
 def test_kills_at_random_moments_lose_no_episode(kills, tmp_path, figure):
     seeds, chance, interrupted = evaluation_seeds(50), random.Random(0), 0
