@@ -150,6 +150,9 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
             f"it is of obs_mode {result['obs_mode']!r}, but its env_kwargs have obs_mode {observed!r}, with which its episodes "
             "are run; evaluate again with the --obs-mode of the policy"
         )
+    limit, most = result["env_kwargs"].get("max_episode_steps"), task_spec(env_id).max_episode_steps
+    if isinstance(limit, int) and limit > most:  # running episodes again could take for ever
+        faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
     if result["revision"] != here:
         faults.append(
             f"it is of revision {result['revision']} of {env_id}, but the task has revision {here} here; evaluate again with "

@@ -87,6 +87,10 @@ def change(folder: Path, edit) -> None:
         (lambda r: r.update(stop_at_success=True), "evaluate without --stop-at-success"),
         (lambda r: r.update(episode_len=5.0), "episode_len says 5.0"),
         (lambda r: r.update(env_id="ManiFeel-Knitting-v1"), "is no task of this leaderboard"),
+        (
+            lambda r: r["env_kwargs"].update(max_episode_steps=10**9),
+            "a time limit of 1000000000 steps, the task ends after 240",
+        ),
         (lambda r: r.update(obs_mode="rgb"), "of obs_mode 'rgb', but its env_kwargs have obs_mode 'tacff'"),
         (lambda r: r["env_kwargs"].update(obs_mode="state"), "of obs_mode 'tacff', but its env_kwargs have obs_mode 'state'"),
         (lambda r: r["env_kwargs"].pop("obs_mode"), "its env_kwargs have obs_mode None"),
