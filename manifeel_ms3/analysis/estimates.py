@@ -81,7 +81,8 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
     """
     if first.episode_seeds != second.episode_seeds:
         raise ResultError(
-            "the two conditions were evaluated on different initial states; evaluate both with the same --num-eval-episodes"
+            f"{first.name} and {second.name} were evaluated on different initial states, {len(first.episode_seeds)} and "
+            f"{len(second.episode_seeds)} of them; evaluate both with the same --num-eval-episodes"
         )
     checkpoints = min(first.success.shape[1], second.success.shape[1])
     rng = np.random.default_rng(0)

@@ -37,6 +37,8 @@ class ConditionResults:
     """The episodes of `success` as their result files have them, in the same order."""
     force_limit: float | None = None
     """The task's limit of the contact force for gentle success when it was evaluated, in N; None without one."""
+    name: str = "a condition"
+    """What messages call the condition."""
 
     @property
     def size(self) -> str:
@@ -93,7 +95,9 @@ def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Conditi
         if (limit := result.get("force_limit")) is not None:
             limits[condition] = limit
     return {
-        condition: replace(_stacked(condition, by_seed, last, planned.get(condition)), force_limit=limits.get(condition))
+        condition: replace(
+            _stacked(condition, by_seed, last, planned.get(condition)), force_limit=limits.get(condition), name=str(condition)
+        )
         for condition, by_seed in found.items()
     }
 

@@ -343,3 +343,11 @@ def test_the_papers_own_numbers_agree_with_its_claims_but_where_it_contradicts_i
 def test_folders_without_results_are_named(tmp_path):
     with pytest.raises(ResultError, match="--num-eval-episodes 50"):
         claims.main(claims.Args((tmp_path,)))
+
+
+def test_conditions_with_other_initial_states_are_named(tmp_path):
+    write_run(tmp_path, VISION, 0.2)
+    write_run(tmp_path, TACFF, 0.5, episodes=60)
+    named = r"PegInsertion, rgb\+tacff wrist, .* and PegInsertion, rgb wrist, .* on different initial states, 60 and 50 of them"
+    with pytest.raises(ResultError, match=named):
+        claims.main(claims.Args((tmp_path,)))
