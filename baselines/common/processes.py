@@ -7,6 +7,8 @@ import torch
 import torch.distributed as dist
 import torch.nn as nn
 
+from manifeel_ms3.evaluation.policy import checked_device
+
 
 class Processes:
     """This process among those of a training run; the only one if `torchrun` did not start it.
@@ -14,14 +16,17 @@ class Processes:
     Args:
         device: "cpu", "cuda", or one GPU by its number, such as "cuda:1". With `torchrun`, "cuda" gives each process a GPU of
             its own; a GPU that has a number would be shared by all of them.
+
+    Raises:
+        InvalidArgumentError: The name is not that of a device.
+        MachineError: This machine does not have the device.
     """
 
     def __init__(self, device: str):
         self.rank, self.count = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
-        self.device = torch.device(device)
-        gpu = None
-        if "LOCAL_RANK" in os.environ and device == "cuda":
-            self.device = gpu = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        own = "LOCAL_RANK" in os.environ and device == "cuda"
+        self.device = torch.device(checked_device(f"cuda:{os.environ['LOCAL_RANK']}" if own else device))
+        gpu = self.device if own else None
         if self.device.type == "cuda" and self.device.index is not None:
             torch.cuda.set_device(self.device)  # or what names no GPU, such as the noise, would be on the first one
         if self.count > 1:

@@ -9,8 +9,10 @@ from typing import Annotated, Literal
 import torch
 from tyro.conf import arg
 
-from manifeel_ms3.arguments import require_positive
+from manifeel_ms3.arguments import is_number, require_not_negative, require_positive
+from manifeel_ms3.command_line import json_object
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.checks import check_argument_names
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
 from .observation import CameraView, PoseForm
@@ -159,6 +161,9 @@ def check_run(args: TrainArgs) -> None:
         inference_steps=args.inference_steps,
         log_freq=args.log_freq,
     )
+    require_not_negative(seed=args.seed, warmup_steps=args.warmup_steps)
+    if args.lr is not None and not (is_number(args.lr) and args.lr >= 0):
+        raise InvalidArgumentError(f"--lr {args.lr} must be a number of at least 0")
     if args.inference_steps < (least := args.policy.least_inference_steps):
         raise InvalidArgumentError(f"--inference-steps {args.inference_steps}: this policy needs at least {least} to generate")
     if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):
@@ -169,6 +174,20 @@ def check_run(args: TrainArgs) -> None:
         raise InvalidArgumentError(
             f"--eval-freq {args.eval_freq} must be a multiple of --save-freq {args.save_freq}, as checkpoints are evaluated"
         )
+
+
+def check_evaluation(args: TrainArgs) -> None:
+    """Check the arguments of the task in evaluation, since an evaluation that fails does not stop the training.
+
+    Args:
+        args: Settings of the run, with its task.
+
+    Raises:
+        InvalidArgumentError: They are not a json object, or the task does not take one of them.
+    """
+    assert args.env_id is not None
+    given = json_object("--eval-env-kwargs", args.eval_env_kwargs)
+    check_argument_names(task_spec(args.env_id).env_class, given.keys() - {"max_episode_steps"})  # which gym.make takes
 
 
 def default_exp_name(args: TrainArgs, policy: str) -> str:

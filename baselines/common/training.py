@@ -47,7 +47,7 @@ from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog, wandb_run_of
-from .train_args import FREE_ON_RESUME, TrainArgs, check_run, default_exp_name, default_steps
+from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, default_exp_name, default_steps
 
 log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
@@ -68,8 +68,9 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         policy_class: Class of the policy.
 
     Raises:
-        InvalidArgumentError: A number is too small, the settings contradict each other (`check_run`), or the policy cannot
-            learn actions of the demonstrations' control mode.
+        InvalidArgumentError: A number is too small, the settings contradict each other (`check_run`), the device or an argument
+            of the evaluations is not known, or the policy cannot learn actions of the demonstrations' control mode.
+        MachineError: This machine does not have the device.
         FileExistsAlreadyError: The folder of the run has checkpoints, and is neither to be resumed nor to be overwritten.
         InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
@@ -79,6 +80,7 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     check_run(args)
     processes = Processes(args.device)
     args = args.with_task_defaults()
+    check_evaluation(args)
     exp_name = processes.of_first(args.exp_name or default_exp_name(args, policy_class.name))
     run_dir = args.run_dir or Path("runs") / exp_name
     with owned(run_dir) if processes.first else nullcontext():
@@ -142,14 +144,8 @@ class Trainer:
             torch.manual_seed(args.seed + RANK_SEED_STRIDE * self.processes.rank)
 
         self.model = self.processes.with_mean_gradients(self.policy).train()
-        self.evaluation = BackgroundEvaluation(
-            self.run_dir / EVALUATIONS,
-            args.num_eval_episodes,
-            args.num_eval_envs,
-            args.eval_env_kwargs,
-            args.device,
-            args.capture_video,
-        )
+        evaluation = (args.num_eval_episodes, args.num_eval_envs, args.eval_env_kwargs, args.device, args.capture_video)
+        self.evaluation = BackgroundEvaluation(self.run_dir / EVALUATIONS, *evaluation)
         self.log = self._open_log() if processes.first else None
 
     @property

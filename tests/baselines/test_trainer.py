@@ -20,7 +20,7 @@ from baselines.common.training import RecentLosses, Trainer, TrainingError, fast
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
-from manifeel_ms3.errors import InvalidArgumentError, PluginError, WorkFailedError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError, PluginError, WorkFailedError
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
 
@@ -51,6 +51,9 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
         (dict(inference_steps=0), "--inference-steps 0 must be at least 1"),  # else the first evaluation fails, hours later
         (dict(log_freq=0), "--log-freq 0 must be at least 1"),
         (dict(save_freq=4, eval_freq=6), "--eval-freq 6 must be a multiple of --save-freq 4"),
+        (dict(seed=-1), "--seed -1 must be at least 0"),
+        (dict(lr=-0.1), "--lr -0.1 must be a number of at least 0"),
+        (dict(lr=float("nan")), "--lr nan must be a number of at least 0"),
         (
             dict(policy=FlowConfig(consistency=True, segments=2), inference_steps=1),  # would stop short of the actions
             "--inference-steps 1: this policy needs at least 2 to generate",
@@ -60,6 +63,23 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
 def test_numbers_that_no_run_can_meet_are_refused(settings, said):
     with pytest.raises(InvalidArgumentError, match=said):
         check_run(TrainArgs((), **settings))
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "said"),
+    [
+        (dict(eval_env_kwargs="{fit"), InvalidArgumentError, "--eval-env-kwargs '{fit' is not json"),
+        (dict(eval_env_kwargs="[1]"), InvalidArgumentError, r"--eval-env-kwargs '\[1\]' is not a json object"),
+        (dict(eval_env_kwargs='{"fits": "tight"}'), InvalidArgumentError, r"has no arguments \['fits'\]; choose from"),
+        (dict(device="gpu"), InvalidArgumentError, "--device 'gpu' is no device of torch"),
+        (dict(device="cuda:99"), MachineError, "--device cuda:99 is not there"),
+    ],
+)
+def test_what_only_a_later_evaluation_or_step_would_meet_is_refused_at_the_start(settings, error, said, tmp_path):
+    args = dataclasses.replace(diffusion.PRESETS["cpu"].args, demos=(states_sample(PEG),), run_dir=tmp_path / "run")
+    with pytest.raises(error, match=said):
+        diffusion.SPEC.train(dataclasses.replace(args, **settings))
+    assert not (tmp_path / "run/log.jsonl").exists()
 
 
 def test_the_task_is_that_of_the_demonstrations_unless_another_is_named():
