@@ -15,6 +15,8 @@ from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
 from .unet import DOWN_DIMS, KERNEL_SIZE, NUM_GROUPS, STEP_EMBED_DIM, ConditionalUnet1D
 
+LEAST_EMBED_DIM = 4
+"""Smallest size of the embedding of a step: a sine and a cosine of its shortest and of its longest wave."""
 HEIGHT = 2
 """Index of the height among the features of a pose."""
 
@@ -74,6 +76,26 @@ class PolicyConfig:
                 f"pred_horizon={self.pred_horizon} must be at least {least}: a prediction begins with the action at the "
                 f"first of obs_horizon={self.obs_horizon} observations, and action_horizon={self.action_horizon} actions are "
                 "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
+            )
+        if self.noise_draws < 1:
+            raise InvalidArgumentError(f"noise_draws={self.noise_draws} must be at least 1")
+        if self.diffusion_step_embed_dim < LEAST_EMBED_DIM or self.diffusion_step_embed_dim % 2:
+            raise InvalidArgumentError(
+                f"diffusion_step_embed_dim={self.diffusion_step_embed_dim} must be an even number of at least {LEAST_EMBED_DIM}"
+            )
+        if self.action_network == "unet":
+            self._require_unet()
+
+    def _require_unet(self) -> None:
+        """Check that a U-Net of these sizes can be built, and halves a prediction to its coarsest scale without a rest."""
+        if self.kernel_size % 2 == 0:
+            raise InvalidArgumentError(f"kernel_size={self.kernel_size} must be odd, so that a convolution keeps the length")
+        if odd := [width for width in self.down_dims if width % self.n_groups]:
+            raise InvalidArgumentError(f"down_dims={odd} must be multiples of n_groups={self.n_groups}")
+        if self.pred_horizon % (multiple := 2 ** (len(self.down_dims) - 1)):
+            raise InvalidArgumentError(
+                f"pred_horizon={self.pred_horizon} must be a multiple of {multiple}, as the U-Net halves it between its "
+                f"{len(self.down_dims)} scales (down_dims); the policy still executes action_horizon={self.action_horizon}"
             )
 
 

@@ -92,6 +92,36 @@ def test_horizons_that_a_prediction_cannot_meet_are_refused(horizons, said):
     assert PolicyConfig(obs_horizon=9).action_horizon == 8  # the last action of a prediction may be executed
 
 
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [
+        (dict(pred_horizon=18), "pred_horizon=18 must be a multiple of 4, as the U-Net halves it between its 3 scales"),
+        (dict(pred_horizon=15, down_dims=(8, 16)), "pred_horizon=15 must be a multiple of 2"),
+        (dict(down_dims=(12, 16)), r"down_dims=\[12\] must be multiples of n_groups=8"),
+        (dict(kernel_size=4), "kernel_size=4 must be odd"),
+        (dict(diffusion_step_embed_dim=2), "diffusion_step_embed_dim=2 must be an even number of at least 4"),
+        (dict(diffusion_step_embed_dim=63), "diffusion_step_embed_dim=63 must be an even number"),
+        (dict(noise_draws=0), "noise_draws=0 must be at least 1"),
+    ],
+)
+def test_sizes_that_no_network_can_have_are_refused(sizes, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        PolicyConfig(**sizes)
+
+
+def test_a_network_of_any_size_that_is_accepted_keeps_the_shape_of_actions():
+    for sizes in (
+        dict(pred_horizon=17, action_network="mlp"),
+        dict(pred_horizon=12, kernel_size=3),
+        dict(pred_horizon=18, down_dims=(8, 16)),
+        dict(pred_horizon=17, down_dims=(8,), diffusion_step_embed_dim=4),
+    ):
+        config = PolicyConfig(**dict(down_dims=(8, 8, 8), diffusion_step_embed_dim=8) | sizes)
+        actions = torch.zeros(2, config.pred_horizon, 6)
+        network = make_action_network(config, 6, 5)
+        assert network(actions, torch.zeros(2), torch.zeros(2, 5)).shape == actions.shape
+
+
 def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
     assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
