@@ -46,7 +46,19 @@ class PolicySpec:
         return self.policy_class.name
 
     def train(self, args: TrainArgs) -> Path:
-        """Train, and return the last checkpoint."""
+        """Train, and return the last checkpoint.
+
+        Raises:
+            PluginError: The policy names another class of settings than its arguments have, so that its checkpoints could not
+                be read.
+        """
+        given, named = type(args.policy), self.policy_class.Config
+        if given is not named:
+            raise PluginError(
+                f"the settings of the policy {self.name!r} are of the class {given.__qualname__}, and its checkpoints would be "
+                f"read as {named.__qualname__}; give the class {self.policy_class.__qualname__} the line "
+                f"`Config = {given.__qualname__}`"
+            )
         from .common.training import train  # imported here, because it takes seconds
 
         return train(args, self.policy_class)

@@ -238,6 +238,19 @@ def test_two_policies_with_one_class_of_arguments_are_refused():
         require_distinct(specs)
 
 
+def test_a_policy_whose_checkpoints_could_not_be_read_is_not_trained(tmp_path):
+    @dataclasses.dataclass
+    class OwnConfig(diffusion.DiffusionConfig):
+        weight: float = 0.5
+
+    class Own(diffusion.DiffusionPolicy):
+        name = "own"
+
+    args = dataclasses.replace(diffusion.PRESETS["cpu"].args, policy=OwnConfig(), demos=(), run_dir=tmp_path / "run")
+    with pytest.raises(PluginError, match=r"give the class .*Own the line `Config = .*OwnConfig`"):
+        PolicySpec(Own, diffusion.Args, diffusion.PRESETS).train(args)
+
+
 def test_a_policy_under_another_name_than_its_own_is_refused():
     with pytest.raises(PluginError, match="register it as 'diffusion_policy'"):
         require_distinct({"mine": diffusion.SPEC})
