@@ -9,14 +9,14 @@ from uuid import uuid4
 
 import gymnasium as gym
 
-from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.files import FileWriteError, move, remove_folder, write_json
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
+from manifeel_ms3.files import FileWriteError, move, read_json, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
 
-from .formats.maniskill_h5 import ORIGIN, DemonstrationError, read_header, task_of
+from .formats.maniskill_h5 import HEADER, ORIGIN, DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
     RecordedEpisode,
     consolidate,
@@ -175,6 +175,20 @@ class Recording:
                 f"{self._folder} holds episodes of a recording whose file {path} is missing; put the file back, or move the "
                 "folder away, or give another --out"
             )
+        else:
+            self._require_free_json()
+
+    def _require_free_json(self) -> None:
+        """Check that the json of a new file replaces no file of another kind, such as the result of an evaluation."""
+        path = self.path.with_suffix(".json")
+        if not path.exists():
+            return
+        try:
+            read_json(path, HEADER, "a trajectory's json")
+        except InvalidFileError as error:
+            raise DemonstrationError(
+                f"{path} is no recording's json; {self.path} needs its place; give another path"
+            ) from error
 
     def _load(self) -> None:
         before = read_header(self.path)

@@ -181,13 +181,16 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
     """Check before the first episode what would otherwise fail after the last one.
 
     Raises:
-        InvalidArgumentError: The result is a folder, or a video of an episode that does not exist is requested.
+        InvalidArgumentError: The result is a folder or a file of a recording, or a video of an episode that does not
+            exist is requested.
         ResultError: The arguments cannot be part of a result.
         MissingExtraError: Videos are requested, and the extra `report` is not installed.
     """
     try:
         if out.is_dir():
             raise InvalidArgumentError(f"--out {out} is a folder; give the path of a file, such as {out / 'evaluation.json'}")
+        if out.suffix in (".json", ".h5") and (recording := out.with_suffix(".h5")).exists():
+            raise InvalidArgumentError(f"--out {out} would replace a file of the recording {recording}; give another path")
     except OSError as error:
         raise InvalidArgumentError(f"--out {out} cannot be written ({error.strerror}); give another path") from error
     if wrong := [number for number in args.videos if not 0 <= number < len(seeds)]:

@@ -323,6 +323,14 @@ def test_a_file_whose_json_would_be_that_of_another_file_is_refused(recorded, tm
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_new_file_does_not_replace_a_result_by_its_json(tmp_path):
+    result = tmp_path / "evaluation.json"
+    result.write_text('{"schema": "manifeel-evaluation-3"}')
+    with pytest.raises(DemonstrationError, match=r"evaluation.json is no recording's json; .* give another path"):
+        run(tmp_path / "evaluation.h5", num=1)
+    assert result.read_text() == '{"schema": "manifeel-evaluation-3"}'
+
+
 @pytest.mark.parametrize("kwargs", ['{"randomization": {"foo": 1}}', '{"control_mode": "foo"}', '{"max_episode_steps": "foo"}'])
 def test_a_run_that_was_refused_does_not_stand_in_the_way_of_the_next(recorded, tmp_path, kwargs):
     path = tmp_path / "trajectory.h5"

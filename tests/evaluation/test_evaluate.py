@@ -40,6 +40,15 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     assert result["env_kwargs"]["obs_mode"] == "tacff"
 
 
+@pytest.mark.parametrize("name", ["peg.json", "peg.h5"])
+def test_a_result_does_not_replace_a_recording(name, tmp_path):
+    (tmp_path / "peg.h5").write_text("episodes")
+    (tmp_path / "peg.json").write_text("their json")
+    with pytest.raises(InvalidArgumentError, match=r"would replace a file of the recording .*peg\.h5; give another path"):
+        main(Args(policy="tests.evaluation.policies:StandStill", env_id=PEG, obs_mode="tacff", episodes=1, out=tmp_path / name))
+    assert {path.read_text() for path in tmp_path.iterdir()} == {"episodes", "their json"}
+
+
 def test_a_result_names_the_commit_at_which_its_evaluation_began(tmp_path, monkeypatch):
     """The repository may go on to other commits while the code that was loaded runs."""
     commits = iter(letter * 40 for letter in "abcdef")
