@@ -146,8 +146,8 @@ def check_run(args: TrainArgs) -> None:
     """Check that the numbers of a run can be met, and that its settings do not contradict each other.
 
     Raises:
-        InvalidArgumentError: A number is too small, the run to resume is not named, or is to be overwritten, or evaluations
-            fall between checkpoints.
+        InvalidArgumentError: A number is too small, the run to resume is not named, or is to be overwritten, evaluations fall
+            between checkpoints, or no demonstrations are given.
     """
     require_positive(
         num_demos=args.num_demos,
@@ -174,6 +174,8 @@ def check_run(args: TrainArgs) -> None:
         raise InvalidArgumentError(
             f"--eval-freq {args.eval_freq} must be a multiple of --save-freq {args.save_freq}, as checkpoints are evaluated"
         )
+    if not args.demos:
+        raise InvalidArgumentError("no demonstrations are given; give --demo-path FILE, which `manifeel record` makes")
 
 
 def check_evaluation(args: TrainArgs) -> None:

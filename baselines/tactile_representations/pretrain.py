@@ -28,6 +28,7 @@ from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header, task_of
+from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
@@ -102,7 +103,7 @@ def main(args: Args) -> list[float]:
 
 def _pretrain(args: Args) -> list[float]:
     torch.manual_seed(args.seed)
-    representation = REPRESENTATIONS[args.representation]().to(args.device)
+    representation = REPRESENTATIONS[args.representation]().to(checked_device(args.device))
     size = args.image_size or representation.size
     require_size(representation, size, "--image-size")
     images = torch.as_tensor(tacrgb_images(args.demos, size, args.env_id))

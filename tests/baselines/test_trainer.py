@@ -58,6 +58,7 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
             dict(policy=FlowConfig(consistency=True, segments=2), inference_steps=1),  # would stop short of the actions
             "--inference-steps 1: this policy needs at least 2 to generate",
         ),
+        (dict(env_id=PEG), "no demonstrations are given; give --demo-path"),
     ],
 )
 def test_numbers_that_no_run_can_meet_are_refused(settings, said):
