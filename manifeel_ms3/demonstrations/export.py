@@ -19,7 +19,8 @@ from manifeel_ms3.progress import progress_bar
 from .formats import FORMATS
 from .formats.demonstration_format import Progress
 from .formats.lerobot_writing import write_lerobot
-from .formats.maniskill_h5 import DemonstrationError, observation_keys, read_trajectories
+from .formats.maniskill_h5 import DemonstrationError, observation_keys, read_header, read_trajectories
+from .recording import train_command
 
 Format = Literal["lerobot", "zarr", "npz"]
 
@@ -80,9 +81,7 @@ def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     if args.to == "npz":
         return f"{made} holds one file for each episode; `numpy.load` opens them"
-    return (
-        f"{made} is a data set of the format {args.to}; `manifeel train diffusion_policy cpu --demo-path {made}` trains on it"
-    )
+    return f"{made} is a data set of the format {args.to}; `{train_command(made, read_header(args.file))}` trains on it"
 
 
 if __name__ == "__main__":

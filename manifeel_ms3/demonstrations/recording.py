@@ -349,6 +349,18 @@ def next_step(_args: Any, path: Path) -> str:
     held = f"{path} holds {count} episode{'s' * (count != 1)}"
     if seen["obs_mode"] == "none":
         return f"{held}; `manifeel render-observations {path} --out FILE` adds observations"
-    sensing = f"--obs-mode {seen['obs_mode']} --cameras {' '.join(seen['cameras'])}"
-    train = f"manifeel train diffusion_policy cpu --demo-path {path} --env-id {task_of(header)} {sensing}"
-    return f"{held}; `manifeel view {path}` shows them, `{train}` trains a policy"
+    return f"{held}; `manifeel view {path}` shows them, `{train_command(path, header)}` trains a policy"
+
+
+def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
+    """The command that trains a policy on what was recorded.
+
+    Args:
+        demonstrations: Path of the trajectory file, or of what was exported from it.
+        header: The json beside the trajectory file.
+    """
+    seen = header["env_info"]["env_kwargs"]
+    sensing = f"--env-id {task_of(header)} --obs-mode {seen['obs_mode']}"
+    if "cameras" in seen:  # other programs name them only where they are not the task's policy camera
+        sensing += f" --cameras {' '.join(seen['cameras'])}"
+    return f"manifeel train diffusion_policy cpu --demo-path {demonstrations} {sensing}"

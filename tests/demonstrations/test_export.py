@@ -12,7 +12,7 @@ from baselines.common.dataset import read_episodes, recorded_env_kwargs, recorde
 from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.sample import KEYS, observed_sample, states_sample
@@ -39,6 +39,13 @@ def require_same(read: list[dict[str, np.ndarray]], last_is_repeated: bool) -> N
                 expected[-1] = expected[-2]
             assert episode[key].dtype == expected.dtype
             assert np.array_equal(episode[key], expected), key
+
+
+def test_the_command_that_trains_on_an_export_asks_for_what_was_recorded():
+    recorded = read_header(SAMPLE)["env_info"]["env_kwargs"]
+    said = export.next_step(export.Args(SAMPLE, "lerobot", Path("folder")), Path("folder"))
+    sensing = f"--env-id {PEG} --obs-mode {recorded['obs_mode']} --cameras {' '.join(recorded['cameras'])}"
+    assert f"`manifeel train diffusion_policy cpu --demo-path folder {sensing}`" in said
 
 
 def test_what_can_be_exported_is_found():
