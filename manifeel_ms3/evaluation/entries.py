@@ -71,11 +71,17 @@ def find_entry(name: str) -> Entry:
         name: Path of the entry's folder on the leaderboard, such as "cpu/PegInsertion/rgb+tacff".
 
     Raises:
-        UnknownNameError: There is no such entry with a checkpoint; the message lists the entries that have one.
+        UnknownNameError: There is no such entry with a checkpoint; the message lists the entries that have one. Or there is no
+            leaderboard, because the package is not installed from a copy of the repository.
         InvalidFileError: The checkpoint is not the one that the submission names.
         ResultError: The result is broken.
     """
     board = leaderboard_dir()
+    if not board.is_dir():
+        raise UnknownNameError(
+            f"{board} does not exist: only a copy of the repository has the entries; install the package from one with "
+            "`pip install -e .`"
+        )
     known = {path.parents[2].relative_to(board).as_posix(): path for path in sorted(board.glob(f"*/**/{CHECKPOINTS}/*"))}
     if name not in known:
         raise UnknownNameError(f"no entry {name!r} with a checkpoint is in {board}; choose from {list(known)}")

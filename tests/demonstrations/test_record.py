@@ -323,6 +323,15 @@ def test_a_file_whose_json_would_be_that_of_another_file_is_refused(recorded, tm
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_folder_and_a_file_without_its_json_are_named(recorded, tmp_path):
+    with pytest.raises(DemonstrationError, match=r"is a folder; give a trajectory file"):
+        read_header(tmp_path)
+    alone = tmp_path / recorded.name
+    alone.write_bytes(recorded.read_bytes())
+    with pytest.raises(DemonstrationError, match=r"trajectory\.json does not exist; copy both files"):
+        read_header(alone)
+
+
 def test_a_new_file_does_not_replace_a_result_by_its_json(tmp_path):
     result = tmp_path / "evaluation.json"
     result.write_text('{"schema": "manifeel-evaluation-3"}')

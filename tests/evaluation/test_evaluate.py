@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.errors import InvalidArgumentError, ServerError, UnknownNameError
+from manifeel_ms3.evaluation import entries
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.evaluate import Args, main, next_step
 from manifeel_ms3.evaluation.policy import PolicyError
@@ -38,6 +39,12 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     assert result["policy"] == "tests.evaluation.policies:StandStill"
     assert result["success_once"]["rate"] == 0.0
     assert result["env_kwargs"]["obs_mode"] == "tacff"
+
+
+def test_an_entry_without_a_copy_of_the_repository_says_where_entries_are(tmp_path, monkeypatch):
+    monkeypatch.setattr(entries, "leaderboard_dir", lambda: tmp_path / "leaderboard")
+    with pytest.raises(UnknownNameError, match="only a copy of the repository has the entries"):
+        main(Args(entry="cpu/PegInsertion/rgb+tacff"))
 
 
 @pytest.mark.parametrize("name", ["peg.json", "peg.h5"])
