@@ -75,7 +75,6 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
         InUseError: Another process trains in the folder of the run.
         DemonstrationError: The demonstrations are not what the settings ask for.
         CheckpointError: The run to resume has other settings, or its checkpoint is missing or broken.
-        MachineError: This machine does not have the device.
         TrainingError: The loss is not a finite number.
     """
     check_run(args)
