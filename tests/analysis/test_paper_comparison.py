@@ -11,7 +11,9 @@ from .made_up import TOTAL_STEPS, write_run
 
 @pytest.mark.parametrize(("processes", "minutes", "rate"), [({}, "50.0", "8.0"), (dict(num_processes=2), "25.0", "16.0")])
 def test_minutes_of_an_epoch_count_the_samples_of_all_processes(processes, minutes, rate, tmp_path):
-    timed = dict(num_samples=24_000, batch_size=8, training_seconds=float(TOTAL_STEPS), trained_on=dict(gpu="A30", cpu="EPYC"))
+    timed = dict(
+        num_samples=24_000, batch_size=8, training_seconds=float(TOTAL_STEPS), trained_on=dict(gpu="A30", cpu="EPYC", cores=16)
+    )
     write_run(tmp_path, TACRGB, 0.5, task="BallSorting", checkpoints=1, num_demos=RUNTIME_DEMOS, **timed, **processes)
     (row,) = (line for line in runtime_table(results_in(tmp_path)).splitlines() if "A30 |" in line)
     assert [cell.strip() for cell in row.split("|")][3:6] == [minutes, rate, "A30"]
