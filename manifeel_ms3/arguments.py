@@ -50,6 +50,21 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def require_at_least(least: int, **settings: int) -> None:
+    """Check numbers among the settings of an object.
+
+    Args:
+        least: Smallest number that is allowed.
+        **settings: Numbers by the names of their settings.
+
+    Raises:
+        InvalidArgumentError: A number is smaller.
+    """
+    for name, given in settings.items():
+        if given < least:
+            raise InvalidArgumentError(f"{name}={given} must be at least {least}")
+
+
 def require_positive(**flags: int | None) -> None:
     """Check that whole numbers of a command line are at least 1.
 
@@ -59,7 +74,7 @@ def require_positive(**flags: int | None) -> None:
     Raises:
         InvalidArgumentError: A number is less than 1.
     """
-    _require_at_least(1, flags)
+    _require_flags(1, flags)
 
 
 def require_not_negative(**flags: int) -> None:
@@ -71,10 +86,10 @@ def require_not_negative(**flags: int) -> None:
     Raises:
         InvalidArgumentError: A number is less than 0.
     """
-    _require_at_least(0, flags)
+    _require_flags(0, flags)
 
 
-def _require_at_least(least: int, flags: Mapping[str, int | None]) -> None:
+def _require_flags(least: int, flags: Mapping[str, int | None]) -> None:
     for name, given in flags.items():
         if given is not None and given < least:
             raise InvalidArgumentError(f"--{name.replace('_', '-')} {given} must be at least {least}; give a larger number")

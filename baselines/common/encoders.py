@@ -8,6 +8,7 @@ from pathlib import Path
 import torch
 import torch.nn as nn
 
+from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
 from .observation import POSE, ObservationSpec, is_tactile
@@ -15,7 +16,11 @@ from .observation import POSE, ObservationSpec, is_tactile
 
 @dataclass
 class EncoderConfig:
-    """The networks that encode a policy's observations; the defaults are those of the paper's public code."""
+    """The networks that encode a policy's observations; the defaults are those of the paper's public code.
+
+    Raises:
+        InvalidArgumentError: A number of features is less than 1, or the side of a crop less than 0.
+    """
 
     image: str = "resnet18"
     """Network of each camera: "resnet18" averages its features over the image, as the paper's public code does;
@@ -38,6 +43,10 @@ class EncoderConfig:
     crop: int = 0
     """Side of the square crops of camera images, pixels: random in training, central in evaluation; whole images if 0. TacRGB
     is not cropped, because it matters where the gel is pressed."""
+
+    def __post_init__(self):
+        require_at_least(1, image_features=self.image_features, tactile_features=self.tactile_features)
+        require_at_least(0, crop=self.crop)
 
 
 class SpatialSoftmax(nn.Module):

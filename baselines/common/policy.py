@@ -7,6 +7,7 @@ from typing import ClassVar, Literal, cast
 import torch
 import torch.nn as nn
 
+from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
@@ -26,7 +27,8 @@ class PolicyConfig:
     """Settings of a policy; the defaults are the paper's, which are those of Diffusion Policy.
 
     Raises:
-        InvalidArgumentError: A horizon is less than 1, or a prediction has too few actions for those that are executed.
+        InvalidArgumentError: A horizon is less than 1, a prediction has too few actions for those that are executed, or no
+            network can have these sizes.
     """
 
     obs_horizon: int = 2
@@ -77,8 +79,7 @@ class PolicyConfig:
                 f"first of obs_horizon={self.obs_horizon} observations, and action_horizon={self.action_horizon} actions are "
                 "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
             )
-        if self.noise_draws < 1:
-            raise InvalidArgumentError(f"noise_draws={self.noise_draws} must be at least 1")
+        require_at_least(1, noise_draws=self.noise_draws, mlp_width=self.mlp_width, mlp_blocks=self.mlp_blocks)
         if self.diffusion_step_embed_dim < LEAST_EMBED_DIM or self.diffusion_step_embed_dim % 2:
             raise InvalidArgumentError(
                 f"diffusion_step_embed_dim={self.diffusion_step_embed_dim} must be an even number of at least {LEAST_EMBED_DIM}"

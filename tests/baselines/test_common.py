@@ -102,11 +102,18 @@ def test_horizons_that_a_prediction_cannot_meet_are_refused(horizons, said):
         (dict(diffusion_step_embed_dim=2), "diffusion_step_embed_dim=2 must be an even number of at least 4"),
         (dict(diffusion_step_embed_dim=63), "diffusion_step_embed_dim=63 must be an even number"),
         (dict(noise_draws=0), "noise_draws=0 must be at least 1"),
+        (dict(mlp_width=0), "mlp_width=0 must be at least 1"),
     ],
 )
 def test_sizes_that_no_network_can_have_are_refused(sizes, said):
     with pytest.raises(InvalidArgumentError, match=said):
         PolicyConfig(**sizes)
+
+
+@pytest.mark.parametrize(("name", "least"), [("image_features", 1), ("tactile_features", 1), ("crop", 0)])
+def test_sizes_that_no_encoder_can_have_are_refused(name, least):
+    with pytest.raises(InvalidArgumentError, match=f"{name}={least - 1} must be at least {least}"):
+        EncoderConfig(**{name: least - 1})
 
 
 def test_a_network_of_any_size_that_is_accepted_keeps_the_shape_of_actions():
