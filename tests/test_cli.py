@@ -20,7 +20,8 @@ from baselines.tactile_representations import pretrain
 from manifeel_ms3 import cli, command_line
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
-from manifeel_ms3.demonstrations.recording import next_step
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.demonstrations.recording import next_step, train_command
 from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.sample import observed_sample, states_sample
@@ -63,6 +64,9 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
     assert next_step(None, observed_sample(PEG)).endswith(
         f"--env-id {PEG} --obs-mode rgb+tacff --cameras wrist` trains a policy"
     )
+    header = read_header(observed_sample(PEG))
+    header["env_info"]["env_kwargs"]["tactile_sensors"] = ["left"]
+    assert train_command(path, header).endswith("--cameras wrist --tactile-sensors left")
 
 
 SAYS_IT_ALL = {"tasks", "doctor", "view", "teleop"}

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG, TRAINING_STATE, WEIGHTS, CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.result import published_config
 from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
+from manifeel_ms3.nested_settings import differing
 
 LAST = "last"
 """Name of the link to the checkpoint from which training continues; it always leads to a complete one."""
@@ -57,13 +58,19 @@ def save_in_half_precision(checkpoint: Path, folder: Path) -> None:
 
 
 def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file.
+    """Write a safetensors file. Each name has values of its own there, also where a module uses one weight under two names.
 
     Raises:
         OSError: The file cannot be written, as when the disk is full.
     """
+    separate: dict[str, torch.Tensor] = {}
+    memories: set[int] = set()
+    for name, tensor in tensors.items():
+        whole = tensor.contiguous()
+        separate[name] = whole.clone() if (memory := whole.untyped_storage().data_ptr()) in memories else whole
+        memories.add(memory)
     try:
-        save_file({name: tensor.contiguous() for name, tensor in tensors.items()}, path)
+        save_file(separate, path)
     except SafetensorError as error:
         raise OSError(str(error)) from error
 
@@ -171,10 +178,10 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
     Raises:
         CheckpointError: Some settings differ; the message lists them.
     """
-    saved, wanted = json.loads(json.dumps(saved)), json.loads(json.dumps(wanted))
-    differing = {k: (saved.get(k), v) for k, v in wanted.items() if k not in free and saved.get(k) != v}
-    if differing:
-        lines = ", ".join(f"{k}: {old!r} there, {new!r} now" for k, (old, new) in differing.items())
+    wanted = {name: value for name, value in json.loads(json.dumps(wanted)).items() if name not in free}
+    saved = {name: value for name, value in json.loads(json.dumps(saved)).items() if name in wanted}
+    if unequal := differing(saved, wanted):
+        lines = ", ".join(f"{name}: {old!r} there, {new!r} now" for name, (old, new) in unequal.items())
         raise CheckpointError(
             f"{source} was trained with other settings ({lines}); resume with the same, or choose another --run-dir"
         )

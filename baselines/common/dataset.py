@@ -12,6 +12,7 @@ import torch
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats import Demonstration, format_of
 from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
+from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.progress import progress_bar
 
 from .memory import return_freed_memory
@@ -111,12 +112,11 @@ def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     recorded = [(file, read(file)) for file, read in readers if read is not None]
     known = [(file, _of_task(arguments)) for file, arguments in recorded if arguments is not None]
     for (first, expected), (second, found) in pairwise(known):
-        for name in sorted(expected | found):
-            if expected.get(name) != found.get(name):
-                raise DemonstrationError(
-                    f"{first} was recorded with {name}={expected.get(name)!r}, {second} with {name}={found.get(name)!r}; train "
-                    "on files that were recorded with the same arguments of the task"
-                )
+        for name, (one, other) in differing(expected, found).items():
+            raise DemonstrationError(
+                f"{first} was recorded with {name}={one!r}, {second} with {name}={other!r}; train on files "
+                "that were recorded with the same arguments of the task"
+            )
     return known[0][1] if known else {}
 
 

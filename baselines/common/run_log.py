@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ EVENTS = "events.out.tfevents.*"
 """Files of the log in the folder of a run: json lines, and tensorboard's events."""
 WANDB_TIMEOUT = 30
 """Longest wait for Weights & Biases, s; set once, not tuned."""
+WANDB_ID = "wandb_id.txt"
+"""File, in the folder of a run, of the id of the run in Weights & Biases."""
 GLOBAL_STEP = "global_step"
 """Name of the gradient step in Weights & Biases, over which everything is drawn."""
 TIME = "time/"
@@ -80,7 +83,7 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_run: WandbRun | None):
-        self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
+        self._wandb = _start_wandb(wandb_run, config, folder, resumed=step > 0) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
         """Entries of the earlier log that are kept."""
         self._path = folder / LOG
@@ -158,13 +161,18 @@ def _video_entry(video: Path | None) -> dict[str, Any]:
     return {"eval/video": wandb.Video(str(video), format="mp4")}
 
 
-def _start_wandb(run: WandbRun, config: dict[str, Any], folder: Path) -> Any:
+def _start_wandb(run: WandbRun, config: dict[str, Any], folder: Path, resumed: bool) -> Any:
+    """Start a run in Weights & Biases, or continue the one of a training that is resumed."""
     import wandb
     from wandb.errors import CommError, UsageError
 
+    id_file = folder / WANDB_ID
+    if not (resumed and id_file.is_file()):
+        write_text(id_file, secrets.token_hex(8))
     try:
         settings = wandb.Settings(init_timeout=WANDB_TIMEOUT)
         about: dict[str, Any] = dict(project=run.project, entity=run.entity, name=run.name, group=run.group, tags=run.tags)
+        about |= dict(id=id_file.read_text(encoding="utf-8"), resume="allow")
         started = wandb.init(**about, config=config | run.config, dir=str(folder), settings=settings)
         # evaluations finish later than the steps that they are about, which wandb's own count does not allow
         started.define_metric("*", step_metric=GLOBAL_STEP)

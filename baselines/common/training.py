@@ -203,9 +203,9 @@ class Trainer:
         folder, random_states = self.checkpoints / f"{self.step:08d}", self.processes.of_all(random_state())
         if not self.processes.first:
             return folder
-        weights = dict(self.policy.state_dict())
-        for (name, _), averaged in zip(self.policy.named_parameters(), self.ema.shadow_params, strict=True):
-            weights[name] = averaged
+        averaged = dict(zip(self.policy.parameters(), self.ema.shadow_params, strict=True))
+        of_names = {name: averaged[weight] for name, weight in self.policy.named_parameters(remove_duplicate=False)}
+        weights = self.policy.state_dict() | of_names
         state = pack(self.optimizer, self.policy, random_states) | self.order.state_dict()
         cost = dict(trained_on=machine(), training_seconds=round(time.time() - self.begin, 1))
         save_checkpoint(folder, self.config | cost | dict(step=self.step), weights, state)

@@ -11,6 +11,7 @@ import gymnasium as gym
 
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, move, read_json, remove_folder, write_json
+from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
@@ -192,12 +193,12 @@ class Recording:
 
     def _load(self) -> None:
         before = read_header(self.path)
-        for name in ("env_info", "revision"):
-            if before.get(name, self._header[name]) != self._header[name]:
-                raise DemonstrationError(
-                    f"{self.path} was recorded with {name}={before[name]}, this run asks for {self._header[name]}; give "
-                    "another --out, or delete the file"
-                )
+        asked = {name: self._header[name] for name in ("env_info", "revision")}
+        for name, (recorded, wanted) in differing({n: before.get(n, value) for n, value in asked.items()}, asked).items():
+            raise DemonstrationError(
+                f"{self.path} was recorded with {name}={recorded!r}, this run asks for {wanted!r}; give another --out, "
+                "or delete the file"
+            )
         self.failed = set(before.get("failed_seeds", []))
         self.is_complete = not is_index(self.path)
         if self.is_complete:
@@ -363,4 +364,6 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
     sensing = f"--env-id {task_of(header)} --obs-mode {seen['obs_mode']}"
     if "cameras" in seen:  # other programs name them only where they are not the task's policy camera
         sensing += f" --cameras {' '.join(seen['cameras'])}"
+    if (pads := seen.get("tactile_sensors")) and "right" not in pads:  # policies observe the right one unless told otherwise
+        sensing += f" --tactile-sensors {' '.join(pads)}"
     return f"manifeel train diffusion_policy cpu --demo-path {demonstrations} {sensing}"

@@ -120,5 +120,16 @@ def test_tensorboard_has_the_success_at_the_step_of_the_checkpoint(run_dir):
     assert [event.step for event in board.Scalars("losses/total_loss")] == [TRAINED["step"]]
 
 
+def test_a_run_that_is_resumed_goes_on_under_its_id_and_a_new_one_has_another(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    ids = []
+    for step in (0, 200, 0):
+        RunLog(tmp_path, {}, step, wandb_run_of(ARGS, "diffusion_policy")).close()
+        newest = max(tmp_path.glob("wandb/offline-run-*/run-*.wandb"), key=lambda path: path.stat().st_mtime_ns)
+        ids.append(newest.stem)
+    assert ids[0] == ids[1] != ids[2]
+
+
 def test_nothing_is_sent_unless_it_is_asked_for():
     assert wandb_run_of(replace(ARGS, track=False), "diffusion_policy") is None

@@ -10,7 +10,7 @@ import pytest
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 
-from baselines.common.checkpoint import TRAINING_STATE, prune
+from baselines.common.checkpoint import TRAINING_STATE, WEIGHTS, prune, read_tensors
 from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
@@ -203,6 +203,28 @@ def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(tr
     assert all(torch.equal(own, other) for own, other in pairs)
     assert second.optimizer.param_groups[0]["lr"] == first.optimizer.param_groups[0]["lr"]
     assert torch.equal(second.order.take(4), first.order.take(4))
+
+
+class TiedPolicy(diffusion.DiffusionPolicy):
+    """A policy that uses one weight under two names."""
+
+    def __init__(self, config, spec, action_dim):
+        super().__init__(config, spec, action_dim)
+        self.action_network.register_module("again", self.encoder)
+
+
+def test_a_weight_with_two_names_is_saved_under_both(trainer_args):
+    first = Trainer(trainer_args, TiedPolicy, Processes("cpu"))
+    first.take_step()
+    saved = read_tensors(first.save() / WEIGHTS)
+    names = [name for name in saved if name.startswith("encoder.")]
+    assert names
+    assert all(torch.equal(saved[name], saved[f"action_network.again.{name.removeprefix('encoder.')}"]) for name in names)
+    second = Trainer(dataclasses.replace(trainer_args, resume=True), TiedPolicy, Processes("cpu"))
+    own, other = first.policy.state_dict(), second.policy.state_dict()
+    assert all(torch.equal(own[name], other[name]) for name in own)
+    averaged = dict(zip(second.policy.parameters(), second.ema.shadow_params, strict=True))
+    assert all(torch.equal(saved[name], averaged[weight]) for name, weight in second.policy.named_parameters())
 
 
 def test_two_processes_resume_bit_for_bit(trainer_args):

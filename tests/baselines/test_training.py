@@ -185,6 +185,9 @@ def test_the_seed_fixes_everything(run, tmp_path):
 def test_resume_with_other_settings_names_them(run, checkpoint):
     with pytest.raises(CheckpointError, match=r"lr: 0\.001 there, 0.5 now"):
         run.again(resume=True, lr=0.5)
+    policy = dataclasses.replace(run.args.policy, pred_horizon=run.args.policy.pred_horizon * 2)
+    with pytest.raises(CheckpointError, match=r"\(policy\.pred_horizon: \d+ there, \d+ now\)"):
+        run.again(resume=True, policy=policy)
 
 
 def test_resume_without_a_checkpoint(run, tmp_path):
