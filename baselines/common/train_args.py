@@ -61,7 +61,12 @@ class TrainArgs:
     batch_size: int = 8
     """Number of samples in a gradient step of each process."""
     steps: Annotated[int | None, arg(name="total-iters", aliases=["--steps"])] = None
-    """Number of gradient steps; if not given, the paper's 50,000 epochs divided by the number of demonstrations."""
+    """Number of gradient steps; if not given, `epochs` says how long training is."""
+    epochs: int | None = None
+    """Number of epochs where the number of gradient steps is not given; if neither is, 50,000 divided by the number of
+    demonstrations, as in the paper."""
+    min_steps: Annotated[int, arg(name="min-iters")] = 1
+    """Smallest number of gradient steps of a training whose length is given in epochs."""
     lr: float | None = None
     """Learning rate of AdamW after the warm-up, from which it falls to 0 along a cosine; if not given, that of the paper's
     public code."""
@@ -135,7 +140,18 @@ class TrainArgs:
 
 FREE_ON_RESUME = {
     *("demos", "tacrgb_weights", "exp_name", "run_dir", "resume", "overwrite", "device", "compile", "log_freq"),
-    *("steps", "total_steps", "step", "save_freq", "keep", "inference_steps", "trained_on", "training_seconds"),
+    *(
+        "steps",
+        "epochs",
+        "min_steps",
+        "total_steps",
+        "step",
+        "save_freq",
+        "keep",
+        "inference_steps",
+        "trained_on",
+        "training_seconds",
+    ),
     *("eval_freq", "num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "capture_video"),
     *("track", "wandb_project_name", "wandb_entity"),
 }
@@ -153,6 +169,8 @@ def check_run(args: TrainArgs) -> None:
         num_demos=args.num_demos,
         batch_size=args.batch_size,
         total_iters=args.steps,
+        epochs=args.epochs,
+        min_iters=args.min_steps,
         save_freq=args.save_freq,
         keep=args.keep,
         eval_freq=args.eval_freq,
@@ -204,12 +222,16 @@ def default_exp_name(args: TrainArgs, policy: str) -> str:
     return f"{policy}/{short_name(args.env_id)}-{args.obs_mode}-seed{args.seed}-{now}"
 
 
-def default_steps(num_demos: int, num_samples: float, batch_size: int) -> int:
-    """Number of gradient steps of the paper's public code: 50,000 epochs divided by the number of demonstrations.
+def planned_steps(args: TrainArgs, num_demos: int, num_samples: float, batch_size: int) -> int:
+    """Number of gradient steps of a run.
 
     Args:
+        args: Settings of the run.
         num_demos: Number of training episodes.
         num_samples: Number of samples in an epoch (`SequenceDataset`).
-        batch_size: Number of samples in a gradient step.
+        batch_size: Number of samples in a gradient step of all processes.
     """
-    return round(PAPER_EPOCHS / num_demos) * math.ceil(num_samples / batch_size)
+    if args.steps is not None:
+        return args.steps
+    epochs = PAPER_EPOCHS // num_demos if args.epochs is None else args.epochs
+    return max(epochs * math.ceil(num_samples / batch_size), args.min_steps)

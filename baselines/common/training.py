@@ -47,7 +47,7 @@ from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
 from .processes import Processes
 from .run_log import RunLog, wandb_run_of
-from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, default_exp_name, default_steps
+from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, default_exp_name, planned_steps
 
 log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
@@ -125,7 +125,7 @@ class Trainer:
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
         self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
         self.batch_size = args.batch_size * self.processes.count
-        self.total_steps = args.steps or default_steps(self.dataset.num_episodes, len(self.dataset), self.batch_size)
+        self.total_steps = planned_steps(args, self.dataset.num_episodes, len(self.dataset), self.batch_size)
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
         self.config = run_config(args, policy_class, self.dataset, env_kwargs) | amount
 

@@ -35,7 +35,7 @@ PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
         "A small network that learns on a CPU core in minutes.",
-        for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, steps=3500, hidden=64),
+        for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, epochs=15, min_steps=3500, hidden=64),
     ),
 }
 

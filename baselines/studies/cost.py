@@ -16,7 +16,7 @@ import torch
 from baselines.common.agent import spec_of
 from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE
-from baselines.common.train_args import default_steps
+from baselines.common.train_args import planned_steps
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
@@ -46,7 +46,18 @@ ACTION_SIZE = 7
 """Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
 AMOUNTS = ("num", "episodes", "checkpoints", "version", "revision")
 """Settings on which the cost of one demonstration, gradient step or episode does not depend."""
-AMOUNT_FLAGS = ("seed", "env-id", "cameras", "steps", "keep", "save-every", "num-demos", "tacrgb-weights")
+AMOUNT_FLAGS = (
+    "seed",
+    "env-id",
+    "cameras",
+    "steps",
+    "epochs",
+    "min-iters",
+    "keep",
+    "save-every",
+    "num-demos",
+    "tacrgb-weights",
+)
 """Flags of training on which the cost of one gradient step does not depend; a study's policies have one camera each."""
 
 
@@ -182,7 +193,7 @@ def _units(job: Job) -> int:
     demos = record.settings["num"] if args.num_demos is None else args.num_demos
     steps = _demonstration_steps(record.settings["env_id"])
     samples = demos * max(steps - args.policy.action_horizon + 1, 1)  # as `SequenceDataset` counts them
-    return default_steps(demos, samples, args.batch_size) if args.steps is None else args.steps
+    return planned_steps(args, demos, samples, args.batch_size)
 
 
 def _demonstration_steps(env_id: str) -> float:

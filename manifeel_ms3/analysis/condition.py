@@ -20,6 +20,7 @@ NO_SETTINGS = frozenset(
         *("seed", "step"),  # a condition has several of these
         *("action_dim", "taxel_shape", "num_samples"),  # these follow from the task and its demonstrations
         *("demos", "run_dir", "resume", "overwrite", "device", "compile", "trained_on", "training_seconds"),  # where and how
+        *("epochs", "min_steps"),  # these are in the entry `steps`
         *("total_steps", "save_freq", "keep", "log_freq"),
         *("num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "eval_freq", "capture_video"),
         *("exp_name", "track", "wandb_project_name", "wandb_entity"),
@@ -143,4 +144,6 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
     idle = {name for name, modes in OF_MODALITIES.items() if not set(modes) & set(obs_mode.split("+"))}
     no_settings = NO_SETTINGS | {"obs_mode"}
     named = {n: value for n, value in config.items() if n not in no_settings and (n, value) not in IMPLIED.items()}
+    if named.get("steps", 0) is None and (epochs := config.get("epochs")) is not None:
+        named["steps"] = f"{epochs} epochs, at least {config['min_steps']}"
     return tuple(sorted((name, json.dumps(value, sort_keys=True)) for name, value in innermost(named) if name not in idle))

@@ -18,7 +18,7 @@ import tyro
 from baselines.common.checkpoint import as_json
 from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import observation_spec
-from baselines.common.train_args import default_steps
+from baselines.common.train_args import planned_steps
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import require_valid_flags, shell_command, training_args
@@ -335,7 +335,7 @@ def test_training_is_as_long_as_the_samples_of_its_demonstrations_make_it():
     episodes = [{"actions": np.zeros((steps, 6))} | {key: np.zeros((steps + 1, 7)) for key in spec.keys}] * record["num"]
     horizons = args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon
     data = SequenceDataset(episodes, spec, *horizons, torch.device("cpu"))
-    assert cost._units(train) == default_steps(record["num"], len(data), args.batch_size)
+    assert cost._units(train) == planned_steps(args, record["num"], len(data), args.batch_size)
 
 
 def test_a_plan_tells_the_hours_from_a_trial(study, tmp_path):

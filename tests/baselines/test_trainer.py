@@ -15,7 +15,7 @@ from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
-from baselines.common.train_args import PAPER_EPOCHS, TrainArgs, check_run, default_steps
+from baselines.common.train_args import PAPER_EPOCHS, TrainArgs, check_run, planned_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
@@ -31,10 +31,16 @@ SPEC = observation_spec("tacff", (), ("right",), 64)
 
 
 @pytest.mark.parametrize(("num_demos", "num_samples", "batch_size", "steps"), [(50, 4200, 8, 525_000), (2, 9, 4, 75_000)])
-def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, num_samples, batch_size, steps):
-    assert default_steps(num_demos, num_samples, batch_size) == steps
+def test_without_a_length_training_has_the_papers_epochs_over_all_demonstrations(num_demos, num_samples, batch_size, steps):
+    assert planned_steps(TrainArgs(demos=()), num_demos, num_samples, batch_size) == steps
     epochs = steps / -(-num_samples // batch_size)
     assert epochs * num_demos == PAPER_EPOCHS
+
+
+@pytest.mark.parametrize(("length", "steps"), [(dict(), 30 * 263), (dict(min_steps=9000), 9000), (dict(steps=7), 7)])
+def test_a_length_in_epochs_counts_unless_that_is_fewer_steps_than_wanted_or_steps_are_given(length, steps):
+    args = TrainArgs(demos=(), epochs=30, **length)
+    assert planned_steps(args, 50, 4200, 16) == steps
 
 
 @pytest.mark.parametrize(
@@ -43,6 +49,8 @@ def test_default_steps_are_the_papers_epochs_over_all_demonstrations(num_demos, 
         (dict(num_demos=-1), "--num-demos -1 must be at least 1"),
         (dict(batch_size=0), "--batch-size 0 must be at least 1"),
         (dict(steps=0), "--total-iters 0 must be at least 1"),  # not the paper's number of steps
+        (dict(epochs=0), "--epochs 0 must be at least 1"),
+        (dict(min_steps=0), "--min-iters 0 must be at least 1"),
         (dict(save_freq=0, eval_freq=5), "--save-freq 0 must be at least 1"),
         (dict(keep=-2), "--keep -2 must be at least 1"),
         (dict(eval_freq=0), "--eval-freq 0 must be at least 1"),
