@@ -104,6 +104,20 @@ def test_a_reading_that_is_no_number_breaks_its_bound_wherever_it_is():
     assert [check.holds for check in checks] == [False] * 5 + [True] * 2
 
 
+@pytest.mark.parametrize("entry", range(4))
+def test_one_bad_reading_among_good_ones_breaks_its_bound(entry):
+    load = np.array([10.0, 1.0, -2.0, 0.01])
+    good = Reading("ball, 10 mm", load, load, load, 0.0, 1.0)
+    off = np.zeros(4)
+    off[entry] = 0.0075 if entry == 3 else 0.15  # 0.75 mm, or 1.5 % of the normal load
+    loop = np.array([(0, 0), (10, 10), (0, 0)], float)
+    for bad, holds in ((load + 0.5 * off, True), (load + off, False), (load - off, False)):
+        readings = [good, replace(good, reported=bad), good]
+        found = Measurements(readings, [], loop, np.array([(1.0, 1e-4, 1e-4)]))
+        checks = checks_of(found, task_sensor("digit", "a", "b", {}, {}))
+        assert all(check.holds for check in checks) is holds
+
+
 def test_area_of_a_loop():
     loop = np.array([(0, 0), (5, 5), (10, 10), (5, 7), (0, 0)], float)
     assert loop_area(loop) == pytest.approx((0.5 * 10 * 2) / 50)

@@ -13,6 +13,7 @@ from manifeel_ms3.sensors import (
     OpticsConfig,
     TouchRandomization,
     gelsight_r15,
+    pad_pose,
     sensor_config,
     sensor_names,
     with_options,
@@ -106,6 +107,16 @@ def test_sensors_by_name():
     assert digit.gel.max_sag == pytest.approx(0.005, rel=1e-3)  # TACTO's
     with pytest.raises(UnknownNameError, match=r"choose from \['gelsight_r15', 'gelsight_mini', 'digit'"):
         sensor_config("biotac", "a", "b")
+
+
+def test_a_pads_pose_has_its_normal_and_the_fingertip_where_it_is_told():
+    pose = pad_pose(facing=(0, -2, 0), tip=(0.3, 0.5, 0.3), at=(0.01, 0.02, 0.03)).to_transformation_matrix()
+    assert pose[:3, 2] == pytest.approx([0, -1, 0], abs=1e-6)
+    assert pose[:3, 1] == pytest.approx([np.sqrt(0.5), 0, np.sqrt(0.5)], abs=1e-6)
+    assert pose[:3, 0] == pytest.approx(np.cross(pose[:3, 1], pose[:3, 2]), abs=1e-6)
+    assert pose[:3, 3] == pytest.approx([0.01, 0.02, 0.03])
+    with pytest.raises(InvalidArgumentError, match="at an angle to each other"):
+        pad_pose(facing=(0, 0, 1), tip=(0, 0.1, 1), at=(0, 0, 0))
 
 
 def test_sag_is_that_of_a_sphere():

@@ -8,6 +8,7 @@ from scipy.integrate import trapezoid
 
 from manifeel_ms3.sensors import ImperfectionConfig, sensor_config
 from manifeel_ms3.sensors.depth.raycast import MeshRays
+from manifeel_ms3.sensors.draws import uniform_draws
 from manifeel_ms3.sensors.imperfections import Imperfections
 from manifeel_ms3.sensors.touch_model import OUTPUTS, TouchModel
 
@@ -178,6 +179,12 @@ def test_an_episode_draws_its_own_amounts_from_its_seed():
         assert np.array_equal(values[0], drawn[name][7]), name
         if name != "delay":
             assert not np.array_equal(drawn[name][6], drawn[name][7]), name
+
+
+def test_streams_and_seeds_of_draws_are_independent():
+    draws = np.stack([uniform_draws(np.arange(2000), stream, 1)[:, 0] for stream in (0, 1, 16)])
+    assert np.abs(np.corrcoef(draws) - np.eye(3)).max() < 0.1
+    assert np.abs(np.corrcoef(draws[:, 1:], draws[:, :-1]) - np.eye(6)).max() < 0.1
 
 
 def test_reset_forgets_in_the_reset_pads_alone():

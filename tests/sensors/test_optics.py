@@ -138,6 +138,43 @@ def test_shadow_darkens_behind_the_bump_and_nowhere_else(optics):
         assert (away * torch.as_tensor(optics._to_light.numpy()[channel])).sum() < -1
 
 
+def middle_of(weight: torch.Tensor) -> torch.Tensor:
+    """Centroid (2,) of weights (240, 320), as row and column from the middle of the image, pixels."""
+    axes = [torch.arange(n, dtype=weight.dtype) - (n - 1) / 2 for n in weight.shape]
+    return torch.stack([weight.sum(1) @ axes[0], weight.sum(0) @ axes[1]]) / weight.sum()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_drawn_turn_of_the_lights_turns_colours_and_shadows_together(optics, seed):
+    options = {"randomization.light_phase": 2.5}
+    bare, shaded = make_optics(**options), make_optics(**options, **{"optics.shadow": 0.5})
+    surface = optics.surface(ball(0.003, 1.2e-3))
+    for one in (bare, shaded):
+        one.reset(torch.arange(1), np.array([seed]))
+    unturned, picture, dark = (one.shade(surface)[0].double() for one in (optics, bare, shaded))
+    (turn,) = bare.config.randomization.draw_lights(np.array([seed]))[1]
+    assert abs(turn) > 0.2
+    for channel in range(3):
+        flat = background(optics)[..., channel].double()
+        at = [middle_of((image[..., channel] - flat).clamp(min=0)) for image in (unturned, picture)]  # the lit side of the bump
+        angles = [torch.atan2(place[1], place[0]).item() for place in at]
+        off = (angles[1] - angles[0] + turn + np.pi) % (2 * np.pi) - np.pi
+        assert abs(off) < 0.35, channel
+        behind = middle_of((picture - dark)[..., channel])
+        assert behind @ at[1] < 0, channel
+
+
+def test_sensors_have_their_own_colours():
+    r15, mini, digit = (sensor_config(name, "a", "b").optics for name in ("gelsight_r15", "gelsight_mini", "digit"))
+    assert (r15.lights, mini.lights) == (None, None)
+    untouched = [Shader.load(Path(one.calibration)).background[:, 0] for one in (r15, mini)]  # grey levels in the middle
+    assert np.abs(untouched[0] - untouched[1]).max() > 5
+    red, green, blue = digit.lights.lamps
+    for lamp, colour, degrees in ((red, (1, 0, 0), 30), (green, (0, 1, 0), 150), (blue, (0, 0, 1), 270)):
+        assert lamp.colour == colour
+        assert np.rad2deg(np.arctan2(lamp.position[1], lamp.position[0])) % 360 == pytest.approx(degrees)
+
+
 def dots(image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Middles (n, 2), as column and row, and areas (n,) of the dark dots of an image, in pixels."""
     _, _, stats, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))

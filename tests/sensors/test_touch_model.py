@@ -86,6 +86,30 @@ def test_randomised_gel_sinks_otherwise_under_the_same_force():
     assert seen["force_field"][..., 0].sum((1, 2)).tolist() == pytest.approx([5.0] * 8, rel=1e-5)
 
 
+def test_randomised_friction_bounds_the_shear_of_each_pad():
+    """Under more shear than friction holds, a field carries the friction coefficient times the load."""
+    drawn = {"randomization.stiffness": 0.3, "randomization.friction": 0.2}
+    pads = TouchModel(with_options(CONFIG, drawn), 4, CPU, ("force_field",))
+    pads.reset(torch.arange(4), np.arange(4))
+    load = torch.tensor([[9.0, 0, -5.0, 0, 0, 0]], dtype=torch.float64).repeat(4, 1)
+    seen = pads.observe(pressed([meshes()[2]] * 4), load)["force_field"].sum((1, 2))
+    _, friction = pads.config.randomization.draw_gels(np.arange(4))
+    assert np.ptp(friction) > 0.05
+    assert (seen[:, 1] / 5.0).tolist() == pytest.approx(CONFIG.gel.friction * friction, rel=0.01)
+
+
+def test_a_penetration_is_cut_at_its_limit_and_the_force_is_not():
+    plain, cut = model(1), model(1, **{"gel.max_penetration": 3e-4})
+    seen, limited = (pad.observe(pressed(meshes()[:1]), LOADS[:1]) for pad in (plain, cut))
+    assert seen["penetration"].max() > 1e-3
+    assert limited["penetration"].max().item() == pytest.approx(3e-4, rel=1e-3)
+    assert torch.equal(limited["force_field"], seen["force_field"])
+    levels = (cut.optics.levels + 0.5).to(torch.uint8)
+    middle = (slice(100, 140), slice(140, 180))  # the plateau of what is pressed in deeper than the limit
+    assert torch.equal(limited["rgb"][0][middle], levels[middle])
+    assert not torch.equal(seen["rgb"][0][middle], levels[middle])
+
+
 def test_only_what_is_asked_for_is_computed():
     depth = pressed(meshes()[:1])
     looked, heights = [], depth.heights
