@@ -8,7 +8,7 @@ from mani_skill.utils.wrappers.flatten import FlattenObservationWrapper
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper, PadsAsCamerasWrapper
+from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper, PadsAsCamerasWrapper, resized
 from tests.tasks_and_marks import needs_renderer
 
 SMALL = dict(sensor_configs=dict(width=64, height=64))
@@ -43,6 +43,26 @@ def test_images_are_resized_and_joined_for_scripts_that_know_cameras_alone(make_
     assert (obs["rgb"].shape, obs["rgb"].dtype) == ((1, 48, 48, 6), torch.uint8)
     tacrgb = env.unwrapped.get_obs()["sensor_data"]["tactile_right"]["rgb"].float()
     assert obs["rgb"][..., 3:].float().mean((1, 2)) == pytest.approx(tacrgb.mean((1, 2)), abs=1.0)
+
+
+@pytest.mark.parametrize("left_out", [("tacrgb", "depth"), ("tacff", "rgb"), ("state",)])
+def test_what_is_not_asked_for_is_left_out(make_env, left_out):
+    wrapper = FlattenVisuotactileObservationWrapper(make_env(**TOUCH), **dict.fromkeys(left_out, False))
+    image, field = torch.zeros(1, 4, 4, 3), torch.zeros(1, 10, 14, 3)
+    sensors = dict(wrist=dict(rgb=image, depth=image[..., :1]), tactile_right=dict(rgb=image, force_field=field))
+    obs = wrapper.observation(dict(sensor_data=sensors, extra=dict(tcp_pose=torch.zeros(1, 7))))
+    assert set(obs) == {"state", "rgb", "depth", "tacrgb", "tacff"} - set(left_out)
+
+
+def test_a_smaller_image_is_what_it_was_side_up():
+    image = torch.arange(4 * 6 * 3, dtype=torch.uint8).view(4, 6, 3)
+    large = image.repeat_interleave(10, dim=0).repeat_interleave(10, dim=1)[None]
+    small = resized(large, (4, 6))
+    assert small.dtype == torch.uint8
+    assert (small[0, 1:3, 1:5].int() - image[1:3, 1:5].int()).abs().max() <= 1  # the filter reaches into the neighbours
+    assert torch.equal(resized(image[None], (4, 6)), image[None])
+    square = resized(large[:, :, :40], (4, 4))[0].int()
+    assert (square[1:3, 1:3] - image[1:3, 1:3].int()).abs().max() <= 1
 
 
 def test_touch_joins_the_state_in_one_vector(make_env):

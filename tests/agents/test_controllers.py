@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.agents import PandaGelSight
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.errors import InvalidArgumentError
 
 ACTION_DIMS = {
@@ -74,6 +75,21 @@ def test_target_is_precise_in_the_air(env):
     assert np.linalg.norm(after - before) < 1e-5  # it neither sags nor creeps
 
 
+def test_the_next_action_is_relative_to_a_target_that_leads_by_6_millimetres_and_0_04_radians_at_most(env):
+    env.reset(seed=0)
+    settle(env)
+    place, facing = tool(env)
+    arm = env.unwrapped.agent.controller.controllers["arm"]
+    for distance, angle in ((0.1, 0.8), (0.004, 0.03)):
+        target = Rotation.from_rotvec([0.0, 0.6 * angle, 0.8 * angle]) * facing
+        pose = np.r_[place + distance * np.array([0.6, 0.0, -0.8]), target.as_quat()[[3, 0, 1, 2]]]
+        arm.set_state(dict(target_pose=torch.tensor(pose[None], dtype=torch.float32)))
+        raw = arm.commanded_pose.raw_pose[0].double().numpy()
+        lead, turn = raw[:3] - place, Rotation.from_quat(raw[[4, 5, 6, 3]]) * facing.inv()
+        assert lead == pytest.approx(min(distance, 0.006) * np.array([0.6, 0.0, -0.8]), abs=1e-6)
+        assert turn.as_rotvec() == pytest.approx(min(angle, 0.04) * np.array([0.0, 0.6, 0.8]), abs=1e-5)
+
+
 def test_target_lead_limit_bounds_the_force_however_long_one_pushes(env):
     env.reset(seed=2)
     down = -np.eye(6)[2]
@@ -93,10 +109,9 @@ def test_yaw_mode_turns_about_the_vertical_alone(make_env):
     env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_delta_yaw")
     env.reset(seed=0)
     _, facing = tool(env)
-    for _ in range(4):
-        env.step(np.array([0, 0, 0, 1.0, -1.0]))
-    for _ in range(8):
-        env.step(np.array([0, 0, 0, 0, -1.0]))
+    turning, still = (dict(yaw=rate, gripper=-1.0) for rate in (1.0, 0.0))
+    for motion in [turning] * 4 + [still] * 8:
+        env.step(np.array([motion.get(axis, 0.0) for axis in ACTION_AXES["pd_ee_delta_yaw"]]))
     _, turned = tool(env)
     assert (turned * facing.inv()).as_rotvec() == pytest.approx([0, 0, 0.2], abs=4e-3)
 
@@ -196,6 +211,20 @@ def test_lower_ends_of_the_ranges_are_those_of_the_actions(make_env):
     assert env.action_space.high == pytest.approx([config.pos_upper] * 3 + [config.rot_upper] * 3)
     with pytest.raises(TypeError, match="pos_lower"):
         type(config)(config.joint_names, stiffness=1.0, damping=1.0, pos_lower=-0.5)
+
+
+@pytest.mark.parametrize("mode", ["pd_joint_delta_pos_fixed_gripper", "pd_joint_target_delta_pos_fixed_gripper"])
+def test_a_joint_delta_is_a_tenth_of_a_radian_from_the_target_or_from_where_the_joint_is(make_env, mode):
+    env = make_env(obs_mode="none", render_backend="none", control_mode=mode)
+    env.reset(seed=0)
+    start = env.unwrapped.agent.robot.get_qpos()[0, :7].numpy().copy()
+    for action in [np.eye(7)[6]] * 3 + [np.zeros(7)] * 12:
+        env.step(action)
+    moved = env.unwrapped.agent.robot.get_qpos()[0, :7].numpy() - start
+    if "target" in mode:
+        assert moved == pytest.approx(0.3 * np.eye(7)[6], abs=2e-3)
+    else:  # each step, and the first one at rest, gives up what the joint lags behind
+        assert 0.1 < moved[6] < 0.27
 
 
 def test_joint_targets_are_reached(make_env):

@@ -5,6 +5,7 @@ import pytest
 
 from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import BallSortingExpert, make_expert
+from manifeel_ms3.experts.skills import perceived_position
 from manifeel_ms3.sensors.depth.surfaces import RELIEF
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.tasks_and_marks import PEG
@@ -42,6 +43,35 @@ def test_expert_feels_the_rim(make_env):
     for _, action in zip(range(120), expert.actions(), strict=False):
         *_, info = env.step(action)
     assert not info["success"].any()
+
+
+def test_a_demonstrator_sees_a_part_up_to_a_millimetre_and_a_half_beside_its_place(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    socket, rng = env.unwrapped.socket, np.random.default_rng(0)
+    errors = np.array([perceived_position(socket, rng) for _ in range(400)]) - socket.pose.p[0].numpy()
+    distance = np.linalg.norm(errors[:, :2], axis=1)
+    assert np.abs(errors[:, 2]).max() < 1e-6
+    assert 1.4e-3 < distance.max() <= 1.5e-3 + 1e-6
+    assert np.median(distance) == pytest.approx(1.5e-3 / np.sqrt(2), rel=0.1)  # even over the disc
+    assert np.abs(errors.mean(0)).max() < 1e-4
+
+
+@pytest.mark.parametrize("task", [PEG, "ManiFeel-NutBoltAssembly-v1", "ManiFeel-BallSorting-v1"])
+def test_a_demonstrator_errs_by_its_seed(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none")
+
+    def first_actions(seed: int) -> np.ndarray:
+        env.reset(seed=0)
+        done = []
+        for _, action in zip(range(8), make_expert(task, env.unwrapped, seed).actions(), strict=False):
+            done.append(action)
+            env.step(action)
+        return np.array(done)
+
+    first = first_actions(1)
+    assert np.array_equal(first_actions(1), first)
+    assert not np.array_equal(first_actions(2), first)
 
 
 SHORT_TASKS = sorted(set(all_tasks()) - {PEG, *LONG_TASKS})  # the long ones: below, and in the replays of their samples

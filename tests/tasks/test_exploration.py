@@ -9,7 +9,7 @@ from manifeel_ms3.experts.skills import Skills
 from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_HEIGHT
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS
-from manifeel_ms3.tasks.placement import POINTING_DOWN
+from manifeel_ms3.tasks.placement import POINTING_DOWN, WORKSPACE_XY
 from tests.tasks_and_marks import needs_renderer
 
 SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
@@ -31,6 +31,32 @@ def test_only_the_golf_ball_lifted_alone_counts(make_env, golf, tennis, goal):
     lift(base.golf, golf)
     lift(base.tennis, tennis)
     assert bool(base.goal_reached(base.measure())) is goal
+
+
+def test_a_ball_fails_when_it_lies_on_the_table(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for ball in (base.golf, base.tennis):
+        seated = ball.pose
+        for over_table, fails in ((0.0, True), (0.0045, True), (0.0055, False)):
+            ball.set_pose(Pose.create_from_pq(torch.tensor([[0.5, 0.3, BALL_RADIUS + over_table]])))
+            assert bool(base.failed(base.measure())) is fails
+        ball.set_pose(seated)
+    assert not base.failed(base.measure())
+
+
+def test_a_ball_is_grasped_by_both_pads(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    at_pad = base.agent.gels["right"].pose * Pose.create_from_pq(torch.tensor([[0.0, 0.0, BALL_RADIUS - 4e-4]]))
+    base.golf.set_pose(at_pad)
+    base.scene.step()
+    forces = {side: base.scene.get_pairwise_contact_forces(gel, base.golf).norm() for side, gel in base.agent.gels.items()}
+    assert forces["right"] > 1.0  # N
+    assert forces["left"] == 0
+    assert not base.agent.is_grasping(base.golf)
 
 
 def test_balls_swap_and_rest_in_their_seats(make_env):
@@ -101,6 +127,35 @@ def test_battery_must_be_lifted(make_env, height, goal):
     assert bool(base.goal_reached(base.measure())) is goal
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize(
+    ("aside", "height", "fails"), [(0.168, 0.0, False), (0.172, 0.0, True), (-0.172, 0.0, True), (0.172, 0.021, False)]
+)
+def test_a_battery_fails_outside_the_container_unless_it_is_lifted(make_env, axis, aside, height, fails):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    place = base.battery.pose.p.clone()
+    place[:, :2] = torch.tensor(WORKSPACE_XY)
+    place[:, axis] += aside
+    place[:, 2] += height
+    base.battery.set_pose(Pose.create_from_pq(place))
+    assert bool(base.failed(base.measure())) is fails
+
+
+@pytest.mark.parametrize(("height", "success"), [(0.119, False), (0.121, True), (0.199, True), (0.201, False)])
+def test_the_papers_success_is_a_distance_of_the_battery(make_env, height, success):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    for aside in (0.0, 0.07):  # of the container's own position, 10 mm over the table
+        up = np.sqrt(height**2 - aside**2)
+        base.battery.set_pose(Pose.create_from_pq(torch.tensor([[0.5, aside, 0.01 + up]], dtype=torch.float32)))
+        measures = base.measure()
+        assert float(measures["distance"]) == pytest.approx(height, abs=1e-6)
+        assert bool(base.paper_goal_reached(measures)) is success
+
+
 @needs_renderer
 def test_front_camera_cannot_see_into_the_container_unless_its_front_is_left_out(make_env):
     for occlusion in (True, False):
@@ -141,7 +196,15 @@ def test_a_ball_over_or_beside_its_bowl_is_not_in_it(make_env, height, aside, go
         (x, y), _ = BOWLS[ball]
         place = torch.tensor([[x + aside, y, BOWL_FLOOR + BALL_RADIUS + height]])
         getattr(base, ball).set_pose(Pose.create_from_pq(place))
-    assert bool(base.goal_reached(base.measure())) is goal
+    measures = base.measure()
+    assert bool(base.goal_reached(measures)) is goal
+    away = np.hypot(height, aside)
+    assert [measures[f"{ball}_to_bowl"].item() for ball in ("golf", "tennis")] == pytest.approx([away, away], abs=1e-6)
+    info = measures | dict(success=torch.tensor([goal]))
+    reward = base.compute_dense_reward(None, None, info)
+    assert reward.item() == pytest.approx(3 * (1 - np.tanh(4 * away)) + goal, abs=1e-5)
+    info["tennis_to_bowl"] = info["tennis_to_bowl"] + 0.1  # each ball counts
+    assert base.compute_dense_reward(None, None, info) < reward - 0.3
 
 
 def test_a_ball_counts_when_the_hand_has_let_go_of_it(make_env):

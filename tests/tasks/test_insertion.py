@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit, usb_fit
+from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X
 from manifeel_ms3.geometry.part import Cylinder, Hulls
 from manifeel_ms3.geometry.plugs import PEG_SOCKETS
 from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
@@ -25,6 +26,15 @@ FITS = {
     "ManiFeel-GearAssembly-v1": gear_fit,
 }
 TASKS = (*FITS, "ManiFeel-PegReorientation-v1")
+LIMITS = {
+    PEG: (1e-3, 9e-3),
+    "ManiFeel-USBInsertion-v1": (1.83e-3, 8e-3),
+    "ManiFeel-PowerPlugInsertion-v1": (2.5e-3, 7e-3),
+    "ManiFeel-GearAssembly-v1": (1e-3, 8e-3),
+    "ManiFeel-PegReorientation-v1": (1.5e-3, 30e-3),
+}
+"""By task: the largest gap at success, 1 mm or a tenth of the way in, and the largest mean distance of the key points at which
+the paper's public code counts a success, in m (docs/tasks.md)."""
 BEYOND_PLAY = {"paper": 7.2e-4, "tight": 2.2e-4}
 """Shift of a seated plug, in m, that is more than the play of every pair of parts."""
 
@@ -71,6 +81,31 @@ def test_near_misses_are_not_the_goal(env, miss, offset, depth, tilt):
     env.reset(seed=0)
     _, reached = measures_with_plug_at(env, (*offset, depth * env.unwrapped.fit.depth), tilt)
     assert not reached, miss
+
+
+@pytest.mark.parametrize(("share", "reached"), [(0.95, True), (1.05, False)])
+def test_success_ends_at_the_limits_that_the_tasks_name(env, share, reached):
+    """The gap, the distance from the axis in every direction, and the tilt to both sides; the key points of the paper."""
+    env.reset(seed=0)
+    gap, threshold = LIMITS[env.unwrapped.spec.id.rpartition(":")[2]]
+    around = np.linspace(0, 2 * np.pi, 8, endpoint=False)
+    beside = [(share * 1e-3 * np.cos(angle), share * 1e-3 * np.sin(angle), 0.0) for angle in around]
+    for offset in ((0.0, 0.0, share * gap), *beside):
+        assert measures_with_plug_at(env, offset)[1] is reached, offset
+    for tilt in (3.0, -3.0):
+        assert measures_with_plug_at(env, (0, 0, 0), share * tilt)[1] is reached, tilt
+    measures, _ = measures_with_plug_at(env, (0, 0, share * threshold))
+    assert bool(env.unwrapped.paper_goal_reached(measures)) is reached
+
+
+@pytest.mark.parametrize(("share", "fails"), [(0.95, False), (1.05, True)])
+def test_a_plug_fails_when_it_is_30_millimetres_from_its_place_in_the_hand(env, share, fails):
+    env.reset(seed=0)
+    base = env.unwrapped
+    for direction in (*np.eye(3), *-np.eye(3)):
+        place = share * 0.03 * direction - [0.0, 0.0, base.fit.grip]
+        base.plug.set_pose(base.agent.tcp.pose * Pose.create_from_pq(torch.tensor(place[None]).float()))
+        assert bool(base.failed(base.measure())) is fails, direction
 
 
 def test_the_papers_success_is_the_mean_distance_of_four_key_points(make_env):
@@ -184,10 +219,28 @@ def test_gear_needs_its_neighbours_in_place(make_env):
     env.reset(seed=0)
     base = env.unwrapped
     assert measures_with_plug_at(env, (0, 0, 0))[1]
-    pose = base.neighbours["small"].pose.raw_pose.clone()
-    pose[:, 2] += 0.002
-    base.neighbours["small"].set_pose(Pose.create(pose))
-    assert not base.goal_reached(base.measure())
+    for actor in base.neighbours.values():
+        pose = actor.pose.raw_pose.clone()
+        for lifted, goal in ((0.0009, True), (0.0011, False)):
+            actor.set_pose(Pose.create(pose + pose.new_tensor([0.0, 0.0, lifted, 0.0, 0.0, 0.0, 0.0])))
+            assert bool(base.goal_reached(base.measure())) is goal
+        actor.set_pose(Pose.create(pose))
+
+
+def test_gears_stand_on_their_shafts_however_their_base_is_turned(make_env):
+    options = dict(randomization=dict(base_yaw=1.5))
+    env = make_env("ManiFeel-GearAssembly-v1", obs_mode="none", render_backend="none", **options)
+    turned = []
+    for seed in range(4):
+        _, info = env.reset(seed=seed)
+        base = env.unwrapped
+        for name, actor in base.neighbours.items():
+            place = (base.socket.pose.inv() * actor.pose).p[0].tolist()
+            assert place == pytest.approx([SHAFT_X[name], 0.0, BASE_SIZE[2]], abs=1e-3)
+        assert info["neighbours_off"].item() < 1e-3
+        quaternion = base.socket.pose.q[0].numpy()
+        turned.append(2 * np.arctan2(quaternion[3], quaternion[0]))
+    assert np.ptp(turned) > 0.5
 
 
 @pytest.mark.parametrize("name", PEG_SOCKETS)

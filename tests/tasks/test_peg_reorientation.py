@@ -33,12 +33,21 @@ def test_only_a_turned_peg_wins(env, hand_tilt, wins):
     base.agent.reset_tool(tool, base.fit.grip_width / 2 - GRIP_INDENTATION, GRIP_FORCE)
     base.agent.controller.controllers["arm"].reset()  # its target is where the arm is now
     base.plug.set_pose(raw_pose(middle, down))
-    for _ in range(8):
-        *_, info = env.step(np.zeros(6))
+    successes = [bool(env.step(np.zeros(6))[-1]["success"]) for _ in range(8)]
     measures = base.measure()
     assert InsertionEnv.goal_reached(base, measures).all()  # the peg is in and upright
     assert float(measures["hand_tilt"]) == pytest.approx(np.deg2rad(hand_tilt), abs=np.deg2rad(1.0))
-    assert bool(info["success"]) is wins
+    assert successes == [wins and step >= 5 for step in range(1, 9)]  # after 0.5 s at the goal
+
+
+def test_the_hand_must_be_upright_and_the_peg_turned_in_it(env):
+    env.reset(seed=0)
+    base = env.unwrapped
+    at_goal = {name: torch.zeros_like(values) for name, values in base.measure().items()}
+    for name, degrees in (("hand_tilt", 5.0), ("in_hand", 3.0), ("tilt", 3.0)):
+        for share, reached in ((0.95, True), (1.05, False)):
+            measures = at_goal | {name: torch.full_like(at_goal[name], np.deg2rad(share * degrees))}
+            assert bool(base.goal_reached(measures)) is reached, name
 
 
 def test_starts_are_those_of_the_public_code(env):

@@ -6,15 +6,24 @@ import torch
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.tasks.placement import POINTING_DOWN
+
 NUT, BULB = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"
 
 
 def goal_with_held_at(env, height: float, offset: float = 0.0, tilt_degrees: float = 0.0, torque: float | None = None) -> bool:
-    """Whether it is the goal with the held part's origin at `height` over the fixed part's underside."""
+    """Whether it is the goal with the held part's origin at `height` over the fixed part's underside; alike in every direction
+    of the offset."""
+    angles = np.linspace(0, 2 * np.pi, 4, endpoint=False)
+    (goal,) = {_goal_with_held_at(env, height, offset, angle, tilt_degrees, torque) for angle in angles}
+    return goal
+
+
+def _goal_with_held_at(env, height: float, offset: float, angle: float, tilt_degrees: float, torque: float | None) -> bool:
     base = env.unwrapped
     fixed = base.fixed.pose.raw_pose[0, :3].double().numpy()
     quaternion = Rotation.from_euler("x", tilt_degrees, degrees=True).as_quat()[[3, 0, 1, 2]]
-    place = torch.tensor((fixed + np.array([offset, 0, height]))[None]).float()
+    place = torch.tensor((fixed + np.array([offset * np.cos(angle), offset * np.sin(angle), height]))[None]).float()
     base.held.set_pose(Pose.create_from_pq(place, torch.tensor(quaternion[None]).float()))
     measures = base.measure()
     if torque is not None:
@@ -30,7 +39,9 @@ def goal_with_held_at(env, height: float, offset: float = 0.0, tilt_degrees: flo
         (0.0, 0.0, 0.0, False),  # resting on the bolt
         (-0.5, 0.0, 4.0, False),  # resting on it, askew
         (1.55, 0.0, 2.5, False),  # not square
-        (1.55, 0.002, 0.0, False),  # beside the axis
+        (1.55, 0.00095, 0.0, True),
+        (1.55, 0.00105, 0.0, False),  # beside the axis
+        (1.55, 0.0, 1.9, True),
         (20.0, 0.1, 0.0, False),  # on the table
     ],
 )
@@ -60,13 +71,36 @@ def test_nut_dropped_on_the_bolt_does_not_reach_the_goal(make_env):
 
 
 @pytest.mark.parametrize(
-    ("gap", "torque", "goal"),
-    [(0.0, 0.15, True), (0.0, 0.05, False), (0.0, 0.0, False), (0.0006, 0.15, False), (0.02, 0.15, False)],
+    ("gap", "torque", "offset", "goal"),
+    [
+        (0.0, 0.15, 0.0, True),
+        (0.0, 0.05, 0.0, False),
+        (0.0, 0.0, 0.0, False),
+        (0.0006, 0.15, 0.0, False),
+        (0.02, 0.15, 0.0, False),
+        (0.00045, 0.105, 0.0019, True),
+        (0.0, 0.15, 0.0021, False),
+    ],
 )
-def test_bulb_must_be_in_and_tight(make_env, gap, torque, goal):
+def test_bulb_must_be_in_and_tight(make_env, gap, torque, offset, goal):
     env = make_env(BULB, obs_mode="none", render_backend="none")
     env.reset(seed=0)
-    assert goal_with_held_at(env, env.unwrapped.screw.seated + gap, torque=torque) is goal
+    assert goal_with_held_at(env, env.unwrapped.screw.seated + gap, offset, torque=torque) is goal
+
+
+@pytest.mark.parametrize(
+    ("from_hand", "from_axis", "fails"), [(0.049, 0.03, False), (0.051, 0.03, True), (0.2, 0.0035, False), (0.2, 0.0045, True)]
+)
+def test_a_part_fails_when_it_is_out_of_the_hand_and_off_the_axis(make_env, from_hand, from_axis, fails):
+    env = make_env(NUT, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    away = torch.tensor([[0.0, from_axis, 0.0]])
+    base.held.set_pose(Pose.create_from_pq(base.fixed.pose.p + away + torch.tensor([[0.0, 0.0, 0.02]])))
+    over = base.held.pose.p + torch.tensor([[0.0, 0.0, from_hand]])
+    base.agent.reset_tool(Pose.create_from_pq(over, torch.tensor([POINTING_DOWN])))
+    assert torch.linalg.norm(base.agent.tcp.pose.p - over) < 1e-4
+    assert bool(base.failed(base.measure())) is fails
 
 
 @pytest.mark.parametrize("task", [NUT, BULB])

@@ -279,6 +279,66 @@ def test_dim_light_is_dim(make_env):
     assert ratio < 0.35
 
 
+@needs_renderer
+def test_dim_ball_sorting_is_dim_unless_it_is_asked_to_be_light(make_env):
+    levels = {}
+    for name, lighting in (("BallSorting", {}), ("BallSortingDim", {}), ("BallSortingDim", dict(lighting="normal"))):
+        env = make_env(f"ManiFeel-{name}-v1", obs_mode="rgb", sensor_configs=dict(width=32, height=32), **lighting)
+        levels[name, bool(lighting)] = env.reset(seed=0)[0]["sensor_data"]["front"]["rgb"].float().mean().item()
+    assert levels["BallSortingDim", False] < 0.35 * levels["BallSorting", False]
+    assert levels["BallSortingDim", True] == levels["BallSorting", False]
+
+
+@needs_renderer
+def test_cameras_stand_where_the_paper_has_them_and_look_30_degrees_down(make_env):
+    """Position and view in the base frame, or in the frame of the hand; x ahead and z up in SAPIEN's cameras."""
+    slant = np.array([np.cos(np.pi / 6), -np.sin(np.pi / 6)])
+    views = {"front": ((0.68, 0.0, 0.15), (-slant[0], 0.0, slant[1])), "side": ((0.5, -0.17, 0.17), (0.0, *slant))}
+    env = make_env(obs_mode="rgb", cameras=("front", "side", "wrist"), sensor_configs=dict(width=32, height=32))
+    env.reset(seed=0)
+    base = env.unwrapped
+    views["wrist"] = ((0.045, 0.0, 0.04), (slant[1], 0.0, slant[0]))  # along the fingers, and inward
+    frames = {name: sapien.Pose() for name in views} | dict(wrist=base.agent.robot.links_map["panda_hand"].pose.sp)
+    focal = 16 / np.tan(np.deg2rad(75) / 2)  # pixels
+    for name, (position, ahead) in views.items():
+        params = base.get_sensor_params()[name]
+        placed = frames[name].inv().to_transformation_matrix() @ params["cam2world_gl"][0].numpy()
+        assert placed[:3, 3] == pytest.approx(position, abs=1e-5), name
+        assert -placed[:3, 2] == pytest.approx(ahead, abs=1e-5), name  # OpenGL's cameras look along -z, y up
+        if name != "wrist":
+            assert placed[2, 1] == pytest.approx(slant[0], abs=1e-5), name
+        assert params["intrinsic_cv"][0, [0, 1], [0, 1]].tolist() == pytest.approx([focal, focal], rel=1e-5), name
+
+
+def test_contact_force_is_the_weight_at_rest_and_the_largest_force_of_a_step(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    assert env.reset(seed=0)[1]["contact_force"].item() == 0
+    base, still = env.unwrapped, np.zeros(6)
+    weight = 9.81 * base.plug.mass.item()
+    for _ in range(3):
+        *_, info = env.step(still)
+    assert info["contact_force"].item() == pytest.approx(weight, rel=0.03)
+    base.plug._bodies[0].add_force_torque([0.0, 0.0, 30.0], [0.0, 0.0, 0.0])  # in the first physics step alone
+    *_, info = env.step(still)
+    assert info["contact_force"] > 5 * weight
+    env.step(still)
+    *_, info = env.step(still)
+    assert info["contact_force"].item() == pytest.approx(weight, rel=0.03)
+
+
+def test_an_episode_without_a_seed_keeps_nothing_of_the_one_before(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    env.step(np.zeros(6))
+    base = env.unwrapped
+    base._steps_at_goal[:], base._success_paper[:] = 5, True
+    _, info = env.reset()
+    assert not info["success"]
+    assert not info["success_paper"]
+    assert info["contact_force"] == 0
+    assert info["elapsed_steps"] == 0
+
+
 def test_force_field_equals_the_wrench_and_the_weight(make_env):
     env = make_env(obs_mode="tacff", tactile_sensors=("left", "right"), render_backend="none")
     for seed in range(3):
@@ -418,8 +478,10 @@ def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):
     for _ in range(8):
         obs, *_ = env.step(np.zeros(env.action_space.shape, np.float32))
     assert pressing(obs) == 0
+    base._steps_at_goal[:] = 5
     base.set_state_dict(gripped)
     assert pressing(base.get_obs()) == pytest.approx(force, rel=0.01)
+    assert not base.evaluate()["success"]  # the peg is in the hand
 
 
 def test_a_gel_that_is_caught_from_behind_is_not_taken_for_one_on_the_wrong_side(make_env, monkeypatch, caplog):
