@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -69,16 +70,27 @@ def test_an_mp4_has_every_frame(tmp_path):
         assert video.count_frames() == 2 * (len(frames) + round(4 * END_SECONDS))
 
 
-@needs_renderer
-def test_a_file_of_states_alone_is_rendered_anew(tmp_path, capsys):
-    out = tmp_path / "peg.webp"
-    assert cli.main(["film", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524"]) == 0
+def last_frame(out: Path, *arguments: str) -> np.ndarray:
+    assert cli.main(["film", str(FILE), "--out", str(out), "--max-frames", "2", "--width", "524", *arguments]) == 0
     with Image.open(out) as video:
         assert video.size == (524, 260)
         video.seek(video.n_frames - 1)
-        last = np.asarray(video.convert("RGB")).astype(int)
-    touch = last[20:130, -150:]
+        return np.asarray(video.convert("RGB")).astype(int)
+
+
+@needs_renderer
+def test_a_file_of_states_alone_is_rendered_anew_from_the_camera_and_the_pad_that_are_asked_for(tmp_path, capsys):
+    usual = last_frame(tmp_path / "peg.webp")
+    touch = usual[20:130, -150:]
     assert touch.std() > 10  # TacRGB of a held peg is not one colour
+    other = last_frame(tmp_path / "other.webp", "--camera", "front", "--pad", "left")
+    places = dict(
+        scene=(slice(20, 260), slice(0, 240)), camera=(slice(40, 130), slice(250, 360)), pad=(slice(40, 130), slice(380, 520))
+    )
+    change = {name: np.abs(usual[place] - other[place]).mean() for name, place in places.items()}
+    assert change["scene"] < 3.0
+    assert change["camera"] > 10.0
+    assert change["pad"] > 1.0
 
 
 @pytest.mark.parametrize(
