@@ -87,8 +87,7 @@ def rows_of(submission: Submission) -> list[Row]:
     """The success of each condition of a submission, by the paper's protocol."""
     rows = []
     for condition, results in collect(submission.results.values()).items():
-        paths = _paths(submission, condition)
-        episodes = [episode for path in paths for episode in submission.results[path]["episodes"]]
+        paths, episodes = _paths(submission, condition), results.episodes
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
         limit, rerun = task_spec(condition.env_id).force_limit, rerun_of(submission, paths)

@@ -12,12 +12,14 @@ import pytest
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
-from manifeel_ms3.evaluation.result import read_result
+from manifeel_ms3.evaluation.floors import highest_floor
+from manifeel_ms3.evaluation.result import read_result, summary_of
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.checks import check
-from manifeel_ms3.leaderboard.page import rows_on
+from manifeel_ms3.leaderboard.page import rows_of, rows_on
 from manifeel_ms3.leaderboard.rerun import policy_sources
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
+from manifeel_ms3.tasks.registry import task_spec
 from tests.browser import browser_program
 from tests.leaderboard.made_up import made_up
 from tests.tasks_and_marks import PEG
@@ -196,6 +198,28 @@ def test_the_table_ranks_within_a_task(board):
     lines = [line for line in (board / "README.md").read_text().splitlines() if line.startswith("| ObjectS") or "Peg" in line]
     assert [re.findall(r"(\d+)% \[", line)[0] for line in lines] == ["40", "60", "20"]
     assert "2 x 2 x 50" in lines[0]
+
+
+def test_a_row_has_the_measures_of_the_episodes_of_its_success(tmp_path):
+    """Of 10 x 50 episodes, 100 succeed, half of them gently; an earlier checkpoint than the last ten counts for nothing."""
+    folder = made_up(tmp_path / "them", "Them", "PegInsertion", "rgb", 10, seeds=1, steps=11)
+    limit, times = task_spec(PEG).force_limit, iter(range(-49, 501))
+
+    def edit(result):
+        early = result["config"]["step"] == 100
+        for k, episode in enumerate(result["episodes"]):
+            force = limit if k < 5 or early else limit + 0.001 if k < 10 else 7.0
+            episode.update(peak_contact_force=force, inference_ms=float(max(next(times), 0)), success_at_end=k < 4)
+            episode["force_until_success"] = force if k < 10 else None
+        result |= summary_of(result["episodes"], limit)
+
+    for path in sorted((folder / "results").rglob("*.json")):
+        rewrite_json(path, edit)
+    (row,) = rows_of(read_submission(folder))
+    assert (row.success.value, row.gentle, row.results.success_at_end) == (0.2, 0.1, 0.08)
+    assert (row.force, row.inference_ms, row.rerun) == (7.0, 250.5, (0, 550))
+    assert (row.is_full, row.is_confirmed) == (False, False)
+    assert row.floor == highest_floor(PEG, task_spec(PEG).revision)
 
 
 def browsed(board: Path, address: str) -> str:
