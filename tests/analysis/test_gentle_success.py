@@ -41,10 +41,18 @@ def test_gentle_success_counts_the_same_episodes_as_success(runs):
 
 
 def test_the_page_of_results_has_the_column_and_the_figure(runs, tmp_path):
+    for path in runs.rglob("*.json"):
+        result = json.loads(path.read_text())
+        if result["obs_mode"] == VISION:  # results of earlier versions lack the threshold of the paper's public code
+            for k, episode in enumerate(result["episodes"]):
+                episode["success_paper"] = k < 30
+            path.write_text(json.dumps(result))
     page = page_of(runs, tmp_path / "results.md")
     header, _, *rows = page.split("## What was run\n\n")[1].splitlines()
     place = header.split(" | ").index("gentle success")
     assert [row.split(" | ")[place] for row in rows[:2]] == [f"20% up to {LIMIT:g} N", f"37% up to {LIMIT:g} N"]
+    place = header.split(" | ").index("by the paper's threshold")
+    assert [row.split(" | ")[place] for row in rows[:2]] == ["60%", ""]
     assert "(images/results_gentle.png)" in page
     assert cv2.imread(str(tmp_path / "images/results_gentle.png")).std() > 5
 

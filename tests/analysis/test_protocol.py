@@ -8,7 +8,7 @@ import pytest
 
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
 from manifeel_ms3.analysis.episode_endings import census_table
-from manifeel_ms3.analysis.estimates import _weights, difference, holm, mean_success
+from manifeel_ms3.analysis.estimates import _weights, difference, has_enough_seeds, holm, mean_success, resampled_success
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.tasks.registry import task_spec
@@ -234,6 +234,24 @@ def test_initial_states_are_compared_one_by_one(rng):
     found, p = difference(first, second)
     assert found.low > 0
     assert p < 0.01
+
+
+def test_conditions_of_a_task_are_resampled_with_the_same_initial_states_and_training_seeds_of_their_own(rng):
+    """Two conditions that depend on the state alone, or on the seed alone: alike in every resample, or independent."""
+    by_start = np.broadcast_to(rng.random(50) < 0.4, (3, 10, 50)).astype(float)
+    by_seed = np.broadcast_to(np.array([0.0, 0.0, 1.0])[:, None, None], (3, 10, 50))
+    starts, seeds = (ConditionResults(success, list(range(50))) for success in (by_start, by_seed))
+    same, again, elsewhere, first, second = resampled_success(
+        [("Peg", starts), ("Peg", starts), ("Gear", starts), ("Peg", seeds), ("Peg", seeds)]
+    )
+    assert np.allclose(same, again)
+    for one, other in ((same, elsewhere), (first, second), (same, first)):
+        assert abs(np.corrcoef(one, other)[0, 1]) < 0.1
+
+
+def test_a_difference_says_something_about_training_only_if_both_conditions_have_enough_seeds(rng):
+    many, few = runs(rng, 0.5, seeds=3), runs(rng, 0.5, seeds=2)
+    assert [has_enough_seeds(*pair) for pair in ((many, many), (many, few), (few, many))] == [True, False, False]
 
 
 def test_outcomes_that_never_varied_have_an_interval():

@@ -1,5 +1,7 @@
 """Ranks are compared as scipy and SimplerEnv do, and appear on the page of results once there is something to rank."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -70,4 +72,11 @@ def test_tables_whose_conditions_do_not_differ_in_what_they_compare_are_not_rank
     assert "| I | paper | within tasks | 3 |" in page
     assert "| II | " not in page
     write_run(tmp_path, MODES[0], 0.4, task="GearAssembly", policy="flow_matching")
-    assert "| II | paper | within tasks | 4 |" in page_of(tmp_path)
+    page = page_of(tmp_path)
+    assert "| II | paper | within tasks | 4 |" in page
+    table = page.partition("### Table II, ")[2].partition("\n##")[0]
+    rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| GearAssembly | ")]
+    shown = {
+        policy: [re.sub(r"[\[\]]", "", cell).split("%")[0].split(" / ")[0] for cell in cells[:3]] for _, policy, *cells in rows
+    }
+    assert shown == dict(diffusion_policy=["20", "30", "60"], flow_matching=["40", "not run", "not run"])

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from baselines.common.dataset import SequenceDataset, read_episodes, recorded_env_kwargs
-from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped
+from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped, network_images
 from baselines.common.normalizer import ActionNormalizer, Normalizer
 from baselines.common.observation import POSE, WORK_SQUARES, observation_spec, prepare, quaternion_pose, rotation_6d_pose
 from baselines.common.policy import PolicyConfig, make_action_network
@@ -131,7 +131,9 @@ def test_a_network_of_any_size_that_is_accepted_keeps_the_shape_of_actions():
 
 def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
-    assert len(read_episodes([demos, demos], PEG, SPEC, 3)) == 3
+    recorded = [len(episode["actions"]) for episode in read_demonstrations(demos, [])]
+    assert recorded[0] != recorded[1]
+    assert [len(episode["actions"]) for episode in read_episodes([demos, demos], PEG, SPEC, 3)] == [*recorded, recorded[0]]
     with pytest.raises(DemonstrationError, match="9 demonstrations are wanted, but the files hold"):
         read_episodes([demos], PEG, SPEC, 9)
 
@@ -314,6 +316,11 @@ def test_encoder_sees_every_modality(name):
     for key in obs:
         changed = encoder(obs | {key: obs[key].flip(2)})
         assert not torch.allclose(changed, features)
+    alone = encoder({key: values[1:] for key, values in obs.items()})
+    torch.testing.assert_close(features[1:], alone, rtol=1e-4, atol=1e-5)
+    first, second = features.view(2, 2, -1).unbind(1)  # the steps of a window, in their order
+    swapped = encoder({key: values.flip(1) for key, values in obs.items()}).view(2, 2, -1)
+    torch.testing.assert_close(swapped, torch.stack([second, first], 1), rtol=1e-4, atol=1e-5)
 
 
 def test_crops_are_random_in_training_and_central_in_evaluation():
@@ -327,6 +334,29 @@ def test_crops_are_random_in_training_and_central_in_evaluation():
     assert not torch.equal(crops, central)
     windows = images[0, 0].unfold(0, 48, 1).unfold(1, 48, 1).permute(0, 1, 3, 4, 2).reshape(-1, 48, 48, 3)
     assert (windows == crops[0, 0]).flatten(1).all(1).any()
+
+
+def test_an_encoder_crops_at_random_in_training_and_in_the_centre_in_evaluation():
+    spec, small = (observation_spec("rgb", ("wrist",), (), size) for size in (32, 24))
+    config = dict(image="small_cnn", image_features=8)
+    encoder = ObservationEncoder(EncoderConfig(**config, crop=24), spec, 1)
+    alike = ObservationEncoder(EncoderConfig(**config), small, 1)  # takes images that are cropped already
+    alike.load_state_dict(encoder.state_dict())
+    torch.manual_seed(0)
+    images, poses = torch.randint(0, 255, (6, 1, 32, 32, 3), dtype=torch.uint8), torch.zeros(6, 1, 7)
+    expected = alike({spec.images[0]: images[:, :, 4:28, 4:28], POSE: poses})
+    observed = {spec.images[0]: images, POSE: poses}
+    torch.testing.assert_close(encoder.eval()(observed), expected)
+    first, second = (encoder.train()(observed) for _ in range(2))
+    assert not torch.allclose(first, second)
+
+
+def test_networks_take_colours_in_their_order_from_minus_one_to_one():
+    images = torch.zeros(2, 1, 20, 30, 3, dtype=torch.uint8)
+    images[1, 0, 3, 5] = torch.tensor([255, 51, 0])
+    seen = network_images("sensor_data/wrist/rgb", images, crop=0, at_random=True)
+    assert (seen.shape, seen.unique().tolist()) == ((2, 3, 20, 30), pytest.approx([-1.0, -0.6, 1.0]))
+    assert seen[1, :, 3, 5].tolist() == pytest.approx([1.0, -0.6, -1.0])
 
 
 @pytest.mark.parametrize(
@@ -381,6 +411,8 @@ def test_action_networks_map_actions_to_noise_and_use_step_and_condition(kind):
     assert out.shape == actions.shape
     assert not torch.allclose(out, net(actions, torch.tensor([1, 51, 98]), condition))
     assert not torch.allclose(out, net(actions, torch.tensor([0, 50, 99]), -condition))
+    alone = net(actions[1:2], torch.tensor([50]), condition[1:2])
+    torch.testing.assert_close(out[1:2], alone, rtol=1e-4, atol=1e-5)
 
 
 def test_papers_unet_has_the_published_channels():

@@ -207,6 +207,26 @@ def test_what_touch_feels_matters_and_does_not_turn(policy):
     assert torch.allclose(change, change[:, :1].expand_as(change), atol=1e-6)  # alike in every frame
 
 
+@pytest.mark.parametrize("policy", ["small_cnn"], indirect=True)
+def test_each_row_of_a_batch_has_its_own_answer(policy):
+    """Windows, steps and actions of a batch are not mixed up between the frames of the eight rotations."""
+    windows = [observation(poses_of(8)[[k, k + 1]], smooth_picture(48, k), smooth_picture(48, k + 9)) for k in range(3)]
+    for k, window in enumerate(windows):
+        window[PAD] = window[PAD].roll(k, dims=2)
+        window[SPEC.force_fields[0]] = window[SPEC.force_fields[0]].roll(k, dims=2)
+    together = {key: torch.cat([window[key] for window in windows]) for key in windows[0]}
+    actions, steps = torch.randn(3, 16, 6), torch.tensor([1, 4, 9])
+    with torch.no_grad():
+        conditions = policy.condition(together)
+        predicted = policy.action_network(actions, steps, conditions)
+        for k, window in enumerate(windows):
+            alone = policy.condition(window)
+            torch.testing.assert_close(conditions[k : k + 1], alone, rtol=1e-4, atol=1e-5)
+            answer = policy.action_network(actions[k : k + 1], steps[k : k + 1], alone)
+            torch.testing.assert_close(predicted[k : k + 1], answer, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(conditions[0], conditions[1], rtol=0.01)
+
+
 def test_actions_of_an_unknown_size_are_refused(policy):
     with pytest.raises(ValueError, match="ACTION_PAIRS"):
         EquivariantDiffusionPolicy(policy.config, SPEC, action_dim=4)

@@ -4,13 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
+from baselines.common.checkpoint import read_tensors
+from baselines.diffusion_policy import train as diffusion
+from baselines.studies import half_precision
 from baselines.studies.publish import publish
 from baselines.studies.study import Job
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS
 from manifeel_ms3.paths import CHECKPOINTS
 from tests.analysis.made_up import write_run
+from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 
 def finished(root: Path, title: str, **run) -> Job:
@@ -26,6 +31,21 @@ def finished(root: Path, title: str, **run) -> Job:
         (checkpoint / name).write_text(title)
     (folder / "done.json").write_text(json.dumps(dict(settings=job.settings)))
     return job
+
+
+def test_what_is_published_is_rounded_to_half_precision_without_the_state_of_training_and_local_paths(tmp_path):
+    checkpoint = save_tiny_checkpoint(tmp_path / "checkpoint")
+    config = json.loads((checkpoint / CONFIG).read_text()) | dict(demos=["/home/me/peg.h5"], run_dir="/home/me/run")
+    (checkpoint / CONFIG).write_text(json.dumps(config))
+    copy = half_precision.main(half_precision.Args(checkpoint, tmp_path / "copy"))
+    assert {path.name for path in copy.iterdir()} == {WEIGHTS, CONFIG}
+    whole, rounded = (read_tensors(folder / WEIGHTS) for folder in (checkpoint, copy))
+    assert whole.keys() == rounded.keys()
+    assert all(torch.equal(rounded[name], tensor.half()) for name, tensor in whole.items())
+    assert {tensor.dtype for tensor in rounded.values()} == {torch.float16}
+    assert json.loads((copy / CONFIG).read_text()) == config | dict(demos=["peg.h5"], run_dir="run")
+    acts = diffusion.SPEC.load(copy).policy.state_dict()
+    assert all(torch.equal(acts[name], tensor.half().float()) for name, tensor in whole.items())
 
 
 def test_each_set_up_has_a_folder_of_its_own_in_a_submission(tmp_path):

@@ -11,6 +11,7 @@ import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.evaluation import evaluate_episode
+from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
@@ -20,7 +21,7 @@ from manifeel_ms3.evaluation.rollout import failed_outcome, outcome_as_json, out
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
-from tests.evaluation.policies import StandStill
+from tests.evaluation.policies import LetsGo, StandStill
 from tests.outcomes import made_up
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
@@ -103,6 +104,20 @@ def test_a_policy_that_stands_still_never_succeeds(make_env):
     assert lost.success_paper is False
 
 
+def test_a_policy_that_drops_the_peg_has_lost(make_env):
+    env = make_env(**BARE | dict(max_episode_steps=20), control_mode="pd_ee_delta_pose")
+    lost, stopped = (evaluate_episode(env, LetsGo(), 1, stop_at_success=stops) for stops in (False, True))
+    assert (lost.success_once, lost.fail_once, lost.fail_at_end, lost.episode_len, lost.ending) == (
+        False,
+        True,
+        True,
+        20,
+        "lost",
+    )
+    assert (stopped.fail_once, stopped.fail_at_end, stopped.ending) == (True, None, "lost")
+    assert 0 < stopped.episode_len < 20
+
+
 def test_an_episode_without_an_outcome_is_no_success_by_the_papers_threshold():
     reached = replace(made_up(1, True), success_paper=True)
     episodes = list(map(outcome_as_json, (reached, failed_outcome(2, "the process crashed", stop_at_success=False))))
@@ -164,6 +179,40 @@ def test_the_success_under_a_force_counts_the_force_until_the_first_success():
     assert summary["force_limit"] == 6.0
     assert summary["gentle_success"]["rate"] == 1 / 3
     assert "gentle_success" not in summary_of(episodes, None)
+
+
+def test_a_result_holds_the_rates_and_means_of_all_its_episodes():
+    episodes = [outcome_as_json(made_up(seed, seed < 3, length=10 * seed)) for seed in (1, 2, 3, 6)]
+    episodes[0]["success_at_end"], episodes[2]["fail_once"], episodes[3]["fail_once"] = False, True, True
+    episodes[3]["fail_at_end"] = True
+    summary = summary_of(episodes, None)
+    rates = {name: summary[name]["rate"] for name in ("success_once", "success_at_end", "fail_once", "fail_at_end")}
+    assert rates == dict(success_once=0.5, success_at_end=0.25, fail_once=0.5, fail_at_end=0.25)
+    assert (summary["episode_len"], summary["return"], summary["reward"]) == (30.0, 15.0, 0.5)
+    low, high = wilson_interval(1, 4)
+    assert (summary["fail_at_end"]["low"], summary["fail_at_end"]["high"]) == pytest.approx((low, high), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (dict(success_once=False), ["success_once"]),
+        (dict(success_at_end=False), ["success_at_end"]),
+        (dict(fail_once=True), ["fail_once"]),
+        (dict(fail_at_end=True), ["fail_at_end"]),
+        (dict(first_success=2), ["first_success"]),
+        (dict(first_success=None), ["first_success"]),
+        (dict(episode_len=10), ["episode_len"]),
+        (dict(peak_contact_force=1.02), ["peak_contact_force"]),
+        (dict(force_until_success=0.98), ["force_until_success"]),
+        (dict(force_until_success=None), ["force_until_success"]),
+        (dict(peak_contact_force=1.009, force_until_success=0.991, inference_ms=9.0, return_=4.6), []),
+    ],
+    ids=str,
+)
+def test_an_episode_that_is_run_again_has_the_same_outcome_or_is_said_to_differ(change, named):
+    outcome = made_up(1, True)
+    assert [said.split()[0] for said in differences(outcome_as_json(outcome), replace(outcome, **change))] == named
 
 
 LONGEST = dict(

@@ -11,11 +11,11 @@ from baselines.common.observation import observation_spec
 from baselines.diffusion_policy.train import SPEC
 
 
-def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = ()) -> Path:
-    """Write it, and return its folder."""
+def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = (), crop: int = 0) -> Path:
+    """Write it, and return its folder; its camera images have 32 pixels, of which crops of `crop` pixels are taken."""
     config = dataclasses.replace(
         SPEC.presets["paper"].args.policy,
-        encoder=EncoderConfig(image="small_cnn", force_field="small"),
+        encoder=EncoderConfig(image="small_cnn", force_field="small", crop=crop),
         down_dims=(8, 16),
         diffusion_step_embed_dim=8,
         diffusion_steps=20,
