@@ -1,7 +1,9 @@
 """The full data set: every episode with and without observations, a manifest, and the validation of both."""
 
 import json
+import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -13,6 +15,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
+from tests.sample import states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.trajectories import arrays_of
 
@@ -108,6 +111,53 @@ def test_a_changed_action_is_found(folder, tmp_path):
     problems = validate.validate(copy, num_replays=2)
     assert any("sha256" in problem for problem in problems)
     assert any("seed 1 does not come out as recorded" in problem for problem in problems)
+
+
+def first_array(file: h5py.File, name: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    values = change(file[f"traj_0/{name}"][()])
+    del file[f"traj_0/{name}"]
+    file[f"traj_0/{name}"] = values
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("actions", lambda values: 1.5 * values / np.abs(values).max(), "seed 0: an action is beyond its limits"),
+        ("actions", lambda values: np.append(values[:-1], np.nan + values[-1:], axis=0), "seed 0: actions holds NaN"),
+        ("actions", lambda values: values[:-1], r"seed 0: actions has \d+ entries instead of \d+"),
+        ("env_states/actors/peg", lambda values: values[:-1], r"seed 0: env_states/actors/peg has \d+ entries instead"),
+        ("env_states/actors/peg", lambda values: values + np.inf, "seed 0: env_states/actors/peg holds NaN or infinite"),
+        ("success", lambda values: values & False, "seed 0: it does not end in success"),
+    ],
+)
+def test_what_is_wrong_with_the_arrays_of_an_episode_is_said(tmp_path, name, change, said):
+    copy = copy_of_the_sample(tmp_path)
+    with h5py.File(copy, "r+") as file:
+        first_array(file, name, change)
+    (problem,) = validate.validate(copy)
+    assert re.match(said, problem)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "said"),
+    [((0, 0), "a seed occurs twice"), ((0, 100_000), r"seeds \[100000\] are evaluation seeds"), ((0, 99_999), None)],
+)
+def test_seeds_that_no_demonstrations_may_have_are_said(tmp_path, seeds, said):
+    copy = copy_of_the_sample(tmp_path)
+    header = json.loads(copy.with_suffix(".json").read_text())
+    for episode, seed in zip(header["episodes"], seeds, strict=True):
+        episode["episode_seed"] = seed
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    problems = validate.validate(copy)
+    assert len(problems) == (said is not None)
+    assert said is None or re.match(said, problems[0])
+
+
+def copy_of_the_sample(tmp_path: Path) -> Path:
+    for suffix in (".json", ".h5"):
+        copy = Path(shutil.copy(states_sample(PEG).with_suffix(suffix), tmp_path / f"trajectory{suffix}"))
+    assert validate.validate(copy) == []
+    return copy
 
 
 def test_a_replay_that_rounds_differently_is_kept_with_its_own_states_and_one_that_fails_is_left_out(folder, tmp_path, caplog):

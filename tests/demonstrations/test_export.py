@@ -61,6 +61,13 @@ def test_lerobot(tmp_path):
     poses = np.concatenate([episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS)])
     assert np.allclose(stats["observation.state"]["mean"], poses.mean(0), atol=1e-6)
     assert np.allclose(stats["observation.state"]["std"], poses.std(0), atol=1e-6)
+    one, other = (episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS))
+    share = len(one) / len(poses)
+    for name, quantile in dict(q01=0.01, q10=0.1, q50=0.5, q90=0.9, q99=0.99).items():  # means over episodes, as in lerobot
+        expected = share * np.quantile(one, quantile, axis=0) + (1 - share) * np.quantile(other, quantile, axis=0)
+        assert np.allclose(stats["observation.state"][name], expected, atol=1e-6)
+    assert np.allclose([stats["observation.state"][name] for name in ("min", "max")], [poses.min(0), poses.max(0)])
+    assert stats["observation.state"]["count"] == [len(poses)]
     images = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
     assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
 
@@ -134,10 +141,38 @@ def test_a_lerobot_dataset_holds_the_outcome_of_each_action(tmp_path):
                 assert np.allclose(table["next.reward"].to_pylist(), file[f"traj_{e}/rewards"][()])
 
 
+def test_a_lerobot_dataset_counts_its_frames_and_tells_their_times(tmp_path):
+    folder = exported("lerobot", tmp_path)
+    import pyarrow.parquet as pq
+
+    lengths = [len(episode["actions"]) for episode in read_demonstrations(SAMPLE, [])]
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["fps"], info["total_episodes"], info["total_frames"]) == (10, 2, sum(lengths))
+    entries, begin = pq.read_table(folder / "meta/episodes").to_pylist(), 0
+    for e, (entry, length) in enumerate(zip(entries, lengths, strict=True)):
+        table = pq.read_table(folder / f"data/chunk-000/file-{e:03d}.parquet")
+        assert np.allclose(table["timestamp"].to_pylist(), np.arange(length) / 10)  # s
+        assert table["frame_index"].to_pylist() == list(range(length))
+        assert table["episode_index"].to_pylist() == [e] * length
+        assert table["index"].to_pylist() == list(range(begin, begin + length))
+        assert (entry["episode_index"], entry["length"]) == (e, length)
+        assert (entry["dataset_from_index"], entry["dataset_to_index"]) == (begin, begin + length)
+        assert (entry["data/chunk_index"], entry["data/file_index"]) == (0, e)
+        begin += length
+
+
 def test_the_cameras_of_a_lerobot_dataset_can_be_videos(tmp_path):
     pytest.importorskip("pyarrow")
     folder = export.main(export.Args(SAMPLE, "lerobot", tmp_path / "videos", videos=True))
+    import imageio.v2 as imageio
+    import pyarrow.parquet as pq
+
     camera, *rest = KEYS
+    name = "observation.images.wrist"
+    for e, entry in enumerate(pq.read_table(folder / "meta/episodes").to_pylist()):
+        assert (entry[f"videos/{name}/from_timestamp"], entry[f"videos/{name}/to_timestamp"]) == (0.0, entry["length"] / 10)
+        with imageio.get_reader(folder / f"videos/{name}/chunk-000/file-{e:03d}.mp4") as video:
+            assert (video.get_meta_data()["fps"], video.count_frames()) == (10, entry["length"])
     recorded, read = read_demonstrations(SAMPLE, KEYS), lerobot.read_lerobot(folder, KEYS)
     for episode, original in zip(read, recorded, strict=True):
         assert np.abs(episode[camera][:-1].astype(float) - original[camera][:-1]).mean() < 6  # H.264 halves colours
@@ -170,6 +205,11 @@ def test_zarr_of_the_papers_layout(tmp_path):
         *("wrist", "tactile_force_field_right", "state", "action")
     }
     require_same(list(diffusion_policy_zarr.read_zarr(folder, KEYS, 2)), last_is_repeated=True)
+    import zarr
+
+    poses = np.concatenate([episode["extra/tcp_pose"][:-1] for episode in read_demonstrations(SAMPLE, KEYS)])
+    x, y, z, qw, qx, qy, qz = poses.T
+    assert np.array_equal(zarr.open_array(str(folder / "data/state"), mode="r")[:], np.stack([x, y, z, qx, qy, qz, qw], 1))
 
 
 def test_images_of_touch_lie_as_in_the_papers_data():
@@ -181,6 +221,7 @@ def test_images_of_touch_lie_as_in_the_papers_data():
     assert theirs.dtype == np.float32
     assert theirs.max() <= 1
     assert np.array_equal(diffusion_policy_zarr._from_paper(key, theirs), images)
+    assert np.allclose(255 * theirs[:, 0], images[:, ::-1, 0])  # turned clockwise: the first column becomes the first row
 
 
 def test_npz(tmp_path):
