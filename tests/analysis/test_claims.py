@@ -24,6 +24,7 @@ from .made_up import TOTAL_STEPS, page_of, write_run
 
 ROOT = Path(__file__).parents[2]
 WEIGHTS = dict(unit="unit.safetensors", t3="t3_medium", anytouch="anytouch.pth")
+TRAINED_ON = dict(gpu="A30", cpu="EPYC", cores=16)
 NEEDS = {name: dict(tacrgb_weights=file) for name, file in WEIGHTS.items()}
 for vit in ("t3", "anytouch"):
     NEEDS[vit]["tactile_image_size"] = 224
@@ -118,12 +119,13 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
 
 def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     for seed, rate in enumerate((0.1, 0.2, 0.3)):
-        write_run(tmp_path, VISION, rate, seed, checkpoints=10)
+        write_run(tmp_path, VISION, rate, seed, checkpoints=12, training_seconds=1800.0, trained_on=TRAINED_ON)
     page = page_of(tmp_path)
     (ran,) = (line for line in page.splitlines() if "3 x 10 x 50" in line)
     mean = r"20% \[\d+%, \d+%\] \(\[10%\]\(\S+\), \[20%\]\(\S+\), \[30%\]\(\S+\)\)"
     assert re.match(rf"\| PegInsertion revision {task_spec(PEG).revision} \| rgb wrist \| {mean} \| 20% \|", ran)
     assert " | 10% | 3 x 10 x 50 |  | diffusion_policy |  | 50 | paper | `" in ran
+    assert ran.endswith(" | 1.50 h | A30 |")  # of the three runs
     (beside,) = (line for line in page.splitlines() if line.startswith("| PegInsertion | 20% ["))
     assert re.search(rf"{mean} / 14 ± 1% \| not run / 21 ± 2% \| not run / 40 ± 2% \| \d+% \[", beside)
     links = re.findall(r"\]\((.*?\.json)\)", beside)
@@ -254,7 +256,14 @@ def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
     assert {ranking.task: ranking.encoders[0] for ranking in ranked} == best
     assert all(ranking.best_over_second.low > 0.4 for ranking in ranked)
     assert verdict_on(ranked) == verdict
-    assert f"**6. No tactile encoder is best on all tasks**: {verdict} (settings: paper)." in page_of(tmp_path)
+    page = page_of(tmp_path)
+    assert f"**6. No tactile encoder is best on all tasks**: {verdict} (settings: paper)." in page
+    header, _, *rows = page.partition("### Table III")[2].strip().splitlines()[2:]
+    for task, row in zip(best, rows, strict=False):
+        cells = dict(zip(*(line.strip("| ").split(" | ") for line in (header, row)), strict=True))
+        assert cells.pop("task") == task
+        shown = {name: (cells[name].split("%")[0], cells[name].split(" / ")[1]) for name in TABLE_III[task]}
+        assert shown == {name: ("90" if name == best[task] else "30", str(rate)) for name, rate in TABLE_III[task].items()}
 
 
 def test_encoders_that_are_near_each_other_decide_nothing(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from contextlib import suppress
 from itertools import pairwise
 
@@ -20,6 +21,7 @@ from baselines.common.training import RecentLosses, Trainer, TrainingError, fast
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
+from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, PluginError, WorkFailedError
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
@@ -233,6 +235,43 @@ def test_a_weight_with_two_names_is_saved_under_both(trainer_args):
     assert all(torch.equal(own[name], other[name]) for name in own)
     averaged = dict(zip(second.policy.parameters(), second.ema.shadow_params, strict=True))
     assert all(torch.equal(saved[name], averaged[weight]) for name, weight in second.policy.named_parameters())
+
+
+def test_a_run_has_the_settings_that_it_was_given(trainer_args, demos):
+    """Its learning rates, its averaged weights, its optimiser, and the demonstrations that it learns from."""
+    few = dict(
+        num_demos=1, log_freq=9, warmup_steps=2, lr=0.01, betas=(0.8, 0.9), weight_decay=0.03, ema_power=0.5, ema_max_decay=0.4
+    )
+    trainer = Trainer(dataclasses.replace(trainer_args, **few), diffusion.DiffusionPolicy, Processes("cpu"))
+    (group,) = trainer.optimizer.param_groups
+    assert (group["betas"], group["weight_decay"]) == ((0.8, 0.9), 0.03)
+    rates, averaged = [], [parameter.clone() for parameter in trainer.policy.parameters()]
+    for step in range(6):
+        rates.append(group["lr"])
+        trainer.take_step()
+        decay = min(0.4, 1 - (1 + step) ** -0.5)
+        for old, new in zip(averaged, trainer.policy.parameters(), strict=True):
+            old.lerp_(new.detach(), 1 - decay)
+        torch.testing.assert_close(trainer.ema.shadow_params, averaged)
+    assert rates == pytest.approx([0.0, 0.005, *(0.005 * (1 + math.cos(math.pi * step / 4)) for step in range(4))])
+    first, _ = read_demonstrations(demos, SPEC.keys)
+    assert (trainer.config["num_demos"], trainer.config["num_samples"]) == (1, len(first["actions"]) - 7)
+    fitted = {key: trainer.policy.obs_normalizer(key) for key in SPEC.force_fields} | dict(
+        actions=trainer.policy.action_normalizer
+    )
+    for key, normalizer in fitted.items():
+        values = torch.as_tensor(first[key][: len(first["actions"])])
+        assert torch.equal(normalizer.low, values.amin(0)), key
+        assert torch.equal(normalizer.high, values.amax(0)), key
+
+
+@pytest.mark.parametrize(("given", "evaluated"), [(dict(), [2, 4, 6, 7]), (dict(eval_freq=4), [4, 7])])
+def test_checkpoints_are_evaluated_as_often_as_asked_and_the_last_one_always(trainer_args, monkeypatch, given, evaluated):
+    args = dataclasses.replace(trainer_args, **dict(steps=7, save_freq=2, num_eval_episodes=1) | given)
+    trainer, submitted = Trainer(args, diffusion.DiffusionPolicy, Processes("cpu")), []
+    monkeypatch.setattr(trainer.evaluation, "submit", submitted.append)
+    trainer.run()
+    assert [int(checkpoint.name) for checkpoint in submitted] == evaluated
 
 
 def test_two_processes_resume_bit_for_bit(trainer_args):

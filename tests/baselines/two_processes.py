@@ -30,7 +30,7 @@ def _run(rank: int, what: Callable[[TrainArgs], None], args: TrainArgs, port: in
 
 
 def resume_and_compare(args: TrainArgs) -> None:
-    """Train, save and train on; then resume from what was saved, which must lead to the same weights."""
+    """Train, save and train on; then resume from what was saved, which must lead to the same weights in both processes."""
     processes = Processes("cpu")
     _resume_and_compare(args, processes)  # its trainers are gone when the group of processes ends
     processes.close()
@@ -46,6 +46,21 @@ def _resume_and_compare(args: TrainArgs, processes: Processes) -> None:
     _take_steps(resumed, 2)
     for (name, own), other in zip(resumed.policy.named_parameters(), whole.policy.parameters(), strict=True):
         assert torch.equal(own, other), name
+    _require_apart(resumed, processes)
+
+
+def _require_apart(trainer: Trainer, processes: Processes) -> None:
+    """Check that the processes take a step on other samples and with other noise each, and have the same weights after it."""
+    seen, sample = [], trainer.dataset.sample
+    trainer.dataset.sample = lambda index: seen.extend(index.tolist()) or sample(index)
+    _take_steps(trainer, 1)
+    first, second = processes.of_all(seen)
+    assert len(first) == len(second) == trainer.args.batch_size
+    assert not set(first) & set(second)
+    noise = processes.of_all(torch.rand(1).item())
+    assert noise[0] != noise[1]
+    weights = processes.of_all([parameter.detach().sum().item() for parameter in trainer.policy.parameters()])
+    assert weights[0] == weights[1]
 
 
 def _take_steps(trainer: Trainer, count: int) -> None:

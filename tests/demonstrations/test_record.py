@@ -63,7 +63,8 @@ def test_file_holds_what_maniskill_expects(recorded):
             assert 0.5 < group["rewards"][-1] <= 1.0
             assert group["obs/sensor_data/tactile_right/force_field"].shape == (steps + 1, 10, 14, 3)
             assert group["env_states/actors/peg"].shape[0] == steps + 1
-            assert episode["peak_contact_force"] < 60
+            assert 5 < episode["peak_contact_force"] < 60
+            assert episode["peak_contact_force"] == pytest.approx(group["contact_force"][()].max(), abs=1e-3)
     assert not episode_folder(recorded).exists()
     assert header["commit_info"] == (git_commit() and dict(commit_id=git_commit()))
 
@@ -120,6 +121,36 @@ def test_every_episode_succeeds_again_from_its_actions(recorded):
     results = replay.replay(recorded)
     assert all(result.success for result in results)
     assert max(result.deviation for result in results) == 0.0
+
+
+def test_an_observation_is_that_before_its_action(recorded, make_env):
+    env = make_env(**EASY, obs_mode="tacff", tactile_sensors=("right",))
+    obs, _ = env.reset(seed=1)
+    (_, episode), actions = read_demonstrations(recorded, KEYS, PEG, num=2), []
+    for step in range(12):
+        for key in KEYS:
+            expected = obs
+            for part in key.split("/"):
+                expected = expected[part]
+            assert np.array_equal(episode[key][step], expected[0]), (key, step)
+        actions.append(episode["actions"][step])
+        obs, *_ = env.step(actions[-1])
+    assert np.abs(actions).max() > 0.1  # the hand moves
+
+
+def test_an_episode_that_fails_is_not_recorded_but_remembered(recorded, tmp_path):
+    """The demonstration of seed 0 is longer than that of seed 1, and than the time limit here."""
+    first, second, _ = (episode["elapsed_steps"] for episode in read_header(recorded)["episodes"])
+    assert first > second
+    kwargs = json.dumps(EASY | dict(max_episode_steps=second))
+    path = record.main(record.Args(PEG, 1, out=tmp_path / "t.h5", obs_mode="none", env_kwargs=kwargs))
+    header = read_header(path)
+    assert ([episode["episode_seed"] for episode in header["episodes"]], header["failed_seeds"]) == ([1], [0])
+    with h5py.File(path) as file:
+        assert list(file) == ["traj_0"]
+        assert file["traj_0/success"][-1]
+    with pytest.raises(WorkFailedError, match=r"1 seeds were tried and 0 of 1 episodes succeeded"):
+        record.main(record.Args(PEG, 1, out=tmp_path / "u.h5", obs_mode="none", env_kwargs=kwargs, max_tries=1))
 
 
 def test_more_can_be_recorded_later(recorded, tmp_path):

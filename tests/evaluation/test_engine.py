@@ -171,6 +171,16 @@ def test_noise_depends_on_the_seed_of_the_episode_and_on_the_step(checkpoint):
     np.testing.assert_array_equal(answers[0], answers[3])
 
 
+def test_an_answer_has_no_other_chance_than_its_noise(tmp_path):
+    """Such as the random crops of training."""
+    agent = SPEC.load(save_tiny_checkpoint(tmp_path / "1", "rgb", ("wrist",), crop=24))
+    (request,) = requests(1)
+    images = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3), np.uint8)
+    seen = {"sensor_data/wrist/rgb": images, "extra/tcp_pose": request.observation["extra/tcp_pose"]}
+    first, *others = (agent.answer([replace(request, observation=seen)])[0] for _ in range(3))
+    assert all(np.array_equal(first, other) for other in others)
+
+
 def outcomes_with(checkpoint, workers):
     source = PolicySource(checkpoint, device="cpu", batch_size=2)
     outcomes = run_episodes(Evaluation(source, PEG, BARE, {}), [100_000, 100_001, 100_005], workers)
@@ -256,6 +266,8 @@ def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_oth
         evaluation = evaluation_from_args(Args(folder))
         assert (evaluation.env_kwargs["fit"], evaluation.env_kwargs["lighting"]) == ("tight", "dim")
         assert "max_episode_steps" not in evaluation.env_kwargs
+        assert not evaluation.stop_at_success
+        assert evaluation_from_args(Args(folder, stop_at_success=True)).stop_at_success
         assert not caplog.messages
         evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "paper", "lighting": "dim"}'))
     assert evaluation.env_kwargs["fit"] == "paper"

@@ -41,6 +41,15 @@ def test_a_policy_of_ones_own_is_evaluated(tmp_path):
     assert result["env_kwargs"]["obs_mode"] == "tacff"
 
 
+def test_episodes_end_at_failure_if_they_are_asked_to_end(tmp_path):
+    kwargs = json.dumps(dict(render_backend="none", control_mode="pd_ee_delta_pose", max_episode_steps=20))
+    result = evaluated("LetsGo", tmp_path, episodes=1, env_kwargs=kwargs, stop_at_success=True)
+    (episode,) = result["episodes"]
+    assert (result["stop_at_success"], episode["fail_once"], episode["ending"]) == (True, True, "lost")
+    assert episode["episode_len"] < 20
+    assert not {"success_at_end", "fail_at_end"} & result.keys()
+
+
 def test_an_entry_without_a_copy_of_the_repository_says_where_entries_are(tmp_path, monkeypatch):
     monkeypatch.setattr(entries, "leaderboard_dir", lambda: tmp_path / "leaderboard")
     with pytest.raises(UnknownNameError, match="only a copy of the repository has the entries"):
