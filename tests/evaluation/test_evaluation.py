@@ -104,6 +104,13 @@ def test_a_policy_that_stands_still_never_succeeds(make_env):
     assert lost.success_paper is False
 
 
+def test_the_papers_threshold_may_be_met_without_success_and_counts_at_any_step(make_env):
+    """The peg is pulled out before it has been in place for half a second."""
+    env = make_env(**BARE | dict(max_episode_steps=70))
+    outcome = evaluate_episode(env, ExpertPolicy(env, 1, steps=44, then=UP), seed=1)
+    assert (outcome.success_once, outcome.success_paper, outcome.ending) == (False, True, "beside or above the hole")
+
+
 def test_a_policy_that_drops_the_peg_has_lost(make_env):
     env = make_env(**BARE | dict(max_episode_steps=20), control_mode="pd_ee_delta_pose")
     lost, stopped = (evaluate_episode(env, LetsGo(), 1, stop_at_success=stops) for stops in (False, True))
