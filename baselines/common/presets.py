@@ -21,7 +21,7 @@ def for_cpu(
     min_steps: int = 7000,
     **policy: Any,
 ) -> Args:
-    """Settings for small networks that learn a task with the paper's ranges and demonstrations on one CPU core in 5 to 20 minutes.
+    """Settings for small networks that learn a task with the paper's ranges and demonstrations on one CPU core in minutes.
 
     docs/training.md has the measurements by which they were chosen.
 
