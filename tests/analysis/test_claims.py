@@ -258,9 +258,9 @@ def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
     assert verdict_on(ranked) == verdict
     page = page_of(tmp_path)
     assert f"**6. No tactile encoder is best on all tasks**: {verdict} (settings: paper)." in page
-    header, _, *rows = page.partition("### Table III")[2].strip().splitlines()[2:]
-    tables = [dict(zip(*(line.strip("| ").split(" | ") for line in (header, row)), strict=False)) for row in rows]
-    by_task = {cells.get("task"): cells for cells in tables}
+    header, _, *rows = page.partition("### Table III")[2].strip().partition("\n\n")[2].partition("\n\n")[0].splitlines()
+    tables = [dict(zip(*(line.strip("| ").split(" | ") for line in (header, row)), strict=True)) for row in rows]
+    by_task = {cells["task"]: cells for cells in tables}
     for task in best:
         cells = by_task[task]
         shown = {name: (cells[name].split("%")[0], cells[name].split(" / ")[1]) for name in TABLE_III[task]}
