@@ -264,7 +264,8 @@ def _short_names() -> dict[str, str]:
     names = {}
     for name, hint in get_type_hints(TrainArgs, include_extras=True).items():
         for flag in getattr(hint, "__metadata__", ()):
-            names[(flag.name or name).replace("_", "-")] = flag.aliases[0].removeprefix("--")
+            if flag.aliases:
+                names[(flag.name or name).replace("_", "-")] = flag.aliases[0].removeprefix("--")
     return names
 
 
