@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from baselines.common.encoders import IMAGE_ENCODERS
-from baselines.common.presets import for_cpu
+from baselines.common.presets import for_cpu, in_epochs
 from baselines.common.train_args import PUBLIC_CODE_LR, TrainArgs
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.registry import PolicySpec, Preset, next_step, preset_cli
@@ -35,12 +35,14 @@ class Args(TrainArgs):
         return LR if from_scratch else PUBLIC_CODE_LR
 
 
+CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
         "A small network that learns on a CPU core in minutes.",
-        for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
+        CPU,
     ),
+    "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
 }
 
 SPEC = PolicySpec(DiffusionPolicy, Args, PRESETS)

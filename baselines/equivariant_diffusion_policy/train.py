@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from baselines.common.observation import PoseForm
-from baselines.common.presets import FINE, for_cpu
+from baselines.common.presets import FINE, for_cpu, in_epochs
 from baselines.common.train_args import TrainArgs
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig, EquivariantDiffusionPolicy
 from baselines.registry import PolicySpec, Preset, next_step, preset_cli
@@ -31,11 +31,15 @@ class Args(TrainArgs):
 
 SMALL = replace(FINE, image="small_cnn", crop=78)
 """Encoders of the preset `cpu`; the equivariant network over camera images is too slow for larger images."""
+CPU = for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, steps=3500, hidden=64)
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset(
         "A small network that learns on a CPU core in minutes.",
-        for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, epochs=15, min_steps=3500, hidden=64),
+        CPU,
+    ),
+    "cpu_long": Preset(
+        "The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU, epochs=15)
     ),
 }
 

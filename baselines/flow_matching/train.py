@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from baselines.common.presets import for_cpu
+from baselines.common.presets import for_cpu, in_epochs
 from baselines.common.train_args import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
 from baselines.registry import PolicySpec, Preset, next_step, preset_cli
@@ -28,6 +28,7 @@ class Args(TrainArgs):
     """Number of Euler steps from noise to actions in evaluation; 100 as in the paper's table and its public code."""
 
 
+CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "consistency": Preset(
@@ -36,8 +37,9 @@ PRESETS = {
     ),
     "cpu": Preset(
         "A small network that learns on a CPU core in minutes.",
-        for_cpu(Args(demos=()), inference_steps=8, prediction="sample"),
+        CPU,
     ),
+    "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
 }
 
 SPEC = PolicySpec(FlowMatchingPolicy, Args, PRESETS)
