@@ -33,7 +33,7 @@ $(DEMOS): | $(READY)
 		--obs-mode rgb+tacff --cameras wrist --tactile-sensors right --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/.trained: | $(DEMOS)
-	$(PYTHON) baselines/diffusion_policy/train.py cpu --demo-path $(DEMOS) --obs-mode rgb+tacff --total-iters 7000 --run-dir $(RUN) \
+	$(PYTHON) baselines/diffusion_policy/train.py cpu --demo-path $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
 		$$(ls $(RUN)/checkpoints/*/config.json >/dev/null 2>&1 && echo --resume)
 	touch $@
 

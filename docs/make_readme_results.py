@@ -1,6 +1,7 @@
 """README's table of results, made anew: `python -m docs.make_readme_results` in the repository's root.
 
-It shows Table I with the results of the folder leaderboard/cpu. A test fails where README does not have what this makes.
+It shows Table I in the set-up in which most of it was run, with the results of the folder leaderboard/cpu. A test fails where
+README does not have what this makes.
 """
 
 import re
@@ -14,7 +15,6 @@ from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
 from manifeel_ms3.analysis.paper_tables import HEADINGS, table_one
-from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
 from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import write_text
@@ -45,9 +45,6 @@ above those of vision alone (p < {p}). The paper's rates, in brackets, come from
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""
-MARK = " \\*"
-"""Sign of a row whose policies were trained with other settings than the preset has now."""
-NOTE = "\\* Trained before the preset was changed, with {changes}."
 WIDTH = 140
 """Width of README's lines, in characters."""
 
@@ -60,12 +57,12 @@ def block() -> str:
     """
     results = list(results_by_file(RESULTS).values())
     found = of_the_protocol(collect(results))
-    if not (conditions := table_one(found)):
+    if not (most := table_one(found)):
         raise SystemExit(f"{RESULTS} has no result of the paper's Table I")
-    settings = {task: training_settings_of(condition) for (task, _), condition in conditions.items()}
+    settings, conditions = most
     minutes = [seconds / 60 for seconds in _training_seconds(results, set(conditions.values()))]
     text = TEXT.format(
-        preset=", ".join(sorted({of_task.preset for of_task in settings.values()})),
+        preset=settings.preset,
         fastest=min(minutes),
         slowest=max(minutes),
         episodes=min(len(found[condition].episode_seeds) for condition in conditions.values()),
@@ -73,17 +70,8 @@ def block() -> str:
         p=SIGNIFICANT,
     )
     here = {place: found[condition] for place, condition in conditions.items()}
-    changes = [dict(settings[task].changes) if task in settings else {} for task in ROWS]
-    rows = [
-        (label + MARK * bool(changed), *_cells(task, here))
-        for (task, label), changed in zip(ROWS.items(), changes, strict=True)
-    ]
-    table = markdown_table(("", *HEADINGS.values()), rows)
-    if not any(changes):
-        return f"{fill(text.strip(), WIDTH)}\n\n{table}"
-    changed = {(name, value.strip('"')) for of_task in changes for name, value in of_task.items()}
-    note = NOTE.format(changes=", ".join(f"`{name}` {value}" for name, value in sorted(changed)))
-    return f"{fill(text.strip(), WIDTH)}\n\n{table}\n{fill(note, WIDTH)}\n"
+    rows = [(label, *_cells(task, here)) for task, label in ROWS.items()]
+    return f"{fill(text.strip(), WIDTH)}\n\n{markdown_table(('', *HEADINGS.values()), rows)}"
 
 
 def _training_seconds(results: list[dict[str, Any]], conditions: set[Condition]) -> list[float]:

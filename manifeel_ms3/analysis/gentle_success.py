@@ -13,7 +13,6 @@ from .figures import save_figure
 from .matching import Found
 from .paper import MODES, TABLE_I
 from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, table_one
-from .presets import training_settings_of
 from .protocol import ConditionResults
 from .success_curves import PANEL
 
@@ -36,7 +35,7 @@ def gentle_cell(results: ConditionResults) -> str | None:
 def draw_success_under_force(found: Found, out: Path) -> bool:
     """Draw the success of Table I's conditions against the force allowed: a panel for each task, a curve for each sensing.
 
-    The set-up of a task is that of `table_one`; tasks that were not run have no panel.
+    The set-up is the one in which most conditions were run; tasks that were not run in it have no panel.
 
     Args:
         found: The results that enter comparisons.
@@ -48,19 +47,19 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    if not (conditions := table_one(found)):
+    if not (most := table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
+    settings, conditions = most
     tasks = [task for task in TABLE_I if any((task, mode) in conditions for mode in MODES)]
     columns = min(len(tasks), COLUMNS)
     rows = -(-len(tasks) // columns)
     fig = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained")
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
     for ax, task in zip(panels, tasks, strict=False):
-        by_mode = {mode: conditions[task, mode] for mode in MODES if (task, mode) in conditions}
-        _draw_task(ax, found, by_mode)
-        ax.set_title(f"{task}: Diffusion Policy, {training_settings_of(next(iter(by_mode.values()))).preset}")
+        _draw_task(ax, found, {mode: conditions[task, mode] for mode in MODES if (task, mode) in conditions})
+        ax.set_title(f"{task}: Diffusion Policy, {settings.preset}")
     for ax in panels[len(tasks) :]:
         ax.set_axis_off()
     save_figure(fig, out, DPI)

@@ -14,7 +14,7 @@ from .figures import save_figure
 from .markdown import markdown_table
 from .matching import Found, answering
 from .paper import DP, MODES, TABLE_I, TABLE_II, TABLE_III, Rate, paper_condition, tasks_in_table
-from .presets import PAPER, TrainingSettings, training_settings_of
+from .presets import PAPER, TrainingSettings
 from .protocol import ConditionResults
 
 TEXT = """
@@ -154,23 +154,20 @@ def linked(success: Estimate, file: str | None) -> str:
     return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
 
 
-def table_one(found: Found) -> dict[tuple[str, str], Condition]:
-    """The conditions of Table I that were run, by task and observation mode.
+def table_one(found: Found) -> tuple[TrainingSettings, dict[tuple[str, str], Condition]] | None:
+    """The conditions of Table I, by task and observation mode, in the set-up in which most of them were run.
 
-    Those of a task have the same set-up: the one in which most of them were run, and of several such the one that sorts first.
+    None if none was run.
 
     Args:
         found: The results that enter comparisons.
     """
-    chosen: dict[tuple[str, str], Condition] = {}
+    by_settings: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
     for task in TABLE_I:
-        by_settings: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
         for mode in MODES:
             for settings, condition in answering(paper_condition(task, mode), found).items():
                 by_settings.setdefault(settings, {})[task, mode] = condition
-        in_order = sorted(by_settings, key=lambda settings: (-len(by_settings[settings]), settings.sort_key))
-        chosen |= by_settings[in_order[0]] if in_order else {}
-    return chosen
+    return max(by_settings.items(), key=lambda item: len(item[1]), default=None)
 
 
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
@@ -178,7 +175,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
 
     A task that was not run has the paper's lines alone.
 
-    The set-up of a task is that of `table_one`.
+    The set-up is the one in which most conditions were run.
 
     Args:
         found: The results that enter comparisons.
@@ -190,11 +187,11 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    if not (conditions := table_one(found)):
+    if not (most := table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    presets = sorted({training_settings_of(condition).preset for condition in conditions.values()})
+    settings, conditions = most
     drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
     tasks = list(TABLE_I)
     fig = Figure(figsize=PANEL, layout="constrained")
@@ -206,7 +203,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
             ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=PAPER_LINE, label=label)
-    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {', '.join(presets)}")
+    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {settings.preset}")
     ax.set_xticks(range(len(tasks)), tasks, rotation=LABEL_ANGLE, ha="right")
     ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
     save_figure(fig, out, DPI)
