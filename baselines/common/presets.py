@@ -13,12 +13,7 @@ seen."""
 
 
 def for_cpu(
-    args: Args,
-    inference_steps: int,
-    encoder: EncoderConfig = FINE,
-    image_size: int = 160,
-    steps: int = 7000,
-    **policy: Any,
+    args: Args, inference_steps: int, encoder: EncoderConfig = FINE, image_size: int = 160, steps: int = 7000, **policy: Any
 ) -> Args:
     """Settings for small networks that learn a task with the paper's ranges and demonstrations on one CPU core in minutes.
 

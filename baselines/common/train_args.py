@@ -140,18 +140,8 @@ class TrainArgs:
 
 FREE_ON_RESUME = {
     *("demos", "tacrgb_weights", "exp_name", "run_dir", "resume", "overwrite", "device", "compile", "log_freq"),
-    *(
-        "steps",
-        "epochs",
-        "min_steps",
-        "total_steps",
-        "step",
-        "save_freq",
-        "keep",
-        "inference_steps",
-        "trained_on",
-        "training_seconds",
-    ),
+    *("steps", "epochs", "min_steps", "total_steps", "step", "save_freq", "keep", "inference_steps"),
+    *("trained_on", "training_seconds"),
     *("eval_freq", "num_eval_episodes", "num_eval_envs", "eval_env_kwargs", "capture_video"),
     *("track", "wandb_project_name", "wandb_entity"),
 }

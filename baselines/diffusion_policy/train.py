@@ -38,10 +38,7 @@ class Args(TrainArgs):
 CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
-    "cpu": Preset(
-        "A small network that learns on a CPU core in minutes.",
-        CPU,
-    ),
+    "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
     "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
 }
 

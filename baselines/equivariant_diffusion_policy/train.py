@@ -34,10 +34,7 @@ SMALL = replace(FINE, image="small_cnn", crop=78)
 CPU = for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, steps=3500, hidden=64)
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
-    "cpu": Preset(
-        "A small network that learns on a CPU core in minutes.",
-        CPU,
-    ),
+    "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
     "cpu_long": Preset(
         "The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU, epochs=15)
     ),

@@ -35,10 +35,7 @@ PRESETS = {
         "Consistency training, for generation in one step.",
         Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1),
     ),
-    "cpu": Preset(
-        "A small network that learns on a CPU core in minutes.",
-        CPU,
-    ),
+    "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
     "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
 }
 

@@ -46,17 +46,11 @@ ACTION_SIZE = 7
 """Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
 AMOUNTS = ("num", "episodes", "checkpoints", "version", "revision")
 """Settings on which the cost of one demonstration, gradient step or episode does not depend."""
-AMOUNT_FLAGS = (
-    "seed",
-    "env-id",
-    "cameras",
-    "steps",
-    "epochs",
-    "min-iters",
-    "keep",
-    "save-every",
-    "num-demos",
-    "tacrgb-weights",
+AMOUNT_FLAGS = frozenset(
+    {
+        *("seed", "env-id", "cameras", "keep", "save-every", "num-demos", "tacrgb-weights"),
+        *("steps", "epochs", "min-iters"),
+    }
 )
 """Flags of training on which the cost of one gradient step does not depend; a study's policies have one camera each."""
 
