@@ -1,34 +1,24 @@
-"""Settings in nested mappings: their innermost entries, and those in which two differ."""
+"""Settings in nested mappings: the entries in which two differ."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 
-def innermost(settings: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Names and values of the entries that are no mappings, or empty ones.
+def differing(first: Mapping[str, Any], second: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """The entries in which two mappings differ, in the order of their names.
 
     Args:
-        settings: Values by name, which may be such mappings themselves; their names are joined by dots.
+        first: Values by name, which may be such mappings themselves.
+        second: The other values. An entry that only one of the two has is one in which they differ.
+        place: Text before the names.
+
+    Yields:
+        The name of an entry, and its value in the first and in the second mapping; None where one of them has no such entry.
+        Names of entries of mappings that both have are joined by dots.
     """
-    places = [("", settings)]
-    while places:
-        place, entries = places.pop()
-        for name, value in entries.items():
-            if isinstance(value, Mapping) and value:
-                places.append((f"{place}{name}.", value))
-            else:
-                yield f"{place}{name}", value
-
-
-def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """The values of the innermost entries in which two mappings differ, in the order of their names.
-
-    Args:
-        first: Values by name, as `innermost` takes them.
-        second: The other values.
-
-    Returns:
-        The value in the first and in the second mapping by name; None where one of them has no such entry.
-    """
-    ours, theirs = dict(innermost(first)), dict(innermost(second))
-    return {n: (ours.get(n), theirs.get(n)) for n in sorted(ours.keys() | theirs.keys()) if ours.get(n) != theirs.get(n)}
+    for name in sorted(first.keys() | second.keys()):
+        one, other = first.get(name), second.get(name)
+        if isinstance(one, Mapping) and isinstance(other, Mapping):
+            yield from differing(one, other, f"{place}{name}.")
+        elif one != other or (name in first) != (name in second):
+            yield f"{place}{name}", one, other

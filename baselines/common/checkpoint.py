@@ -179,9 +179,9 @@ def require_same_config(saved: dict[str, Any], wanted: dict[str, Any], free: set
         CheckpointError: Some settings differ; the message lists them.
     """
     wanted = {name: value for name, value in json.loads(json.dumps(wanted)).items() if name not in free}
-    saved = {name: value for name, value in json.loads(json.dumps(saved)).items() if name in wanted}
-    if unequal := differing(saved, wanted):
-        lines = ", ".join(f"{name}: {old!r} there, {new!r} now" for name, (old, new) in unequal.items())
+    saved = json.loads(json.dumps(saved))
+    unequal = differing({name: saved.get(name) for name in wanted}, wanted)
+    if lines := ", ".join(f"{name}: {old!r} there, {new!r} now" for name, old, new in unequal):
         raise CheckpointError(
             f"{source} was trained with other settings ({lines}); resume with the same, or choose another --run-dir"
         )

@@ -112,7 +112,7 @@ def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
     recorded = [(file, read(file)) for file, read in readers if read is not None]
     known = [(file, _of_task(arguments)) for file, arguments in recorded if arguments is not None]
     for (first, expected), (second, found) in pairwise(known):
-        for name, (one, other) in differing(expected, found).items():
+        for name, one, other in differing(dict.fromkeys(found) | expected, dict.fromkeys(expected) | found):
             raise DemonstrationError(
                 f"{first} was recorded with {name}={one!r}, {second} with {name}={other!r}; train on files "
                 "that were recorded with the same arguments of the task"

@@ -36,6 +36,7 @@ class Args(TrainArgs):
 
 
 CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
+"""Settings of the preset `cpu`, from which those of `cpu_long` follow."""
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),

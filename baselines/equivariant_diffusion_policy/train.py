@@ -32,6 +32,7 @@ class Args(TrainArgs):
 SMALL = replace(FINE, image="small_cnn", crop=78)
 """Encoders of the preset `cpu`; the equivariant network over camera images is too slow for larger images."""
 CPU = for_cpu(Args(demos=()), inference_steps=8, encoder=SMALL, image_size=80, steps=3500, hidden=64)
+"""Settings of the preset `cpu`, from which those of `cpu_long` follow."""
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),

@@ -29,6 +29,7 @@ class Args(TrainArgs):
 
 
 CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
+"""Settings of the preset `cpu`, from which those of `cpu_long` follow."""
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
     "consistency": Preset(

@@ -6,12 +6,12 @@ of the same condition only if they differ in nothing but the training seed, the 
 
 import hashlib
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED
 from manifeel_ms3.evaluation.variant import SENSING, variant_of
-from manifeel_ms3.nested_settings import innermost
 from manifeel_ms3.tasks.registry import short_name
 
 NO_SETTINGS = frozenset(
@@ -146,4 +146,16 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
     named = {n: value for n, value in config.items() if n not in no_settings and (n, value) not in IMPLIED.items()}
     if named.get("steps", 0) is None and (epochs := config.get("epochs")) is not None:
         named["steps"] = f"{epochs} epochs, at least {config['min_steps']}"
-    return tuple(sorted((name, json.dumps(value, sort_keys=True)) for name, value in innermost(named) if name not in idle))
+    return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
+
+
+def _flat(config: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names joined by dots and values as json of a configuration's innermost entries."""
+    places = [("", config)]
+    while places:
+        place, entries = places.pop()
+        for name, value in entries.items():
+            if isinstance(value, dict) and value:
+                places.append((f"{place}{name}.", value))
+            else:
+                yield f"{place}{name}", json.dumps(value, sort_keys=True)

@@ -194,7 +194,7 @@ class Recording:
     def _load(self) -> None:
         before = read_header(self.path)
         asked = {name: self._header[name] for name in ("env_info", "revision")}
-        for name, (recorded, wanted) in differing({n: before.get(n, value) for n, value in asked.items()}, asked).items():
+        for name, recorded, wanted in differing({n: before.get(n, value) for n, value in asked.items()}, asked):
             raise DemonstrationError(
                 f"{self.path} was recorded with {name}={recorded!r}, this run asks for {wanted!r}; give another --out, "
                 "or delete the file"

@@ -109,9 +109,11 @@ def test_yaw_mode_turns_about_the_vertical_alone(make_env):
     env = make_env(obs_mode="none", render_backend="none", control_mode="pd_ee_delta_yaw")
     env.reset(seed=0)
     _, facing = tool(env)
-    turning, still = (dict(yaw=rate, gripper=-1.0) for rate in (1.0, 0.0))
-    for motion in [turning] * 4 + [still] * 8:
-        env.step(np.array([motion.get(axis, 0.0) for axis in ACTION_AXES["pd_ee_delta_yaw"]]))
+    assert ACTION_AXES["pd_ee_delta_yaw"][3:] == ("yaw", "gripper")
+    for _ in range(4):
+        env.step(np.array([0, 0, 0, 1.0, -1.0]))
+    for _ in range(8):
+        env.step(np.array([0, 0, 0, 0, -1.0]))
     _, turned = tool(env)
     assert (turned * facing.inv()).as_rotvec() == pytest.approx([0, 0, 0.2], abs=4e-3)
 
