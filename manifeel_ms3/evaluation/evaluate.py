@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from manifeel_ms3.arguments import is_number, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
@@ -62,9 +63,9 @@ class Args:
     policy_kwargs: str = "{}"
     """Keyword arguments of the policy, as json. Passwords and tokens among them are left out of the result."""
     env_id: str | None = None
-    """Id of the task; the checkpoint's task if not given."""
+    """Id of the task, for a --policy; a checkpoint brings its own."""
     obs_mode: str | None = None
-    """Observation mode of the policy, such as rgb+tacff; a checkpoint brings its own."""
+    """Observation mode of the policy, such as rgb+tacff, for a --policy; a checkpoint brings its own."""
     cameras: tuple[str, ...] | None = None
     """Cameras that the policy observes, for a --policy; the task's policy camera if not given. A checkpoint brings its own."""
     tactile_sensors: tuple[str, ...] = ("right",)
@@ -227,9 +228,12 @@ def evaluation_from_args(args: Args) -> Evaluation:
     Raises:
         CheckpointError: The checkpoint's configuration is missing or incomplete.
         UnknownNameError: The task is not registered.
-        InvalidArgumentError: Neither a checkpoint nor a policy is given, or both, or a policy without its task, or arguments
-            of the task with other observations than the policy's.
+        InvalidArgumentError: Neither a checkpoint nor a policy is given, or both, or a policy without its task, a checkpoint
+            with another task or other observations than its own, or a number that is not allowed.
     """
+    require_positive(num_eval_envs=args.workers, inference_steps=args.inference_steps)
+    if not (is_number(args.step_timeout) and args.step_timeout > 0):
+        raise InvalidArgumentError(f"--step-timeout {args.step_timeout} must be a number of seconds above 0")
     if (args.checkpoint is None) == (args.policy is None):
         raise InvalidArgumentError("give either --checkpoint, or --policy with --env-id and --obs-mode")
     given = json_object("--env-kwargs", args.env_kwargs)
@@ -260,6 +264,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     # recorded in the result, because it changes the actions
     config |= {name: value for name, value in kwargs.items() if name == INFERENCE_STEPS and value}
     env_id = task_spec(config["env_id"]).env_id
+    _require_own(args, config | dict(env_id=env_id))
     trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
     sensing = {name: config[name] for name in SENSING}
     if args.sensor not in (None, learnt := trained.get("sensor", DEFAULT_SENSOR)):
@@ -276,6 +281,23 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     # not the link `last`, which training may move meanwhile
     source = PolicySource(checkpoint.resolve(), None, json.dumps(kwargs), device, batch_size)
     return Evaluation(source, env_id, trained | sensing | BACKEND | given, config, args.stop_at_success, args.step_timeout)
+
+
+def _require_own(args: Args, config: dict[str, Any]) -> None:
+    """Check that what a checkpoint brings is not asked for in another form.
+
+    Raises:
+        InvalidArgumentError: The task, the observation mode or the cameras that are given are not the checkpoint's.
+    """
+    given = dict(
+        env_id=args.env_id and task_spec(args.env_id).env_id, obs_mode=args.obs_mode, cameras=args.cameras and [*args.cameras]
+    )
+    for name, value in given.items():
+        if value not in (None, own := config[name]):
+            raise InvalidArgumentError(
+                f"{_flags([name])} {value}: the policy of {args.checkpoint} was trained with {own}; leave it out. Other "
+                "arguments of its task are given by --env-kwargs"
+            )
 
 
 def _require_obs_mode(obs_mode: str, given: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from baselines.diffusion_policy.train import SPEC
-from manifeel_ms3.errors import MachineError, WorkFailedError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError, WorkFailedError
 from manifeel_ms3.evaluation import policy_process
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.evaluate import Args, evaluation_from_args
@@ -257,6 +257,37 @@ def test_a_device_that_is_not_there_is_named_before_anything_starts(checkpoint, 
         evaluation_from_args(Args(folder, batch_size=0))
     with pytest.raises(ValueError, match="--device are for a --checkpoint"):
         evaluation_from_args(Args(policy="a:B", env_id=PEG, obs_mode="tacff", device="cpu"))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (dict(env_id="USBInsertion"), "--env-id ManiFeel-USBInsertion-v1: .* was trained with ManiFeel-PegInsertion-v1; leave"),
+        (dict(obs_mode="rgb+tacff"), "--obs-mode rgb.tacff: .* was trained with tacff; leave it out"),
+        (dict(cameras=("side",)), r"--cameras \['side'\]: .* was trained with \['wrist'\]; leave it out"),
+    ],
+)
+def test_what_a_checkpoint_brings_cannot_be_asked_for_in_another_form(checkpoint, tmp_path, given, said):
+    folder = config_with(checkpoint, tmp_path, obs_mode="tacff", cameras=["wrist"])
+    same = evaluation_from_args(Args(folder, env_id="PegInsertion", obs_mode="tacff", cameras=("wrist",)))
+    assert same == evaluation_from_args(Args(folder))
+    with pytest.raises(InvalidArgumentError, match=said):
+        evaluation_from_args(Args(folder, **given))
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (dict(step_timeout=0.0), "--step-timeout 0.0 must be"),
+        (dict(step_timeout=-1.0), "--step-timeout -1.0 must be"),
+        (dict(step_timeout=float("nan")), "--step-timeout nan must be"),
+        (dict(inference_steps=0), "--inference-steps 0 must be at least 1"),
+        (dict(workers=0), "--num-eval-envs 0 must be at least 1"),
+    ],
+)
+def test_numbers_with_which_no_episode_could_succeed_are_refused(given, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        evaluation_from_args(Args(policy="a:B", env_id=PEG, obs_mode="tacff", **given))
 
 
 def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_otherwise(checkpoint, tmp_path, caplog):
