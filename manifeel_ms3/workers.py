@@ -10,6 +10,7 @@ with WorkerPool(2, partial(gym.make, "ManiFeel-PegInsertion-v1")) as pool:
 import gc
 import multiprocessing
 import os
+import pickle
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -262,4 +263,18 @@ def end_with_parent() -> None:
 
 def _run(function: Callable[[Any, Any], Any], task: Any) -> Any:
     assert _this_worker is not None
-    return function(_this_worker.state, task)
+    try:
+        return function(_this_worker.state, task)
+    except Exception as error:
+        if (sent := portable(error)) is error:
+            raise
+        raise sent from error
+
+
+def portable(error: Exception) -> Exception:
+    """The error, or one with its message where the error, as some of libraries, cannot be sent to another process."""
+    try:
+        pickle.loads(pickle.dumps(error))
+    except Exception:
+        return WorkFailedError(f"{type(error).__name__}: {error}")
+    return error

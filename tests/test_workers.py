@@ -89,6 +89,27 @@ def test_errors_of_a_task_and_of_the_state_are_raised_in_the_caller():
                 finished.result()
 
 
+class OfALibraryError(Exception):
+    """An error that can be sent to another process, but not be made again there."""
+
+    def __init__(self, what: str, number: int):
+        super().__init__(f"{what} {number}")
+
+
+def raise_of_a_library(state: list[int], number: int) -> None:
+    raise OfALibraryError("no solution for", number)
+
+
+def test_an_error_that_cannot_be_sent_fails_its_task_alone():
+    with WorkerPool(1, partial(counter, 0)) as pool:
+        pool.submit(raise_of_a_library, 5)
+        pool.submit(add, 2)
+        failed, other = sorted(pool.as_finished(), key=lambda finished: finished.task != 5)
+    assert other.result()[1] == 2
+    with pytest.raises(WorkFailedError, match="OfALibraryError: no solution for 5"):
+        failed.result()
+
+
 def fail_while_tasks_run() -> None:
     with WorkerPool(1, partial(counter, 0)) as pool:
         for _ in range(3):

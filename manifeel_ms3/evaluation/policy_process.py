@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.errors import WorkFailedError
-from manifeel_ms3.workers import WorkerContext, end_with_parent, without_ctrl_c
+from manifeel_ms3.workers import WorkerContext, end_with_parent, portable, without_ctrl_c
 
 from .policy import EpisodePolicy, Policy, PolicyRequest, PolicySource, PolicyUnavailableError, with_defaults
 from .rollout import PolicyFault
@@ -313,7 +313,7 @@ def answer_batches(source: PolicySource, connection: Connection) -> None:
     try:
         policy: Any = source.make()
     except Exception as error:
-        connection.send(_portable(error))
+        connection.send(portable(error))
         return
     if not hasattr(policy, "answer"):
         connection.send(Ready(None))
@@ -335,11 +335,3 @@ def _answers(policy: Any, requests: list[PolicyRequest]) -> list[np.ndarray | Ex
             return [answer for request in requests for answer in _answers(policy, [request])]
         known = isinstance(error, PolicyFault | PolicyUnavailableError)
         return [error if known else PolicyFault(f"{type(error).__name__}: {error}")]
-
-
-def _portable(error: Exception) -> Exception:
-    """The error, or one with its message where the error cannot be sent to another process."""
-    try:
-        return pickle.loads(pickle.dumps(error))
-    except Exception:
-        return WorkFailedError(f"the policy cannot be made ({type(error).__name__}: {error})")
