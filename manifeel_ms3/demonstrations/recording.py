@@ -135,7 +135,7 @@ def open_recording(path: Path, header: dict[str, Any], order: Sequence[int] | No
         recording = Recording(path, header, order)
         try:
             yield recording
-        except Exception:
+        except BaseException:  # Ctrl-C, too
             recording.withdraw()
             raise
 

@@ -247,6 +247,24 @@ def test_a_file_without_episodes_is_of_the_session_that_records_into_it(tmp_path
     assert "source_type" not in held["episodes"][0]
 
 
+@pytest.mark.parametrize("error", [KeyboardInterrupt, InvalidArgumentError])
+def test_a_session_that_ends_before_its_first_episode_leaves_no_file(tmp_path, error):
+    """The same command with other arguments would be refused because of it."""
+    path = tmp_path / "trajectory.h5"
+
+    def end_at_once(env_kwargs: dict) -> None:
+        with open_recording(path, make_header(PEG, env_kwargs)) as recording:
+            recording.begin()
+            raise error
+
+    with pytest.raises(error):
+        end_at_once(dict(obs_mode="none", fit="tight"))
+    add_episode(path, 0, make_header(PEG, dict(obs_mode="none")))
+    with pytest.raises(error):
+        end_at_once(dict(obs_mode="none"))
+    assert [episode["episode_seed"] for episode in read_header(path)["episodes"]] == [0]
+
+
 @pytest.mark.parametrize(("first", "num"), [(5000, 3), (5000, 4), (1, 3)])
 def test_episodes_of_other_seeds_are_neither_returned_nor_mixed_in(recorded, first, num):
     before = bytes_of(recorded)
