@@ -21,7 +21,10 @@ LOG = "log.jsonl"
 EVENTS = "events.out.tfevents.*"
 """Files of the log in the folder of a run: json lines, and tensorboard's events."""
 WANDB_TIMEOUT = 30
-"""Longest wait for Weights & Biases, s; set once, not tuned."""
+"""Longest wait for Weights & Biases to begin a run, s; set once, not tuned."""
+WANDB_FINISH_TIMEOUT = 600
+"""Longest wait at the end of a run until everything is sent, s; set once, not tuned. What is left stays in the folder of the
+run, and `wandb sync` sends it."""
 WANDB_ID = "wandb_id.txt"
 """File, in the folder of a run, of the id of the run in Weights & Biases."""
 GLOBAL_STEP = "global_step"
@@ -83,7 +86,9 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_run: WandbRun | None):
-        self._wandb = _start_wandb(wandb_run, config, folder, resumed=step > 0) if wandb_run else None
+        if step == 0:  # also without `wandb_run`: a new run must not go on in that of an earlier one when it is resumed
+            (folder / WANDB_ID).unlink(missing_ok=True)
+        self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
         """Entries of the earlier log that are kept."""
         self._path = folder / LOG
@@ -161,16 +166,16 @@ def _video_entry(video: Path | None) -> dict[str, Any]:
     return {"eval/video": wandb.Video(str(video), format="mp4")}
 
 
-def _start_wandb(run: WandbRun, config: dict[str, Any], folder: Path, resumed: bool) -> Any:
-    """Start a run in Weights & Biases, or continue the one of a training that is resumed."""
+def _start_wandb(run: WandbRun, config: dict[str, Any], folder: Path) -> Any:
+    """Start a run in Weights & Biases, or continue the one whose id is in the folder of the training."""
     import wandb
     from wandb.errors import CommError, UsageError
 
     id_file = folder / WANDB_ID
-    if not (resumed and id_file.is_file()):
+    if not id_file.is_file():
         write_text(id_file, secrets.token_hex(8))
     try:
-        settings = wandb.Settings(init_timeout=WANDB_TIMEOUT)
+        settings = wandb.Settings(init_timeout=WANDB_TIMEOUT, finish_timeout=WANDB_FINISH_TIMEOUT)
         about: dict[str, Any] = dict(project=run.project, entity=run.entity, name=run.name, group=run.group, tags=run.tags)
         about |= dict(id=id_file.read_text(encoding="utf-8"), resume="allow")
         started = wandb.init(**about, config=config | run.config, dir=str(folder), settings=settings)

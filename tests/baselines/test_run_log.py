@@ -131,5 +131,14 @@ def test_a_run_that_is_resumed_goes_on_under_its_id_and_a_new_one_has_another(tm
     assert ids[0] == ids[1] != ids[2]
 
 
+def test_a_resumed_run_does_not_go_on_in_that_of_an_earlier_training(tmp_path, monkeypatch):
+    """A training that is not tracked takes the place of a tracked one, and is tracked only after it was resumed."""
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    for step, track in ((0, True), (0, False), (200, True)):
+        RunLog(tmp_path, {}, step, wandb_run_of(replace(ARGS, track=track), "diffusion_policy")).close()
+    assert len({path.stem for path in tmp_path.glob("wandb/offline-run-*/run-*.wandb")}) == 2
+
+
 def test_nothing_is_sent_unless_it_is_asked_for():
     assert wandb_run_of(replace(ARGS, track=False), "diffusion_policy") is None
