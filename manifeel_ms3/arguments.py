@@ -60,9 +60,7 @@ def require_at_least(least: int, **settings: int) -> None:
     Raises:
         InvalidArgumentError: A number is smaller.
     """
-    for name, given in settings.items():
-        if given < least:
-            raise InvalidArgumentError(f"{name}={given} must be at least {least}")
+    _require(least, {f"{name}=": given for name, given in settings.items()})
 
 
 def require_positive(**flags: int | None) -> None:
@@ -74,7 +72,7 @@ def require_positive(**flags: int | None) -> None:
     Raises:
         InvalidArgumentError: A number is less than 1.
     """
-    _require_flags(1, flags)
+    _require(1, {f"{_flag(name)} ": given for name, given in flags.items()})
 
 
 def require_not_negative(**flags: int) -> None:
@@ -86,13 +84,17 @@ def require_not_negative(**flags: int) -> None:
     Raises:
         InvalidArgumentError: A number is less than 0.
     """
-    _require_flags(0, flags)
+    _require(0, {f"{_flag(name)} ": given for name, given in flags.items()})
 
 
-def _require_flags(least: int, flags: Mapping[str, int | None]) -> None:
-    for name, given in flags.items():
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _require(least: int, numbers: Mapping[str, int | None]) -> None:
+    for name, given in numbers.items():
         if given is not None and given < least:
-            raise InvalidArgumentError(f"--{name.replace('_', '-')} {given} must be at least {least}; give a larger number")
+            raise InvalidArgumentError(f"{name}{given} must be at least {least}; give a larger number")
 
 
 def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch.device | str = "cpu") -> torch.Tensor:

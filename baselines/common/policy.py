@@ -89,6 +89,8 @@ class PolicyConfig:
 
     def _require_unet(self) -> None:
         """Check that a U-Net of these sizes can be built, and halves a prediction to its coarsest scale without a rest."""
+        narrowest = min(self.down_dims, default=0)
+        require_at_least(1, kernel_size=self.kernel_size, n_groups=self.n_groups, down_dims=narrowest)
         if self.kernel_size % 2 == 0:
             raise InvalidArgumentError(f"kernel_size={self.kernel_size} must be odd, so that a convolution keeps the length")
         if odd := [width for width in self.down_dims if width % self.n_groups]:

@@ -8,6 +8,7 @@ import torch.nn.functional as F  # noqa: N812
 
 from baselines.common.observation import ObservationSpec
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy
+from manifeel_ms3.arguments import require_at_least
 
 
 @dataclass
@@ -20,6 +21,10 @@ class DiffusionConfig(PolicyConfig):
     """Output of the network: the noise, as in the paper, or the clean actions, which a short training learns far sooner."""
     sampler: Literal["ddpm", "ddim"] = "ddpm"
     """Sampler if generation takes all diffusion steps; with fewer it is always DDIM (Song et al. 2021)."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(1, diffusion_steps=self.diffusion_steps)
 
 
 class DiffusionPolicy(VisuotactilePolicy):

@@ -11,6 +11,7 @@ from baselines.common.observation import POSE
 from baselines.common.policy import make_action_network
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.arguments import require_at_least
 
 from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantActionNetwork, EquivariantObservationEncoder
 
@@ -33,6 +34,10 @@ class EquivariantConfig(DiffusionConfig):
     of C8."""
     action_fields: int = 64
     """Number of regular fields that the network over action sequences has for an action."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(1, hidden=self.hidden, action_fields=self.action_fields)
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):

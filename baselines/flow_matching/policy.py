@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812
 
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy, draw_rows
+from manifeel_ms3.arguments import require_at_least
 
 TIME_SCALE = 100.0
 """Factor from a time in [0, 1] to the range of diffusion steps for which the U-Net's embedding is made."""
@@ -34,6 +35,10 @@ class FlowConfig(PolicyConfig):
     public_code: bool = False
     """Reproduce two traits of the paper's public code: generation starts from noise that is uniform in [0, 1], though training
     draws Gaussian noise, and the network is given the time in [0, 1] instead of [0, 100]."""
+
+    def __post_init__(self):
+        super().__post_init__()
+        require_at_least(1, segments=self.segments)
 
     @property
     def least_inference_steps(self):

@@ -103,6 +103,10 @@ def test_horizons_that_a_prediction_cannot_meet_are_refused(horizons, said):
         (dict(diffusion_step_embed_dim=63), "diffusion_step_embed_dim=63 must be an even number"),
         (dict(noise_draws=0), "noise_draws=0 must be at least 1"),
         (dict(mlp_width=0), "mlp_width=0 must be at least 1"),
+        (dict(n_groups=0), "n_groups=0 must be at least 1"),
+        (dict(kernel_size=-1), "kernel_size=-1 must be at least 1"),
+        (dict(down_dims=(8, 0)), "down_dims=0 must be at least 1"),
+        (dict(down_dims=()), "down_dims=0 must be at least 1"),
     ],
 )
 def test_sizes_that_no_network_can_have_are_refused(sizes, said):

@@ -11,7 +11,9 @@ from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import POSE, observation_spec
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
+from baselines.equivariant_diffusion_policy.policy import EquivariantConfig
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicyRequest
 
 SPEC = observation_spec("none", (), (), 16)
@@ -168,6 +170,22 @@ class KnowsNoise(torch.nn.Module):
         kept = self.kept[step.long()].view(-1, 1, 1)
         noise = (noisy - kept.sqrt() * CLEAN) / (1 - kept).sqrt()
         return noise if self.prediction == "epsilon" else CLEAN.expand_as(noisy)
+
+
+@pytest.mark.parametrize(
+    ("config", "name"),
+    [
+        (DiffusionConfig, "diffusion_steps"),
+        (FlowConfig, "segments"),
+        (EquivariantConfig, "hidden"),
+        (EquivariantConfig, "action_fields"),
+    ],
+)
+def test_amounts_that_no_policy_can_have_are_refused(config, name):
+    with pytest.raises(InvalidArgumentError, match=f"{name}=0 must be at least 1; give a larger number"):
+        config(**{name: 0})
+    with pytest.raises(InvalidArgumentError, match="noise_draws=0"):  # the settings of every policy are checked, too
+        config(noise_draws=0)
 
 
 @pytest.mark.parametrize("prediction", ["epsilon", "sample"])
