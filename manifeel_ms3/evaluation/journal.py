@@ -17,6 +17,7 @@ import jsonschema
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, write_text
+from manifeel_ms3.nested_settings import differing
 
 from .result import not_finite, result_schema
 from .rollout import EpisodeOutcome, outcome_as_json, outcome_from_json
@@ -127,7 +128,7 @@ class Journal:
 
     def _check_same(self, evaluation: Any, episodes: int) -> None:
         now, before = json.loads(self._first_line), evaluation if isinstance(evaluation, dict) else {}
-        if different := [name for name in sorted(now.keys() | before.keys()) if now.get(name) != before.get(name)]:
+        if different := [name for name, _, _ in differing(before, now)]:
             raise OtherEvaluationError(
                 f"{self.path} holds {episodes} episodes of an unfinished evaluation with another {', '.join(different)}; run "
                 "the command that began it, give another --out, or discard these episodes with --overwrite"

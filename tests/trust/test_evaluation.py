@@ -192,8 +192,8 @@ def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp
     with pytest.raises(OtherEvaluationError, match=r"holds 1 episodes of .* another config, env_kwargs.*--overwrite"):
         main(args)
     assert journal.path.read_text() == before
-    for changed in (dict(git_commit="0" * 40), dict(versions=dict(torch="3"))):
-        with pytest.raises(OtherEvaluationError, match=next(iter(changed))):
+    for changed, name in ((dict(git_commit="0" * 40), "git_commit"), (dict(versions=dict(torch="3")), "versions.torch")):
+        with pytest.raises(OtherEvaluationError, match=f"with another {name};"):
             Journal(args.out, IDENTITY | changed, evaluation_seeds(2))
     with pytest.raises(OtherEvaluationError, match="another seeds"):
         Journal(args.out, IDENTITY, evaluation_seeds(3))
