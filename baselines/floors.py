@@ -19,6 +19,7 @@ import tyro
 from tyro.conf import arg
 
 from baselines.registry import policy_spec, preset_cli
+from manifeel_ms3.arguments import several_of
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
@@ -64,8 +65,10 @@ def main(args: Args) -> list[Path]:
 
     Raises:
         UnknownNameError: A task is not registered.
+        InvalidArgumentError: A policy is not known.
         DemonstrationError: The demonstrations of a task are missing or broken.
     """
+    several_of("--policies", args.policies, POLICIES)
     return [_measure_task(env_id, args) for env_id in args.tasks or all_tasks()]
 
 

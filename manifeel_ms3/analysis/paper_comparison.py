@@ -82,7 +82,7 @@ def similarity_table(files: Sequence[Path]) -> str:
     """Markdown: FID and KID by modality and object, the paper's and those of files that `manifeel similarity` wrote.
 
     Raises:
-        ResultError: A file was not written by `manifeel similarity`.
+        InvalidFileError: A file was not written by `manifeel similarity`.
     """
     measured = [_similarity(path) for path in files]
     rows = []

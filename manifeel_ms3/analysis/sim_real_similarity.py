@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -21,6 +21,7 @@ import torch
 import tyro
 from scipy import linalg
 
+from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.demonstrations.formats.touch_units import recorded_sensor
@@ -66,7 +67,7 @@ class Args:
     features: str
     """Features that images are compared by: "inception" (FID's own; needs the extra `similarity`), a ResNet of transformers
     ("microsoft/resnet-18", or a folder), or your own function ("module:function") from (N, H, W, 3) uint8 to (N, D)."""
-    modality: str = "tacrgb"
+    modality: Literal["tacrgb", "tacff"] = "tacrgb"
     """Modality that is read from trajectory files: "tacrgb" or "tacff"."""
     pad: str = "tactile_right"
     """Finger pad that is read from trajectory files: "tactile_left" or "tactile_right"."""
@@ -108,8 +109,10 @@ def main(args: Args) -> Similarity:
 
     Raises:
         SimilarityError: A set has too few images, one is broken, or the features are not available.
+        InvalidArgumentError: A number is less than 1.
         MissingExtraError: An extra that the features need is not installed.
     """
+    require_positive(limit=args.limit, resamples=args.resamples)
     sim_images, real_images = (images_of(folder, args) for folder in (args.sim, args.real))
     sim, real = _features_of([sim_images, real_images], features_by_name(args.features))
     result = Similarity(

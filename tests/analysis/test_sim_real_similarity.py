@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+import tyro
 from transformers import ConvNextImageProcessor, ResNetConfig, ResNetModel
 
 from manifeel_ms3.analysis import sim_real_similarity
 from manifeel_ms3.analysis.sim_real_similarity import Args, SimilarityError, fid, kid
-from manifeel_ms3.errors import MissingExtraError
+from manifeel_ms3.errors import InvalidArgumentError, MissingExtraError
 from tests.sample import observed_sample
 
 RNG = np.random.default_rng(0)
@@ -91,6 +92,16 @@ def test_force_fields_and_recordings_are_compared(folders):
     assert same.fid.value == pytest.approx(0, abs=1e-6)
     with pytest.raises(SimilarityError, match="lacks tacrgb of tactile_left"):
         sim_real_similarity.main(Args(recording, recording, OWN, "tacrgb", "tactile_left", out=folders / "out"))
+
+
+def test_a_modality_or_a_number_that_is_not_allowed_is_refused(folders, capsys):
+    given = ["--sim", str(folders / "sim"), "--real", str(folders / "real"), "--features", OWN]
+    with pytest.raises(SystemExit):  # and not compared as if it were a force field
+        tyro.cli(Args, args=[*given, "--modality", "tacrbg"])
+    assert "tacrgb" in capsys.readouterr().err
+    for name in ("limit", "resamples"):
+        with pytest.raises(InvalidArgumentError, match=f"--{name} 0 must be at least 1"):
+            sim_real_similarity.main(tyro.cli(Args, args=[*given, f"--{name}", "0"]))
 
 
 def test_a_recording_in_other_units_than_newtons_is_refused(tmp_path, folders):

@@ -10,11 +10,18 @@ import tyro
 from baselines import floors
 from baselines.references import RandomActions
 from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.floors import FLOORS_SCHEMA, POLICIES, floors_file, floors_of, highest_floor
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.tasks_and_marks import PEG, needs_renderer
 
 NUT, SEARCH = "ManiFeel-NutBoltAssembly-v1", "ManiFeel-ObjectSearch-v1"
+
+
+def test_a_policy_that_is_not_known_is_named_before_anything_is_measured(tmp_path):
+    with pytest.raises(InvalidArgumentError, match=r"--policies='trained' is unknown; choose from \['random', 'mean action'"):
+        floors.main(floors.Args((NUT,), ("random", "trained"), out=tmp_path))
+    assert not list(tmp_path.iterdir())
 
 
 def test_random_actions_are_drawn_by_the_seed_of_the_episode():
