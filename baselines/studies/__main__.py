@@ -172,7 +172,7 @@ def _start_ray(address: str | None) -> None:
 
 
 def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console: Console) -> dict[str, str]:
-    """Run every job, show the progress until none is left, and return the errors by the jobs' keys.
+    """Run every job that is not done, show the progress until none is left, and return the errors by the jobs' keys.
 
     A job is given to Ray when its resources are free, so that jobs run in the study's order: Ray itself would do all recordings
     first, since these wait for nothing.
@@ -183,14 +183,14 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
         worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform_in)  # a new process for each job
         _require_resources(study)
         results: dict[str, Any] = {}
-        waiting, running = list(jobs), dict[Any, Job]()
+        waiting, running = [job for job in jobs if not is_done(job, root)], dict[Any, Job]()
         with Live(console=console, refresh_per_second=1) as live:
             while waiting or running:
                 while job := _next_job(study, waiting, running):
                     waiting.remove(job)
                     needs = study.resources[job.kind]
                     task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
-                    needed = [results[need.key] for need in job.needs]
+                    needed = [results[need.key] for need in job.needs if need.key in results]
                     results[job.key] = task.remote(Path.cwd(), job, root, needs, *needed)
                     running[results[job.key]] = job
                 if not running:

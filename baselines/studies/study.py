@@ -38,6 +38,8 @@ OF_THE_STUDY = {
     "keep": "`checkpoints`",
     "demos": "`demos`",
     "run-dir": "--root",
+    "resume": "the same command again",
+    "overwrite": "another --root",
 }
 """Flags of `manifeel train` that a study sets itself, and what it takes them from."""
 MOST_VALUES = 10_000

@@ -19,11 +19,12 @@ from baselines.common.checkpoint import as_json
 from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import observation_spec
 from baselines.common.train_args import planned_steps
+from baselines.registry import policy_spec, preset_cli
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import require_valid_flags, shell_command, training_args
 from baselines.studies.jobs import is_done, perform
-from baselines.studies.study import Job, Resources, StudyError, jobs_of, read_study
+from baselines.studies.study import OF_THE_STUDY, Job, Resources, StudyError, jobs_of, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
@@ -260,6 +261,14 @@ def test_the_printed_evaluation_does_the_same(study, tmp_path, half_precision):
     assert evaluation.checkpoint == Path(checkpoint)
 
 
+def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
+    """A flag that is renamed must be renamed in these lists, too."""
+    with pytest.raises(SystemExit):
+        preset_cli(policy_spec("diffusion_policy"), ["cpu", "--help"])
+    known = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
+    assert known >= {f"--{name}" for name in (*OF_THE_STUDY, *cost.AMOUNT_FLAGS)}
+
+
 @pytest.mark.parametrize(
     ("content", "word"),
     [
@@ -308,6 +317,7 @@ def test_the_printed_evaluation_does_the_same(study, tmp_path, half_precision):
         ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {num_demos: 5}}]", "'num_demos' is set by .* use `num_demos`"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {demo-path: x.h5}}]", "'demo-path' is set by .* use `demos`"),
+        ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {overwrite: true}}]", "'overwrite' is set by .* another --root"),
         (
             "grids: [{tasks: [ManiFeel-PegInsertion-v1], encoder_flags: {t3: {obs-mode: rgb}}}]",
             "encoder_flags/t3: 'obs-mode' is set by the study itself",

@@ -16,13 +16,17 @@ from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
-from baselines.common.train_args import PAPER_EPOCHS, TrainArgs, check_run, planned_steps
+from baselines.common.train_args import FREE_ON_RESUME, PAPER_EPOCHS, TrainArgs, check_run, planned_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
+from baselines.studies.study import OF_THE_MACHINE
+from manifeel_ms3.analysis.condition import NO_SETTINGS, OF_MODALITIES, settings_of
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, PluginError, WorkFailedError
+from manifeel_ms3.evaluation.checkpoint_config import CONFIG
+from manifeel_ms3.evaluation.result import PATHS
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
 
@@ -192,6 +196,15 @@ def trainer_args(demos, tmp_path):
     )
     run = dict(demos=(demos,), obs_mode="tacff", cameras=(), policy=policy, run_dir=tmp_path, batch_size=4, steps=6, log_freq=4)
     return dataclasses.replace(paper, **run, device="cpu", precision="fp32", compile=False)
+
+
+def test_lists_of_settings_name_settings_that_there_are(trainer_args):
+    """A setting that is renamed must be renamed in these lists, too."""
+    checkpoint = Trainer(trainer_args, diffusion.DiffusionPolicy, Processes("cpu")).save()
+    config = json.loads((checkpoint / CONFIG).read_text())
+    known = config.keys() | {field.name for field in dataclasses.fields(TrainArgs)}
+    assert known >= {*FREE_ON_RESUME, *NO_SETTINGS, *OF_THE_MACHINE, *PATHS}
+    assert {name for name, _ in settings_of(config, "rgb+tacrgb+tacff")} >= set(OF_MODALITIES)
 
 
 def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(trainer_args):
