@@ -113,7 +113,11 @@ def _unit_sphere() -> trimesh.Trimesh:
 
 
 def _primitive(shape) -> trimesh.Trimesh:
-    """Mesh of a visual or collision shape that is a box, sphere, capsule, cylinder or plane."""
+    """Mesh of a visual or collision shape that is a box, sphere, capsule, cylinder or plane.
+
+    Capsules and cylinders are made with a radius of 1 and then scaled: trimesh leaves out triangles of less than 1e-8 square
+    units, which in metres would open the tips of capsules and the ends of thin cylinders.
+    """
     kind = type(shape).__name__.removeprefix("RenderShape").removeprefix("PhysxCollisionShape")
     x_from_z = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])  # SAPIEN's axis is x, trimesh's z
     if kind == "Box":
@@ -121,13 +125,12 @@ def _primitive(shape) -> trimesh.Trimesh:
     if kind == "Sphere":
         return _unit_sphere().copy().apply_scale(shape.radius)
     if kind == "Capsule":
-        capsule = trimesh.creation.capsule(
-            height=2 * shape.half_length, radius=shape.radius, count=[CAPSULE_SECTIONS, CAPSULE_SECTIONS]
-        )
-        return capsule.apply_transform(x_from_z)
+        count = [CAPSULE_SECTIONS, CAPSULE_SECTIONS]
+        capsule = trimesh.creation.capsule(height=2 * shape.half_length / shape.radius, radius=1.0, count=count)
+        return capsule.apply_scale(shape.radius).apply_transform(x_from_z)
     if kind == "Cylinder":
-        cylinder = trimesh.creation.cylinder(radius=shape.radius, height=2 * shape.half_length, sections=CYLINDER_SECTIONS)
-        return cylinder.apply_transform(x_from_z)
+        cylinder = trimesh.creation.cylinder(radius=1.0, height=2.0, sections=CYLINDER_SECTIONS)
+        return cylinder.apply_scale([shape.radius, shape.radius, shape.half_length]).apply_transform(x_from_z)
     if kind == "Plane":
         slab = trimesh.creation.box(extents=(PLANE_THICKNESS, 2 * PLANE_HALF_SIZE, 2 * PLANE_HALF_SIZE))
         return slab.apply_translation([-PLANE_THICKNESS / 2, 0, 0])  # SAPIEN's plane: normal along x
