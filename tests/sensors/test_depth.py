@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sapien
+import torch
 import trimesh
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.geometry.containers import CONTAINER_HEIGHT, CONTAINER_OUTER, container
 from manifeel_ms3.sensors import TactileSensor, sensor_config
+from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from manifeel_ms3.verification.press import PadBench
 from tests.tasks_and_marks import needs_renderer
@@ -160,6 +162,73 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
     names = {surface.body.name for surface in sensor._depth.surfaces}
     assert {"table", "cube", "slab", "gel_left"} <= names
     assert not names & {"gel_right", "panda_rightfinger", "panda_hand"}
+    env.close()
+
+
+def test_a_static_body_is_felt_where_an_episode_puts_it():
+    def build(env):
+        builder = env.scene.create_actor_builder()
+        builder.add_box_collision(half_size=[3e-3] * 3)
+        builder.initial_pose = sapien.Pose([0, 0, 2])
+        return [builder.build_static("post")]
+
+    env = PadBench(build, obs_mode="tacff", render_backend="none")
+    sensor = env._tactile_sensors["tactile_right"]
+    for depth in (2e-4, 5e-4):
+        env.place(env.objects[0], sapien.Pose([0, 0, 3e-3 - depth]))
+        sensor._depth.look()
+        assert sensor._depth.heights(sensor.model.cells).max().item() == pytest.approx(depth, abs=5e-6)
+    env.close()
+
+
+def test_velocity_is_along_the_surface_of_a_body_that_turns():
+    """A plate aslant: v + w x p at the point that a ray meets, without its part along the normal of the plate; pad frame."""
+    x = np.array([[0.0, 0.0], [4e-3, 0.0], [0.0, -6e-3], [-3e-3, 5e-3]])
+    slope = 0.1  # rad about y
+    plate = trimesh.creation.box([0.03, 0.04, 0.01]).apply_translation([0, 0, 5e-3])
+    in_pad = sapien.Pose([0, 0, -1e-4], [np.cos(slope / 2), 0, np.sin(slope / 2), 0])
+    pad = sapien.Pose([0.3, -0.2, 0.5], [0.5, -0.5, 0.5, 0.5])
+    body = pad * in_pad
+    rays = MeshRays([[plate]], (0.024, 0.032), torch.device("cpu"))
+    rays.move(
+        *(
+            torch.tensor([*pose.p, *pose.q[[1, 2, 3, 0]]]).float().view(shape)
+            for pose, shape in ((body, (1, 1, 7)), (pad, (1, 7)))
+        )
+    )
+    twist = np.array([0.02, -0.01, 0.03, 1.0, -2.0, 3.0])  # m/s, rad/s
+    height, velocity = rays.sliding(torch.tensor(x).float(), torch.tensor(twist).float().view(1, 1, 6))
+    expected = 1e-4 + x[:, 0] * np.tan(slope)
+    assert height[0].numpy() == pytest.approx(expected, abs=1e-6)
+    v = twist[:3] + np.cross(twist[3:], np.c_[x, -expected])
+    normal = np.array([np.sin(slope), 0, np.cos(slope)])
+    assert velocity[0].numpy() == pytest.approx((v - (v @ normal)[:, None] * normal)[:, :2], abs=1e-6)
+
+
+def test_velocity_counts_from_the_centre_of_mass():
+    """A block that turns about a point far from its origin: the engine's velocity is that of its centre of mass."""
+
+    def build(env):
+        builder = env.scene.create_actor_builder()
+        builder.add_box_collision(half_size=[0.01, 0.01, 5e-3])
+        builder.set_mass_and_inertia(0.1, sapien.Pose([0.02, -0.01, 0.03]), [1e-4] * 3)
+        builder.initial_pose = sapien.Pose([0, 0, 2])
+        return [builder.build("block")]
+
+    env = PadBench(build, obs_mode="tacff", render_backend="none")
+    sensor, pad = env._tactile_sensors["tactile_right"], env.agent.gels["right"].pose.sp
+    axes = pad.to_transformation_matrix()[:3, :3]
+    env.place(env.objects[0], sapien.Pose([0, 0, 5e-3]))
+    linear, spin = np.array([0.02, -0.01, 0.0]), np.array([0.5, -1.0, 2.0])  # pad frame
+    body = env.objects[0]._bodies[0]
+    body.set_linear_velocity(axes @ linear)
+    body.set_angular_velocity(axes @ spin)
+    sensor._depth.look()
+    points = np.array([[0.0, 0.0], [5e-3, -4e-3]])
+    _, velocity = sensor._depth.sliding(torch.tensor(points).float())
+    centre = np.array([0.02, -0.01, 0.035])
+    of_body = linear + np.cross(spin, np.c_[points, np.zeros(2)] - centre)
+    assert velocity[0].numpy() == pytest.approx(-of_body[:, :2], abs=1e-4)  # the pad rests
     env.close()
 
 

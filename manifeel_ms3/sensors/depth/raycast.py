@@ -4,7 +4,7 @@
 # (warp reads a kernel's annotations as its own types, and its stubs do not know the vectors' operators)
 """Depth by rays: warp rays from the pad, parallel to its normal, against triangle meshes. Needs no renderer."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sapien
@@ -279,16 +279,11 @@ class RaycastDepth:
         self._rays = MeshRays(meshes, size, self.device, sag)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
         self._world[..., 3] = 1.0
-        self._moving = [b for b, surface in enumerate(self.surfaces) if not _is_static(surface.body)]
-        self._take_poses(range(len(self.surfaces)))
-
-    def _take_poses(self, indices: Iterable[int]) -> None:
-        for b in indices:
-            self._world[self.surfaces[b].env_idx, b] = self.surfaces[b].body.pose.raw_pose
 
     def look(self) -> None:
-        """Read the present poses."""
-        self._take_poses(self._moving)
+        """Read the present poses, also those of static bodies, which a task may move when an episode begins."""
+        for b, surface in enumerate(self.surfaces):
+            self._world[surface.env_idx, b] = surface.body.pose.raw_pose
         self._pad_world = (self.pad.pose * self._pad_pose).raw_pose
         self._rays.move(_xyzw(self._world), _xyzw(self._pad_world))
 

@@ -8,7 +8,8 @@ from mani_skill.utils.structs import Articulation, Link
 class WrenchGauge:
     """Measures the force and moment of the world on one link, in a frame fixed to it, about that frame's origin.
 
-    The engine's spatial force of a joint is the force of the child link on its parent, in the joint's frame. SAPIEN's joint
+    The engine's spatial force of a joint is what the parent link exerts on the child (PhysX's incoming joint force), in the
+    joint's frame. On a link at rest, it balances the force of the world, which therefore has the opposite sign. SAPIEN's joint
     frames are turned against the link's (by half a turn about x for fixed joints). Contact queries would leave out friction.
     The wrench includes the link's own inertia, and its weight unless its gravity is off, as on ManiSkill's robots.
 
