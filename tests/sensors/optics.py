@@ -1,5 +1,7 @@
 """The optics of the R1.5, for pads without a simulation."""
 
+import cv2
+import numpy as np
 import torch
 
 from manifeel_ms3.sensors import gelsight_r15, with_options
@@ -18,3 +20,9 @@ def background(optics: Optics) -> torch.Tensor:
 
 def make_optics(num_pads: int = 1, **fields) -> Optics:
     return Optics(with_options(CONFIG, fields), GRID, num_pads, CPU)
+
+
+def dots(image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Middles (n, 2), as column and row, and areas (n,) of the dark dots of an image, in pixels."""
+    _, _, stats, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))
+    return centres[1:], stats[1:, cv2.CC_STAT_AREA]

@@ -17,7 +17,7 @@ from manifeel_ms3.sensors.optics.tacrgb import Optics
 from manifeel_ms3.sensors.optics.taxim_table import fit_table, portrait_place, read_table
 from manifeel_ms3.verification.published_colours import change_images, pressed_shapes, published_table, ssim
 from tests.sensors.make_calibration import write_table
-from tests.sensors.optics import CONFIG, CPU, GRID, background, make_optics
+from tests.sensors.optics import CONFIG, CPU, GRID, background, dots, make_optics
 from tests.sensors.readers import photometric_stereo
 
 
@@ -173,12 +173,6 @@ def test_sensors_have_their_own_colours():
     for lamp, colour, degrees in ((red, (1, 0, 0), 30), (green, (0, 1, 0), 150), (blue, (0, 0, 1), 270)):
         assert lamp.colour == colour
         assert np.rad2deg(np.arctan2(lamp.position[1], lamp.position[0])) % 360 == pytest.approx(degrees)
-
-
-def dots(image: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Middles (n, 2), as column and row, and areas (n,) of the dark dots of an image, in pixels."""
-    _, _, stats, centres = cv2.connectedComponentsWithStats((image.numpy().astype(int).sum(-1) < 180).astype(np.uint8))
-    return centres[1:], stats[1:, cv2.CC_STAT_AREA]
 
 
 def test_markers_move_with_the_shear_spread_and_swell_where_pressed():
@@ -371,6 +365,28 @@ def test_a_slope_towards_a_lamp_is_lit_by_lamberts_law():
     assert mean == pytest.approx([60, 60, 0], abs=0.1)
     near, far = (np.array([1, 0, c, 0, 0, c * c]) @ shader.background[0] for c in (1, -1))
     assert near > 1.5 * far
+
+
+@pytest.mark.parametrize("curvature", [(0.0, 0.0), (8.0, 12.0)])
+def test_levels_of_several_lamps_fall_with_the_square_of_their_distance(curvature):
+    """I = sum of a (n . l) / r^2 over the lamps, on a flat face and on a dome; each lit channel has the given mean."""
+    lamps = (Light((0.05, -0.03, -0.04), (2.0, 0.0, 0.5)), Light((-0.04, 0.05, -0.06), (1.0, 0.0, 3.0)))
+    shader = lamp_shader(LightsConfig(lamps, level=80.0), curvature, (240, 320), CONFIG.pixel_size)
+    r, c = (places.ravel() for places in np.meshgrid(*[np.linspace(-1, 1, 9)] * 2, indexing="ij"))
+    x, y = 119.5 * CONFIG.pixel_size * r, 159.5 * CONFIG.pixel_size * c
+    along = np.array(curvature)
+    skin = np.c_[x, y, -(along[0] * x**2 + along[1] * y**2) / 2]  # of a dome that is shallow
+    normal = np.c_[-along[0] * x, -along[1] * y, -np.ones_like(x)]  # towards the lamps
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    level = np.zeros((len(x), 3))
+    for lamp in lamps:
+        ray = np.array(lamp.position) - skin
+        distance = np.linalg.norm(ray, axis=1)
+        level += ((normal * ray).sum(1) / distance**3)[:, None] * np.array(lamp.colour)
+    lit = [0, 2]
+    found = place_terms(r, c) @ shader.background.T
+    assert found[:, lit] == pytest.approx(80.0 * level[:, lit] / level[:, lit].mean(0), rel=0.02)
+    assert (found[:, 1] == 0).all()
 
 
 @pytest.mark.parametrize("sensor", ["gelsight_mini", "digit"])

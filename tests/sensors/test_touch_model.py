@@ -8,6 +8,7 @@ import torch
 from manifeel_ms3.sensors import GelConfig, TactileSensorConfig, grids_for, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel
+from tests.sensors.optics import dots
 from tests.sensors.pads import CONFIG, CPU, EVERYTHING, LOADS, meshes, pressed
 
 
@@ -84,6 +85,21 @@ def test_randomised_gel_sinks_otherwise_under_the_same_force():
     assert deepest.unique().numel() == 8
     assert deepest.max() / deepest.min() < np.sqrt(1.3 / 0.7) + 0.01  # a ball: depth goes with the root of the stiffness
     assert seen["force_field"][..., 0].sum((1, 2)).tolist() == pytest.approx([5.0] * 8, rel=1e-5)
+
+
+def test_the_skin_of_a_softer_gel_is_sheared_further_by_the_same_force():
+    """Dots within a contact that sticks move by F / (k_t A), and k_t is the stiffness that the episode drew."""
+    pads = model(4, **{"randomization.stiffness": 0.5, "optics.markers": True})
+    load = torch.tensor([[1.0, -1.5, -5.0, 0, 0, 0]], dtype=torch.float64).repeat(4, 1)
+    image = pads.observe(pressed([meshes()[2]] * 4), load)["rgb"]
+    middle = np.array([159.5, 119.5])
+    places = [places[np.linalg.norm(places - middle, axis=1).argmin()] for places, _ in map(dots, image)]
+    moved = (np.array(places) - middle)[:, ::-1] * CONFIG.pixel_size  # m along x and y
+    stiffness, _ = pads.config.randomization.draw_gels(np.arange(4))
+    assert np.ptp(stiffness) > 0.3
+    area = pads.grid.area * (pads.heights(pressed([meshes()[2]] * 4))[0] > -1e-4).sum().item()
+    expected = np.outer(1 / (stiffness * CONFIG.gel.shear_stiffness * area), [1.0, -1.5])
+    assert moved == pytest.approx(expected, abs=3e-5)  # a third of a pixel
 
 
 def test_randomised_friction_bounds_the_shear_of_each_pad():
