@@ -53,7 +53,7 @@ class Imperfections:
         }
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
         self._held = torch.zeros(num_pads, *config.taxel_shape, device=device)  # normal reading of the play operator
-        self._surface: torch.Tensor | None = None  # (N, H, W), m
+        self._surface = torch.zeros(num_pads, *config.image_shape, device=device)  # m into the gel
         self._past: dict[str, torch.Tensor] = {}  # by output: (N, steps + 1, ...), steps in turn
 
     @property
@@ -64,9 +64,8 @@ class Imperfections:
     @property
     def memory(self) -> dict[str, torch.Tensor]:
         """What the next observation depends on besides the present state, (N, ...) each; not copies."""
-        own = dict(frame=self._frame, held=self._held)
-        surface = {} if self._surface is None else dict(surface=self._surface)
-        return own | surface | {f"past_{name}": values for name, values in self._past.items()}
+        own = dict(frame=self._frame, held=self._held, surface=self._surface)
+        return own | {f"past_{name}": values for name, values in self._past.items()}
 
     def reset(self, pads: torch.Tensor, seeds: np.ndarray) -> None:
         """Begin an episode on these pads, with draws from the seeds (one for each pad) and no memory."""
@@ -79,13 +78,10 @@ class Imperfections:
         """Let the next observation of these pads be the first one of their episodes."""
         self._frame[pads] = 0
         self._held[pads] = 0.0
-        if self._surface is not None:
-            self._surface[pads] = 0.0
+        self._surface[pads] = 0.0
 
     def recovered_surface(self, penetration: torch.Tensor) -> torch.Tensor:
         """Penetration (N, H, W), m, of a gel that recovers late; `penetration` is that of the object that presses now."""
-        if self._surface is None:
-            self._surface = torch.zeros_like(penetration)
         self._surface = self._play(self._surface, penetration)
         return self._surface
 

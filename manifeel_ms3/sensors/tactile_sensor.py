@@ -151,8 +151,8 @@ class TactileSensor(BaseSensor):
 
         `rgb`: uint8 (N, 240, 320, 3). `force_field`: float32 (N, 10, 14, 3), N per taxel, pad frame, force of the object on the
         gel: normal (>= 0, into the gel), shear along increasing rows, shear along increasing columns. `penetration`: float32
-        (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`. Sizes are those of the sensor's
-        configuration.
+        (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`. Drift and noise
+        (`ImperfectionConfig`) may make a normal reading negative. Sizes are those of the sensor's configuration.
         """
         return dict(self._obs)
 

@@ -215,6 +215,13 @@ def test_a_pad_that_is_not_read_keeps_its_last_reading_and_all_that_it_remembers
             assert not torch.equal(kept["force_field"][1], seen["force_field"][1])
 
 
+def test_a_pad_that_is_not_yet_read_remembers_nothing():
+    """The first reading of all is that of one pad, under a load that the other one never sees."""
+    pads, fresh = (Pad(("rgb",), seeds=(3, 4), hysteresis=0.5) for _ in range(2))
+    pads.under(8.0, pads=torch.tensor([1]))
+    assert torch.equal(pads.under(5.0)["rgb"][0], fresh.under(5.0)["rgb"][0])
+
+
 def test_info_says_what_an_episode_drew(make_env):
     options = dict(obs_mode="tacff", render_backend="none", imperfections=dict(gain=(0.0, 0.2), delay=(0, 2), dead_taxels=0.1))
     env = make_env(**options)
