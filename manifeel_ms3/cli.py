@@ -37,20 +37,20 @@ COMMANDS = {
     "dataset": Command("manifeel_ms3.demonstrations.dataset", "Record the paper's number of demonstrations of every task."),
     "replay": Command("manifeel_ms3.demonstrations.replay", "Run recorded actions again."),
     "render-observations": Command("manifeel_ms3.demonstrations.render_observations", "Add observations to recorded states."),
-    "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files."),
+    "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files for errors."),
     "view": Command("manifeel_ms3.demonstrations.view", "Look at a recorded episode in Rerun."),
     "film": Command("manifeel_ms3.videos.__main__", "Make a video of recorded or evaluated episodes."),
     "summary": Command("manifeel_ms3.demonstrations.summary", "Summarize the content of a recorded file."),
     "export": Command("manifeel_ms3.demonstrations.export", "Export demonstrations to LeRobot, the paper's zarr, or npz."),
     "eval": Command("manifeel_ms3.evaluation.evaluate", "Evaluate a policy on fixed seeds."),
     "report": Command("manifeel_ms3.evaluation.report", "Write a page about one training run."),
-    "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's figures."),
-    "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on the results at hand."),
+    "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's numbers."),
+    "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on your results."),
     "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Check a submission, or build the leaderboard's page."),
     "verify-sensor": Command("manifeel_ms3.verification.__main__", "Verify a tactile sensor by known loads."),
     "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how similar simulated and real touch are."),
     "audit": Command(
-        "manifeel_ms3.analysis.information_audit", "Measure how well each sense answers questions about each task."
+        "manifeel_ms3.analysis.information_audit", "Measure how much a camera, TacRGB and TacFF reveal in each task."
     ),
 }
 """The package's own commands by their names."""
@@ -99,7 +99,7 @@ def _run(arguments: list[str]) -> Any:
         name = arguments[0]
         module = command_module(name)
         getattr(module, "check_arguments", lambda _: None)(arguments[1:])
-        args = tyro.cli(module.Args, prog=f"manifeel {name}", args=arguments[1:])
+        args = tyro.cli(module.Args, prog=f"manifeel {name}", description=commands[name].about, args=arguments[1:])
         import_typed_tasks(args)
         answer = module.main(args)
         if hasattr(module, "next_step"):

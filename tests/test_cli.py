@@ -38,6 +38,12 @@ def test_all_commands_are_listed(capsys):
     )
 
 
+def test_the_help_of_a_command_says_what_it_does(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["replay", "--help"])
+    assert cli.COMMANDS["replay"].about in capsys.readouterr().out
+
+
 def test_a_command_runs(capsys):
     assert cli.main(["tasks"]) == 0
     said = capsys.readouterr().out

@@ -27,14 +27,15 @@ class EncoderConfig:
     "resnet18_keypoints" has the spatial softmax of the paper's text; "small_cnn" is for a CPU, "fine_cnn" for a CPU and
     images of 160 pixels."""
     tacrgb: str = "resnet18"
-    """Network of each TacRGB image, by its name in `TACRGB_ENCODERS`."""
+    """Network of each TacRGB image: one of the networks of cameras, "unit", "unit_released", "t3", "anytouch", "sparsh", or one
+    that another package adds."""
     freeze_tacrgb: bool = False
     """Keep the weights of a pretrained TacRGB network as they were loaded, and train only the layers after it."""
     tacrgb_sensor: str | None = None
     """Sensor whose published weights the TacRGB network uses, if every sensor has weights of its own (t3: "mini", "gs_green",
     ...; anytouch: "gelsight", "gelsight_mini", ...); if not given, the first, which the paper's public code uses."""
     force_field: str = "resnet18"
-    """Network of each TacFF force field, by its name in `FIELD_ENCODERS`."""
+    """Network of each TacFF force field: "resnet18" as in the paper, or "small", which is for a CPU."""
     image_features: int = 512
     """Number of features of each camera image. With "resnet18_keypoints" they are the two coordinates of half as many points,
     of which Diffusion Policy has 32."""

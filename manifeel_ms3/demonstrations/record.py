@@ -65,7 +65,7 @@ class Args:
     env_kwargs: str = "{}"
     """Further arguments of the task as json, such as '{"fit": "tight", "randomization": {"socket_xy": 0.01}}'."""
     max_tries: int = 10
-    """Number of seeds to try before giving up, as a multiple of `num`."""
+    """Number of seeds to try before giving up, as a multiple of --num-demos."""
 
     @property
     def path(self) -> Path:

@@ -54,9 +54,9 @@ class Args:
     checkpoint: Path | None = None
     """Checkpoint folder, with config.json and weights."""
     entry: str | None = None
-    """Entry of the leaderboard to run again instead of a checkpoint of one's own, such as cpu/PegInsertion/rgb+tacff, with the
-    settings of its result, of which --env-kwargs, --inference-steps, --device and --batch-size change single ones; if none is
-    changed, the command says in how many episodes the outcomes agree."""
+    """Entry of the leaderboard, such as cpu/PegInsertion/rgb+tacff, whose checkpoint is evaluated again with the settings of
+    its result; the command reports in how many episodes the outcomes agree. --env-kwargs, --inference-steps, --device and
+    --batch-size change single settings; the outcomes are then not compared."""
     policy: str | None = None
     """Policy to evaluate instead of a checkpoint: a class that can be imported ("module:Class"), or the address of a server
     ("http://localhost:8000")."""
@@ -80,8 +80,7 @@ class Args:
     """Discard the finished episodes of an evaluation that was interrupted, and begin again. Without this flag the evaluation
     goes on if nothing has changed, and is refused otherwise. It cannot be known whether the policy of a server has changed."""
     overwrite_other: bool = False
-    """Begin again where an evaluation that was interrupted would be refused, because something has changed, and go on with it
-    otherwise."""
+    """If an evaluation was interrupted and something has changed since, begin again; if nothing has changed, go on with it."""
     episodes: Annotated[int, tyro.conf.arg(name="num-eval-episodes", aliases=["--episodes"])] = 50
     """Number of episodes; their seeds are 100000 and the following numbers."""
     seeds: Path | None = None
@@ -97,8 +96,8 @@ class Args:
     """Number of episodes that a checkpoint's policy answers together; 1 on the CPU and 16 on a GPU if not given. Actions of
     other batch sizes differ in the last bits."""
     stop_at_success: bool = False
-    """End an episode at success or failure, which is cheaper; the result then lacks success_at_end and fail_at_end. Without
-    this flag every episode runs to the time limit of the task, as in ManiSkill's evaluation."""
+    """End an episode at success or failure, which is cheaper; the result then lacks success_at_end, fail_at_end and
+    success_paper. Without this flag every episode runs to the time limit of the task, as in ManiSkill's evaluation."""
     step_timeout: float = STEP_TIMEOUT
     """Longest time that the policy may take for one action, in s."""
     env_kwargs: str = "{}"
