@@ -1,7 +1,7 @@
 """Serve a policy over HTTP, from any Python that has numpy; nothing of ManiFeel needs to be installed there.
 
 python examples/policy_server.py --port 8000
-python -m manifeel_ms3.evaluation.evaluate --policy http://localhost:8000 --env-id ManiFeel-PegInsertion-v1 --obs-mode rgb+tacff
+manifeel eval --policy http://localhost:8000 --env-id ManiFeel-PegInsertion-v1 --obs-mode rgb+tacff
 """
 
 import argparse
