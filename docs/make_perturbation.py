@@ -30,8 +30,9 @@ leaderboard entry `{entry}` was trained under the usual appearance and evaluated
 changes of the [appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. It observes the
 wrist camera and TacFF; touch itself is not changed. All rows were evaluated on the same processor. Each difference, in
 percentage points, has a 95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm"
-is corrected for all rows (Holm 1979). One policy was tested: nothing here tells how other training seeds, sensings or tasks
-behave. The study `configs/perturbation.yaml` trains and evaluates three tasks with all sensings.
+is corrected for all rows (Holm 1979). One policy was tested: nothing here tells how other training seeds, observations or
+tasks behave. The study `configs/perturbation.yaml` trains and evaluates policies of three tasks, with vision alone, TacRGB
+and TacFF.
 
 """
 
