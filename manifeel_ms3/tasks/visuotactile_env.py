@@ -67,8 +67,8 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
 
     `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
     (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
-    the last control step, between the held object and the rest of the world) and the task's own measures. The `info` of a reset
-    also holds `language_instruction`, the task as a sentence for each environment.
+    the last control step, of both pads together on the held object, its weight and inertia included) and the task's own
+    measures. The `info` of a reset also holds `language_instruction`, the task as a sentence for each environment.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
 
