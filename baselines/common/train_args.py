@@ -10,7 +10,7 @@ import torch
 from tyro.conf import arg
 
 from manifeel_ms3.arguments import is_number, require_not_negative, require_positive
-from manifeel_ms3.command_line import json_object
+from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.checks import check_argument_names
 from manifeel_ms3.tasks.registry import short_name, task_spec
@@ -193,11 +193,20 @@ def check_evaluation(args: TrainArgs) -> None:
         args: Settings of the run, with its task.
 
     Raises:
-        InvalidArgumentError: They are not a json object, or the task does not take one of them.
+        InvalidArgumentError: They are not a json object, the task does not take one of them, or they ask for other observations
+            than those of the policy.
+        MissingExtraError: The extra that videos need is not installed.
     """
     assert args.env_id is not None
     given = json_object("--eval-env-kwargs", args.eval_env_kwargs)
     check_argument_names(task_spec(args.env_id).env_class, given.keys() - {"max_episode_steps"})  # which gym.make takes
+    if (other := given.get("obs_mode", args.obs_mode)) != args.obs_mode:
+        raise InvalidArgumentError(
+            f"--eval-env-kwargs have obs_mode {other!r}, but the policy observes {args.obs_mode!r}; leave it out there"
+        )
+    if args.capture_video:
+        with missing_extras_named():
+            import manifeel_ms3.evaluation.video  # noqa: F401
 
 
 def default_exp_name(args: TrainArgs, policy: str) -> str:

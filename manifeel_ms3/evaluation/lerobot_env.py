@@ -57,7 +57,7 @@ class LeRobotEnv(gym.Env):
         self._env: Any = CPUGymWrapper(registry.make_env(env_id, **kwargs))
         spec = registry.task_spec(env_id)
         self.task = spec.name
-        self.task_description = spec.instruction
+        (self.task_description,) = self._env.unwrapped.get_language_instruction()
         self._max_episode_steps = find_max_episode_steps_value(self._env)  # that of the task, or the one given
         self.action_space = self._env.action_space
         first, _ = self._env.reset()

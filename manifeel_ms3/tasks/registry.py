@@ -12,7 +12,7 @@ tasks are found through the entry point group `manifeel.tasks`.
 
 import inspect
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, TypeVar
@@ -51,6 +51,8 @@ class TaskSpec:
     """Number of demonstrations in the paper; `manifeel dataset` records as many."""
     instruction: str = ""
     """The task as one plain English sentence that tells a robot what to do, for policies that take language; "" if none."""
+    goal_instructions: Mapping[str, str] = field(default_factory=dict)
+    """Such sentences for the values of the task's argument `goal` that change what is to be done."""
     paper_tables: tuple[str, ...] = ()
     """Tables of the paper that report the task: "I", "II", "III"."""
     revision: int = 1
@@ -66,6 +68,10 @@ class TaskSpec:
     """Makes a scripted demonstrator from an environment and a seed; attached by `register_demonstrator`."""
     probes: list[Any] = field(default_factory=list)
     """Questions that the information audit asks of the task; attached by `manifeel_ms3.analysis.probes.register_probe`."""
+
+    def instruction_for(self, env_kwargs: Mapping[str, Any]) -> str:
+        """The sentence for the task with these arguments; "" if there is none."""
+        return self.goal_instructions.get(env_kwargs.get("goal", ""), self.instruction)
 
     @property
     def name(self) -> str:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import sys
 from contextlib import suppress
 from itertools import pairwise
 
@@ -16,7 +17,7 @@ from baselines.common.dataset import SampleOrder
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
-from baselines.common.train_args import FREE_ON_RESUME, PAPER_EPOCHS, TrainArgs, check_run, planned_steps
+from baselines.common.train_args import FREE_ON_RESUME, PAPER_EPOCHS, TrainArgs, check_evaluation, check_run, planned_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
@@ -24,7 +25,7 @@ from baselines.registry import PolicySpec, require_distinct
 from baselines.studies.study import OF_THE_MACHINE
 from manifeel_ms3.analysis.condition import NO_SETTINGS, OF_MODALITIES, settings_of
 from manifeel_ms3.demonstrations import read_demonstrations
-from manifeel_ms3.errors import InvalidArgumentError, MachineError, PluginError, WorkFailedError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError, MissingExtraError, PluginError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG
 from manifeel_ms3.evaluation.result import PATHS
 from tests.sample import states_sample
@@ -85,6 +86,7 @@ def test_numbers_that_no_run_can_meet_are_refused(settings, said):
     [
         (dict(eval_env_kwargs="{fit"), InvalidArgumentError, "--eval-env-kwargs '{fit' is not json"),
         (dict(eval_env_kwargs="[1]"), InvalidArgumentError, r"--eval-env-kwargs '\[1\]' is not a json object"),
+        (dict(eval_env_kwargs='{"obs_mode": "rgb"}'), InvalidArgumentError, "have obs_mode 'rgb', but the policy observes"),
         (dict(eval_env_kwargs='{"fits": "tight"}'), InvalidArgumentError, r"has no arguments \['fits'\]; choose from"),
         (dict(device="gpu"), InvalidArgumentError, "--device 'gpu' is no device of torch"),
         (dict(device="cuda:99"), MachineError, "--device cuda:99 is not there"),
@@ -95,6 +97,15 @@ def test_what_only_a_later_evaluation_or_step_would_meet_is_refused_at_the_start
     with pytest.raises(error, match=said):
         diffusion.SPEC.train(dataclasses.replace(args, **settings))
     assert not (tmp_path / "run/log.jsonl").exists()
+
+
+def test_videos_that_no_evaluation_could_make_are_refused_at_the_start(monkeypatch):
+    monkeypatch.delitem(sys.modules, "manifeel_ms3.evaluation.video", raising=False)
+    monkeypatch.setitem(sys.modules, "imageio", None)
+    args = TrainArgs((), env_id=PEG, num_eval_episodes=1)
+    check_evaluation(args)
+    with pytest.raises(MissingExtraError, match="imageio is not installed: pip install"):
+        check_evaluation(dataclasses.replace(args, capture_video=True))
 
 
 def test_the_task_is_that_of_the_demonstrations_unless_another_is_named():

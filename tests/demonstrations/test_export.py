@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,21 @@ def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):
         recorded_env_kwargs([folder])
     origin.unlink()  # a dataset of another source
     assert recorded_env_kwargs([folder]) == {}
+
+
+@pytest.mark.parametrize(("given", "word"), [({}, "lift it"), (dict(goal="bowls"), "orange bowl")])
+def test_the_sentence_of_a_lerobot_dataset_is_that_of_the_recorded_goal(tmp_path, given, word):
+    pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    sample = observed_sample("ManiFeel-BallSorting-v1")
+    recorded = Path(shutil.copy(sample, tmp_path / "trajectory.h5"))
+    header = json.loads(sample.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"] |= given
+    recorded.with_suffix(".json").write_text(json.dumps(header))
+    folder = export.main(export.Args(recorded, "lerobot", tmp_path / "lerobot"))
+    (sentence,) = pq.read_table(folder / "meta/episodes").column("tasks").to_pylist()[0]
+    assert word in sentence
 
 
 def test_a_lerobot_dataset_says_what_it_is(tmp_path):

@@ -10,6 +10,7 @@ from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, 
 from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_HEIGHT
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS
 from manifeel_ms3.tasks.placement import POINTING_DOWN, WORKSPACE_XY
+from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import needs_renderer
 
 SORTING, SEARCH = "ManiFeel-BallSorting-v1", "ManiFeel-ObjectSearch-v1"
@@ -223,6 +224,14 @@ def test_a_ball_counts_when_the_hand_has_let_go_of_it(make_env):
             *_, info = env.step(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, gripper]))
         assert bool(base.agent.is_grasping(base.tennis)) is not success
         assert bool(info["success"]) is success
+
+
+def test_the_instruction_is_that_of_the_goal(make_env):
+    for goal, word in (("lift", "lift it"), ("bowls", "orange bowl")):
+        env = make_env(SORTING, obs_mode="none", render_backend="none", goal=goal)
+        (sentence,) = env.unwrapped.get_language_instruction()
+        assert word in sentence
+        assert sentence == task_spec(SORTING).instruction_for(dict(goal=goal))
 
 
 def test_unknown_goal_is_refused(make_env):

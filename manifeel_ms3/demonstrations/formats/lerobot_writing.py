@@ -90,7 +90,7 @@ def _instruction(header: dict[str, Any]) -> str:
     """The sentence that tells a robot what to do; the id of a task that is not registered here, or has no sentence."""
     env_id = task_of(header)
     try:
-        return task_spec(env_id).instruction or env_id
+        return task_spec(env_id).instruction_for(header["env_info"]["env_kwargs"]) or env_id
     except UnknownNameError:
         return env_id
 

@@ -37,6 +37,7 @@ GOLF_BUILT_AT, TENNIS_BUILT_AT = (0.45, 0.0, 0.1), (0.55, 0.0, 0.1)
 """Positions at which the balls are built, in m, clear of each other; every reset moves them to their seats."""
 GOALS = ("lift", "bowls")
 """Names of the goals: lift the golf ball, or put each ball into its bowl."""
+BOWLS_INSTRUCTION = "Find the golf ball by touch, put it into the orange bowl, and put the table-tennis ball into the blue one."
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,7 @@ class BallSortingRewardConfig:
 @register_task(
     "ManiFeel-BallSorting-v1",
     instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
+    goal_instructions=dict(bowls=BOWLS_INSTRUCTION),
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,
@@ -108,6 +110,9 @@ class BallSortingEnv(VisuotactileEnv):
     def __init__(self, *args, goal: str = "lift", **kwargs):
         self.goal = one_of("goal", goal, GOALS)
         super().__init__(*args, **kwargs)
+
+    def get_language_instruction(self, **_kwargs):
+        return [BOWLS_INSTRUCTION] * self.num_envs if self.goal == "bowls" else super().get_language_instruction()
 
     def _largest_ranges(self):
         lowest = SEAT_HEIGHT + BALL_RADIUS + PAD_END
@@ -211,6 +216,7 @@ class BallSortingEnv(VisuotactileEnv):
 @register_task(
     "ManiFeel-BallSortingDim-v1",
     instruction="Find the golf ball by touch, lift it, and leave the table-tennis ball in its place.",
+    goal_instructions=dict(bowls=BOWLS_INSTRUCTION),
     max_episode_steps=180,
     category="exploration",
     paper_demos=80,
