@@ -12,7 +12,7 @@ from tyro.conf import arg
 from manifeel_ms3.arguments import is_number, require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.checks import check_argument_names
+from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
 from .observation import CameraView, PoseForm
@@ -200,11 +200,8 @@ def check_evaluation(args: TrainArgs) -> None:
     assert args.env_id is not None
     given = json_object("--eval-env-kwargs", args.eval_env_kwargs)
     check_argument_names(task_spec(args.env_id).env_class, given.keys() - {"max_episode_steps"})  # which gym.make takes
-    if (other := given.get("obs_mode", args.obs_mode)) != args.obs_mode:
-        raise InvalidArgumentError(
-            f"--eval-env-kwargs have obs_mode {other!r}, but the policy observes {args.obs_mode!r}; leave it out there"
-        )
-    if args.capture_video:
+    check_obs_mode("--eval-env-kwargs", given, args.obs_mode)
+    if args.num_eval_episodes and args.capture_video:
         with missing_extras_named():
             import manifeel_ms3.evaluation.video  # noqa: F401
 

@@ -29,6 +29,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
+from manifeel_ms3.tasks.checks import check_obs_mode
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
 
 from .checkpoint_config import CheckpointError, checkpoint_config
@@ -246,7 +247,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
             f"{_flags(unused)} are for a --checkpoint; give them to a --policy of your own by --policy-kwargs"
         )
     env_id = task_spec(args.env_id).env_id
-    _require_obs_mode(args.obs_mode, given)
+    check_obs_mode("--env-kwargs", given, args.obs_mode)
     sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs, answer_timeout=args.step_timeout)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
@@ -271,7 +272,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
             f"--sensor {args.sensor}: the demonstrations of {checkpoint} were recorded with {learnt}; leave it out, or give "
             f'--env-kwargs \'{{"sensor": "{args.sensor}"}}\' if another sensor is meant'
         )
-    _require_obs_mode(config["obs_mode"], given)
+    check_obs_mode("--env-kwargs", given, config["obs_mode"])
     _name_differences(trained | sensing, given)
     device = checked_device(args.device)
     if args.batch_size is not None and args.batch_size < 1:
@@ -297,19 +298,6 @@ def _require_own(args: Args, config: dict[str, Any]) -> None:
                 f"{_flags([name])} {value}: the policy of {args.checkpoint} was trained with {own}; leave it out. Other "
                 "arguments of its task are given by --env-kwargs"
             )
-
-
-def _require_obs_mode(obs_mode: str, given: dict[str, Any]) -> None:
-    """Check that --env-kwargs do not make the task with other observations than those that the result names.
-
-    Raises:
-        InvalidArgumentError: They have another observation mode than the policy.
-    """
-    if (other := given.get("obs_mode", obs_mode)) != obs_mode:
-        raise InvalidArgumentError(
-            f"--env-kwargs have obs_mode {other!r}, but the policy observes {obs_mode!r}; leave it out there, and choose the "
-            "observations of a --policy by --obs-mode"
-        )
 
 
 def _name_differences(trained: dict[str, Any], given: dict[str, Any]) -> None:

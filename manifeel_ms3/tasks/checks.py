@@ -63,6 +63,24 @@ def check_argument_names(task: type, given: Collection[str]) -> None:
         raise InvalidArgumentError(f"{task.__name__} has no arguments {unknown}; choose from {sorted(known)}")
 
 
+def check_obs_mode(flag: str, given: Mapping[str, Any], obs_mode: str) -> None:
+    """Check that the arguments of a flag do not make the task with other observations than those of the policy.
+
+    Args:
+        flag: Flag with the arguments, for the message.
+        given: Arguments of the task by name.
+        obs_mode: Observation mode of the policy, which the result names.
+
+    Raises:
+        InvalidArgumentError: They have another observation mode.
+    """
+    if (other := given.get("obs_mode", obs_mode)) != obs_mode:
+        raise InvalidArgumentError(
+            f"{flag} have obs_mode {other!r}, but the policy observes {obs_mode!r}; leave it out there, and choose the "
+            "observations of a --policy or a training by --obs-mode"
+        )
+
+
 def check_base_arguments(task: type[BaseEnv], render_backend: Any, given: Mapping[str, Any]) -> None:
     """Check arguments of ManiSkill's `BaseEnv`, which fails on their values by other errors, late, or not at all.
 
