@@ -12,7 +12,7 @@ import tyro
 from manifeel_ms3.files import read_json_lines
 
 IMAGES = Path(__file__).parent / "images"
-EPISODE = 40
+EPISODE = 32
 """Steps of an episode, each of which is rewarded with at most 1."""
 
 

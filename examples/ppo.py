@@ -29,8 +29,8 @@ from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper
 
 WRAPPERS = (partial(FlattenVisuotactileObservationWrapper, flat_tacff=True), FlattenObservationWrapper)
-EASY = dict(socket_xy=0.0, start_xy=0.02, start_z=0.0, start_rotation=0.0, in_hand_pitch=0.0)
-"""Ranges with which the peg starts upright, up to 20 mm beside a socket that stays where it is."""
+EASY = dict(socket_xy=0.0, start_xy=0.005, start_z=0.0, start_rotation=0.0, in_hand_pitch=0.0)
+"""Ranges with which the peg starts upright, up to 5 mm along x and y from the axis of a socket that stays where it is."""
 FIRST_VALIDATION_SEED = FIRST_EVALUATION_SEED // 2
 """Seed of the first environment in an evaluation; the next ones have the following seeds. The seeds of `manifeel eval` are held
 out, since weights may be chosen, and settings tuned, by the evaluations during training."""
@@ -55,7 +55,7 @@ FILMED = dict(render_mode="rgb_array", human_render_camera_configs=dict(width=25
 class Args:
     env_id: str = "ManiFeel-PegInsertion-v1"
     """Id of the task."""
-    env_kwargs: str = json.dumps(dict(randomization=EASY, max_episode_steps=40))
+    env_kwargs: str = json.dumps(dict(randomization=EASY, max_episode_steps=32))
     """Arguments of the task as json. By default the task is easier than the paper's (see EASY) and its episodes are short."""
     obs_mode: str = "state+tacff"
     """Observation mode."""
@@ -63,7 +63,10 @@ class Args:
     """Name of the run, whose log and weights are in runs/<exp_name>."""
     seed: int = 1
     """Seed of the networks, the environments and the actions."""
-    total_timesteps: int = 16_384
+    fixed_actions: str = json.dumps({2: -0.5, 3: 0.0, 4: 0.0, 5: 0.0})
+    """Actions that the policy does not choose, by their index, as json. By default the tool descends by 5 mm in every step and
+    does not turn, so that the policy steers it along x and y; '{}' fixes none."""
+    total_timesteps: int = 40_960
     """Number of environment steps."""
     track: bool = False
     """Whether Weights & Biases gets the log, too."""
@@ -81,17 +84,17 @@ class Args:
     """File of weights to start from."""
     learning_rate: float = 3e-4
     """Learning rate of Adam."""
-    anneal_lr: bool = False
+    anneal_lr: bool = True
     """Whether the learning rate falls linearly to zero over the training."""
     num_envs: int = 4
     """Number of environments, each in a process of its own."""
-    num_eval_envs: int = 2
+    num_eval_envs: int = 4
     """Number of environments of an evaluation."""
-    num_eval_steps: int = 80
+    num_eval_steps: int = 128
     """Number of steps of each environment in an evaluation."""
-    partial_reset: bool = True
+    partial_reset: bool = False
     """Whether an episode of the training ends at success and failure, and not only at the time limit."""
-    num_steps: int = 128
+    num_steps: int = 256
     """Number of steps of each environment between two updates."""
     eval_freq: int = 4
     """Number of updates between two evaluations."""
@@ -109,7 +112,7 @@ class Args:
     """Weight of the loss of the critic."""
     max_grad_norm: float = 0.5
     """Largest norm of a gradient."""
-    target_kl: float = 0.1
+    target_kl: float = 0.04
     """Largest Kullback-Leibler divergence between the policy and the one that collected the data; beyond it an update ends."""
 
 
@@ -151,6 +154,21 @@ class Agent(nn.Module):
         return Normal(self.actor_mean(self.normalized(obs)), self.actor_logstd.exp())
 
 
+class FixedActions(gym.ActionWrapper):
+    """Some of the task's actions are fixed; the policy chooses the others."""
+
+    def __init__(self, env: gym.Env, fixed: dict[int, float]):
+        super().__init__(env)
+        whole = env.action_space
+        self._fixed, self._chosen = fixed, [i for i in range(len(whole.low)) if i not in fixed]
+        self.action_space = gym.spaces.Box(whole.low[self._chosen], whole.high[self._chosen], dtype=whole.dtype)
+
+    def action(self, action: np.ndarray) -> np.ndarray:
+        whole = np.zeros_like(self.env.action_space.low)
+        whole[self._chosen], whole[list(self._fixed)] = action, list(self._fixed.values())
+        return whole
+
+
 def make_env(args: Args, ignore_terminations: bool = False, videos: Path | None = None) -> gym.Env:
     """One environment with flat observations; its episodes are filmed where a folder of videos is given."""
     torch.set_num_threads(1)
@@ -160,7 +178,8 @@ def make_env(args: Args, ignore_terminations: bool = False, videos: Path | None 
         env = wrapper(env)
     if videos is not None:
         env = RecordEpisode(env, str(videos), save_trajectory=False, max_steps_per_video=args.num_eval_steps)
-    return CPUGymWrapper(env, ignore_terminations=ignore_terminations, record_metrics=True)
+    env = CPUGymWrapper(env, ignore_terminations=ignore_terminations, record_metrics=True)
+    return FixedActions(env, {int(index): value for index, value in json.loads(args.fixed_actions).items()})
 
 
 def make_envs(args: Args, num: int, videos: Path | None = None, **kwargs) -> AsyncVectorEnv:

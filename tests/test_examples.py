@@ -12,7 +12,7 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
-from mani_skill.utils.wrappers import FlattenRGBDObservationWrapper
+from mani_skill.utils.wrappers import CPUGymWrapper, FlattenRGBDObservationWrapper
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.sensors import pad_pose
@@ -199,6 +199,21 @@ def test_ppo_improves_a_policy_on_what_it_observes():
         agent.watch(rollout.obs.flatten(0, 1))
         rewards.append(rollout.rewards.mean().item())
     assert np.mean(rewards[-5:]) > np.mean(rewards[:5]) + 0.1
+
+
+def test_ppo_can_fix_some_of_the_actions(make_env):
+    ppo = load("ppo")
+    env = CPUGymWrapper(make_env(PEG, obs_mode="state", render_backend="none"))
+    env = ppo.FixedActions(env, {2: -0.5, 3: 0.0, 4: 0.0, 5: 0.0})
+    env.reset(seed=0)
+    before = env.unwrapped.agent.tcp_pose_at_base.raw_pose.clone()
+    assert env.action_space.shape == (2,)
+    for _ in range(10):
+        env.step(np.array([0.2, 0.0], np.float32))
+    moved = (env.unwrapped.agent.tcp_pose_at_base.raw_pose - before)[0]
+    assert moved[0] == pytest.approx(0.02, abs=0.004)
+    assert moved[2] == pytest.approx(-0.05, abs=0.01)
+    assert moved[[1, 3, 4, 5, 6]].abs().max() < 2e-3
 
 
 def test_ppo_evaluates_on_none_of_the_held_out_seeds():

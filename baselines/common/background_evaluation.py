@@ -10,7 +10,7 @@ from pathlib import Path
 from manifeel_ms3.evaluation.result import MEANS, read_result
 
 log = logging.getLogger(__name__)
-RATES = ("success_once", "success_at_end", "fail_once", "fail_at_end", "gentle_success")
+RATES = ("success_once", "success_at_end", "success_paper", "fail_once", "fail_at_end", "gentle_success")
 """Rates of a result that are logged."""
 SUCCESS = "eval/success_once"
 """Scalar that every evaluation logs."""
