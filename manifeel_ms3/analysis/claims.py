@@ -1,4 +1,4 @@
-"""Test the paper's claims on results: `python -m manifeel_ms3.analysis.claims --results runs --out claims.md`.
+"""Test the paper's claims on results: `manifeel claims --results runs --out claims.md`.
 
 Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
 holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. With

@@ -1,4 +1,4 @@
-"""Measure what vision and touch tell: `python -m manifeel_ms3.analysis.information_audit --demo-path data/demos`.
+"""Measure what vision and touch tell: `manifeel audit --demo-path data/demos`.
 
 Small predictors, fitted to recorded observations of one camera or one pad at one moment, answer the questions of
 `manifeel_ms3.analysis.probes`, which a policy would need to answer. Where they cannot answer from a modality, a policy

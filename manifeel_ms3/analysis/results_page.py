@@ -1,4 +1,4 @@
-"""A page of all results beside those of the paper: `python -m manifeel_ms3.analysis.results_page --results runs/study`.
+"""A page of all results beside those of the paper: `manifeel results --results runs/study`.
 
 Figures are static images for the documentation, which matplotlib draws; pages that a reader explores in a browser (the report
 of a run, the leaderboard) have plotly's interactive ones.
@@ -47,7 +47,7 @@ LEGEND_SIZE = 7
 """Size of the letters in the legend of the losses, in points."""
 HEAD = """# Results
 
-*Made from result files by `python -m manifeel_ms3.analysis.results_page`; nothing here is written by hand.*
+*Made from result files by `manifeel results`; nothing here is written by hand.*
 
 An episode is a success if the task was solved at any step. A rate is the mean over training seeds, the last checkpoints (at
 most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states, or over initial

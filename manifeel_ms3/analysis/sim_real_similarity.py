@@ -1,6 +1,6 @@
 """Measure how near simulated touch is to real touch.
 
-    python -m manifeel_ms3.analysis.sim_real_similarity --sim peg.h5 --real DIR --features inception
+    manifeel similarity --sim peg.h5 --real DIR --features inception
 
 Two sets of tactile images are compared by the features of a network that was trained on photographs. FID is the Fréchet
 distance between the normal distributions that fit the two sets of features (Heusel et al. 2017), KID the squared maximum mean

@@ -1,4 +1,4 @@
-"""Record the full set of demonstrations: `python -m manifeel_ms3.demonstrations.dataset --num-procs 2`.
+"""Record the full set of demonstrations: `manifeel dataset --num-procs 2`.
 
 Each task has two files with ManiSkill's names: `trajectory.h5` with states and actions alone, and
 `trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5` with the same episodes and their observations. A `manifest.json` beside

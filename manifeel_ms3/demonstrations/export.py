@@ -1,4 +1,4 @@
-"""Export demonstrations: `python -m manifeel_ms3.demonstrations.export peg.h5 --to lerobot --out folder`."""
+"""Export demonstrations: `manifeel export peg.h5 --to lerobot --out folder`."""
 
 import sys
 from collections.abc import Callable

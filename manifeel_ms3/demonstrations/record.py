@@ -1,4 +1,4 @@
-"""Record demonstrations: `python -m manifeel_ms3.demonstrations.record ManiFeel-PegInsertion-v1 -n 50 --num-procs 2`.
+"""Record demonstrations: `manifeel record ManiFeel-PegInsertion-v1 -n 50 --num-procs 2`.
 
 Seeds are tried in order until `num` episodes have succeeded; any number of workers gives the same episodes. A run that was
 killed continues where it stopped when the same command is given again.

@@ -1,4 +1,4 @@
-"""Add observations to episodes: `python -m manifeel_ms3.demonstrations.render_observations states.h5 --out observed.h5`.
+"""Add observations to episodes: `manifeel render-observations states.h5 --out observed.h5`.
 
 A file of states and actions is small, and is the form in which demonstrations are shared. Its episodes are replayed from seed
 and actions. On the machine that recorded them they are the same bit for bit, and so are the images of cameras and tactile

@@ -1,4 +1,4 @@
-"""Replay episodes from their actions, to see if they succeed again: `python -m manifeel_ms3.demonstrations.replay FILE`."""
+"""Replay episodes from their actions, to see if they succeed again: `manifeel replay FILE`."""
 
 import logging
 import sys

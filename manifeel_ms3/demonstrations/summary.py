@@ -1,4 +1,4 @@
-"""Summarize a trajectory file in the terminal: `python -m manifeel_ms3.demonstrations.summary trajectory.h5`."""
+"""Summarize a trajectory file in the terminal: `manifeel summary trajectory.h5`."""
 
 import sys
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Check demonstrations: `python -m manifeel_ms3.demonstrations.validate data/demos --replay 2`.
+"""Check demonstrations: `manifeel validate data/demos --replay 2`.
 
 A folder is checked against its manifest; one trajectory file is checked by itself.
 """

@@ -1,4 +1,4 @@
-"""View a recorded episode in Rerun: `python -m manifeel_ms3.demonstrations.view peg.h5`.
+"""View a recorded episode in Rerun: `manifeel view peg.h5`.
 
 Cameras, touch, forces, actions and success are shown over one time axis. Needs the extra `view`.
 """

@@ -1,8 +1,8 @@
 r"""Evaluate a policy on fixed seeds.
 
-    python -m manifeel_ms3.evaluation.evaluate --checkpoint runs/x/checkpoints/last
-    python -m manifeel_ms3.evaluation.evaluate --entry cpu/PegInsertion/rgb+tacff
-    python -m manifeel_ms3.evaluation.evaluate --policy my_module:MyPolicy --env-id ManiFeel-PegInsertion-v1 \
+    manifeel eval --checkpoint runs/x/checkpoints/last
+    manifeel eval --entry cpu/PegInsertion/rgb+tacff
+    manifeel eval --policy my_module:MyPolicy --env-id ManiFeel-PegInsertion-v1 \
         --obs-mode rgb+tacff
 
 The result is one json file whose form `data/evaluation_schema.json` defines: versions, git commit, the policy's configuration,

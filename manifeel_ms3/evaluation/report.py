@@ -1,4 +1,4 @@
-"""An HTML page about one training run: `python -m manifeel_ms3.evaluation.report --run-dir runs/demo`.
+"""An HTML page about one training run: `manifeel report --run-dir runs/demo`.
 
 The page is made from evaluation.json and log.jsonl, and from one evaluated episode that is run again with every sensor. It is
 one file, report.html, that needs nothing else. Its curve can be zoomed and hovered over, which plotly does in a page; the

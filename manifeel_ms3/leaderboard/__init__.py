@@ -1,1 +1,1 @@
-"""Submissions, their checks, and the page that ranks them; see `python -m manifeel_ms3.leaderboard --help`."""
+"""Submissions, their checks, and the page that ranks them; see `manifeel leaderboard --help`."""

@@ -1,8 +1,8 @@
 """The leaderboard.
 
-    python -m manifeel_ms3.leaderboard hash my_submission --checkpoint runs/x/checkpoints
-    python -m manifeel_ms3.leaderboard submit my_submission --checkpoint runs/x/checkpoints
-    python -m manifeel_ms3.leaderboard build
+    manifeel leaderboard hash my_submission --checkpoint runs/x/checkpoints
+    manifeel leaderboard submit my_submission --checkpoint runs/x/checkpoints
+    manifeel leaderboard build
 
 A submission is a folder with submission.json ({"name", "authors", "link"}), with the result files of a policy in any
 subfolders, one for each checkpoint and training seed, and optionally with `videos/*.mp4`. `hash` writes into submission.json

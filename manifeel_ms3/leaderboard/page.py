@@ -114,7 +114,7 @@ def ranked(rows: list[Row]) -> list[Row]:
 def leaderboard_table(rows: list[Row]) -> str:
     """The leaderboard in Markdown."""
     head = (
-        f"# Leaderboard\n\n`python -m manifeel_ms3.leaderboard build` writes this table, and `{PAGE}`, which shows the "
+        f"# Leaderboard\n\n`manifeel leaderboard build` writes this table, and `{PAGE}`, which shows the "
         f"same with filters, learning curves and videos. Success is the mean over {FULL[0]} training seeds, the last {FULL[1]} "
         f"checkpoints and {FULL[2]} evaluation episodes, with its 95 % interval; where there are fewer, "
         '"of" gives their numbers. "At the end" is the share of the episodes in which the task is solved at the last step. '

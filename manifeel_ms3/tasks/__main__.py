@@ -1,4 +1,4 @@
-"""Show all tasks, `python -m manifeel_ms3.tasks`, or one of them, `python -m manifeel_ms3.tasks PegInsertion`."""
+"""Show all tasks, `manifeel tasks`, or one of them, `manifeel tasks PegInsertion`."""
 
 import inspect
 import sys

@@ -1,4 +1,4 @@
-"""Record demonstrations by hand, in a browser: `python -m manifeel_ms3.teleop ManiFeel-USBInsertion-v1`.
+"""Record demonstrations by hand, in a browser: `manifeel teleop ManiFeel-USBInsertion-v1`.
 
 Needs the extra `teleop`.
 """

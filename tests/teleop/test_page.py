@@ -22,7 +22,7 @@ SPACE, ENTER, DOWN, AHEAD = (" ", "Space", 32), ("Enter", "Enter", 13), ("f", "K
 
 @pytest.fixture
 def address(tmp_path):
-    """Address of a page that `python -m manifeel_ms3.teleop` serves, with the token, as the command prints it."""
+    """Address of a page that `manifeel teleop` serves, with the token, as the command prints it."""
     port = free_port()
     files = ["--out", str(tmp_path / "human.h5"), "--port", str(port)]
     slow_machine = ["--env-kwargs", '{"max_episode_steps": 3000}']  # the task's own limit ends after 24 s
