@@ -12,8 +12,6 @@ import tyro
 from manifeel_ms3.files import read_json_lines
 
 IMAGES = Path(__file__).parent / "images"
-EPISODE = 32
-"""Steps of an episode, each of which is rewarded with at most 1."""
 
 
 def main(log: tyro.conf.Positional[Path] = IMAGES / "ppo.jsonl") -> Path:
@@ -23,10 +21,10 @@ def main(log: tyro.conf.Positional[Path] = IMAGES / "ppo.jsonl") -> Path:
         log: Log of a run of the example.
     """
     entries = [entry for entry in read_json_lines(log) if "eval/return" in entry]
-    steps = [entry["step"] for entry in entries]
+    steps, length = [entry["step"] for entry in entries], entries[0]["eval/episode_len"]
     fig, (top, bottom) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, height_ratios=(3, 1), layout="constrained")
     top.plot(steps, [entry["eval/return"] for entry in entries], marker="o", markersize=3)
-    top.set(ylabel=f"return of {EPISODE} steps", ylim=(0, None), title="PPO on state and touch, easy PegInsertion")
+    top.set(ylabel=f"return of {length:g} steps", ylim=(0, None), title="PPO on state and touch, easy PegInsertion")
     bottom.plot(steps, [100 * entry["eval/success_once"] for entry in entries], marker="o", markersize=3, color="C1")
     bottom.set(ylabel="success, %", ylim=(-5, 105), xlabel="environment steps")
     for ax in (top, bottom):

@@ -160,12 +160,14 @@ class FixedActions(gym.ActionWrapper):
     def __init__(self, env: gym.Env, fixed: dict[int, float]):
         super().__init__(env)
         whole = env.action_space
-        self._fixed, self._chosen = fixed, [i for i in range(len(whole.low)) if i not in fixed]
+        self._chosen = [i for i in range(len(whole.low)) if i not in fixed]
+        self._whole = np.zeros_like(whole.low)
+        self._whole[list(fixed)] = list(fixed.values())
         self.action_space = gym.spaces.Box(whole.low[self._chosen], whole.high[self._chosen], dtype=whole.dtype)
 
     def action(self, action: np.ndarray) -> np.ndarray:
-        whole = np.zeros_like(self.env.action_space.low)
-        whole[self._chosen], whole[list(self._fixed)] = action, list(self._fixed.values())
+        whole = self._whole.copy()
+        whole[self._chosen] = action
         return whole
 
 
