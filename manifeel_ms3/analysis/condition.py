@@ -6,7 +6,7 @@ of the same condition only if they differ in nothing but the training seed, the 
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -128,6 +128,18 @@ def condition_of(result: dict[str, Any]) -> Condition:
         result["revision"],
         tuple((name, value) for name, value in settings if name != ENCODER),
     )
+
+
+def by_condition(results: Iterable[dict[str, Any]]) -> dict[Condition, list[dict[str, Any]]]:
+    """The results of each condition, in the order in which they are given.
+
+    Args:
+        results: Contents of result files.
+    """
+    found: dict[Condition, list[dict[str, Any]]] = {}
+    for result in results:
+        found.setdefault(condition_of(result), []).append(result)
+    return found
 
 
 def _names(given: Any) -> tuple[str, ...]:

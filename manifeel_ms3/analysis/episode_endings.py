@@ -4,7 +4,7 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
-from .condition import Condition, condition_of
+from .condition import Condition, by_condition
 from .markdown import markdown_table
 
 CENSUS = """
@@ -39,9 +39,9 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
         results: Contents of result files.
         conditions: Conditions to count, in the order of the rows.
     """
-    rows = []
+    rows, of_condition = [], by_condition(results)
     for condition in conditions:
-        if endings := endings_of(condition, results):
+        if endings := endings_of(of_condition.get(condition, [])):
             missed = ", ".join(f"{count} {name}" for name, count in endings.missed)
             counts = (endings.episodes, endings.succeeded, missed, endings.pressed_too_hard)
             rows.append((condition.task, condition.sensing, condition.policy, f"`{condition.key}`", *counts))
@@ -49,18 +49,21 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
     return f"{CENSUS}{markdown_table(names, rows)}" if rows else ""
 
 
-def endings_of(condition: Condition, results: Results) -> Endings | None:
-    """How the episodes of the last checkpoint of every training seed ended; None where the results do not say it."""
+def endings_of(results: Results) -> Endings | None:
+    """How the episodes of the last checkpoint of every training seed ended; None where the results do not say it.
+
+    Args:
+        results: Contents of the result files of one condition.
+    """
     with_endings = [result for result in results if all("ending" in episode for episode in result["episodes"])]
-    of_condition = [result for result in with_endings if condition_of(result) == condition]
     last: dict[Any, dict[str, Any]] = {}
-    for result in sorted(of_condition, key=lambda result: result["config"].get("step", 0)):
+    for result in sorted(with_endings, key=lambda result: result["config"].get("step", 0)):
         last[result["training_seed"]] = result
     if not last:
         return None
     episodes = [episode for result in last.values() for episode in result["episodes"]]
     missed = [episode for episode in episodes if not episode["success_once"]]
-    limit = of_condition[0].get("force_limit")
+    limit = with_endings[0].get("force_limit")
     hard = None if limit is None else sum(episode["peak_contact_force"] > limit for episode in missed)
     return Endings(
         len(episodes), len(episodes) - len(missed), Counter(episode["ending"] for episode in missed).most_common(), hard

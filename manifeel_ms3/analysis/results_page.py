@@ -23,7 +23,7 @@ from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.tasks.registry import all_tasks
 
 from .claims import claims_page, results_of_claims
-from .condition import Condition, condition_of
+from .condition import Condition, by_condition, condition_of
 from .episode_endings import census_table
 from .estimates import difference, p_text
 from .figures import save_figure
@@ -260,10 +260,7 @@ def page(
 
 
 def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Files) -> str:
-    rows = []
-    of_condition: dict[Condition, list[dict[str, Any]]] = {}
-    for result in results:
-        of_condition.setdefault(condition_of(result), []).append(result)
+    rows, of_condition = [], by_condition(results)
     for condition, here in _sorted(found):
         cost, machines = _cost(of_condition[condition])
         note = f"left out: {here.why_left_out}" if here.why_left_out else None

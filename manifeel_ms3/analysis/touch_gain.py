@@ -5,8 +5,8 @@ from typing import Any
 
 from manifeel_ms3.evaluation.result import ResultError
 
-from .condition import Condition
-from .episode_endings import endings_of
+from .condition import Condition, by_condition
+from .episode_endings import Results, endings_of
 from .estimates import SIGNIFICANT, difference, has_enough_seeds
 from .matching import Found, answering
 from .paper import MODES, TABLE_I, VISION, Rate, paper_condition
@@ -32,13 +32,14 @@ def touch_gains(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
         found: The results that enter comparisons.
         results: Contents of result files.
     """
-    paragraphs = [text for task in TABLE_I for text in _of_a_task(task, found, results)]
+    of_condition = by_condition(results)
+    paragraphs = [text for task in TABLE_I for text in _of_a_task(task, found, of_condition)]
     if paragraphs:
         yield TEXT
         yield "\n".join(paragraphs)
 
 
-def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
+def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> Iterator[str]:
     """A paragraph for each set-up in which a task was run with vision alone and with touch."""
     by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
     for mode in MODES:
@@ -47,7 +48,7 @@ def _of_a_task(task: str, found: Found, results: list[dict[str, Any]]) -> Iterat
     for settings, conditions in by_settings.items():
         if VISION in conditions and len(conditions) > 1:
             gains = "; ".join(_gain(task, mode, conditions, found) for mode in conditions if mode != VISION)
-            ends = " ".join(_endings(mode, condition, results) for mode, condition in conditions.items())
+            ends = " ".join(_endings(mode, results[condition]) for mode, condition in conditions.items())
             yield f"**{task}** ({settings}): {gains}. {ends}\n"
 
 
@@ -65,8 +66,8 @@ def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) 
     return f"{NAMES[mode]} changes success by {gain.signed} points ({verdict}{papers})"
 
 
-def _endings(mode: str, condition: Condition, results: list[dict[str, Any]]) -> str:
-    endings = endings_of(condition, results)
+def _endings(mode: str, results: Results) -> str:
+    endings = endings_of(results)
     if endings is None:
         return ""
     missed = ", ".join(f"{count} {name}" for name, count in endings.missed) or "none"
