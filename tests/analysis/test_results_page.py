@@ -1,0 +1,24 @@
+"""The page of results is written from whatever results are at hand."""
+
+import json
+
+from manifeel_ms3.analysis.paper import TACFF, VISION
+from manifeel_ms3.evaluation.result import result_of
+from manifeel_ms3.tasks.registry import evaluation_seeds
+from tests.outcomes import made_up
+from tests.tasks_and_marks import PEG
+
+from .made_up import page_of, write_run
+
+
+def test_conditions_with_other_initial_states_cost_the_page_their_comparison_alone(tmp_path):
+    write_run(tmp_path, VISION, 0.2)
+    write_run(tmp_path, TACFF, 0.5, episodes=60)
+    config = dict(policy_name="baselines.references:MeanAction", obs_mode="none", policy_kwargs={})
+    result = result_of(PEG, dict(obs_mode="none"), config, [made_up(seed, False) for seed in evaluation_seeds(60)])
+    (tmp_path / "0.json").write_text(json.dumps(result))
+    page = page_of(tmp_path)
+    assert "| rgb wrist | diffusion_policy | MeanAction | other initial states |  |" in page
+    assert "| rgb+tacff wrist | diffusion_policy | MeanAction | +50 [" in page
+    assert "on different initial states, 60 and 50 of them; evaluate both with the same --num-eval-episodes.\n" in page
+    assert "## Training time" in page
