@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import tyro
@@ -171,9 +172,14 @@ def _links(by_file: Mapping[Path, dict[str, Any]], folder: Path) -> Files:
     last: dict[Condition, dict[int | None, tuple[int, str]]] = {}
     for path, result in by_file.items():
         runs, seed = last.setdefault(condition_of(result), {}), result["training_seed"]
-        here = (result["config"].get("step", 0), os.path.relpath(path, folder))
+        here = (result["config"].get("step", 0), _address(os.path.relpath(path, folder)))
         runs[seed] = max(here, runs.get(seed, here))
     return {condition: [link for _, link in in_order_of_seeds(runs)] for condition, runs in last.items()}
+
+
+def _address(path: str | os.PathLike[str]) -> str:
+    """A path as the address of a link in Markdown, which ends at a space or a parenthesis."""
+    return quote(str(path), safe="/+")
 
 
 def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
@@ -232,20 +238,20 @@ def page(
     found = of_the_protocol(collected)
     yield HEAD.format(last=LAST)
     if figures.sensing:
-        yield CHART.format(figure=figures.sensing)
+        yield CHART.format(figure=_address(figures.sensing))
     yield from tables_of_the_paper(found, files)
     yield from touch_gains(found, results)
     if figures.gentle:
-        yield GENTLE.format(figure=figures.gentle)
+        yield GENTLE.format(figure=_address(figures.gentle))
     yield "\n## What was run\n\n"
     yield _table_of_conditions(collected, results, files)
     yield AGAIN
     if len(found) < len(collected):
         yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
     if figures.success:
-        yield CURVES.format(figure=figures.success, table=figures.success.with_suffix(".csv"))
+        yield CURVES.format(figure=_address(figures.success), table=_address(figures.success.with_suffix(".csv")))
     if figures.loss:
-        yield f"\n![Loss in training over gradient steps]({figures.loss})\n"
+        yield f"\n![Loss in training over gradient steps]({_address(figures.loss)})\n"
     if rows := list(_gains_over_references(found)):
         yield "\n## What learning gained\n\nThe gain over policies that have learnt nothing, on the same initial states: the "
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"

@@ -1,6 +1,8 @@
 """The page of results is written from whatever results are at hand."""
 
 import json
+import re
+from urllib.parse import unquote
 
 from manifeel_ms3.analysis.paper import TACFF, VISION
 from manifeel_ms3.evaluation.result import result_of
@@ -22,3 +24,15 @@ def test_conditions_with_other_initial_states_cost_the_page_their_comparison_alo
     assert "| rgb+tacff wrist | diffusion_policy | MeanAction | +50 [" in page
     assert "on different initial states, 60 and 50 of them; evaluate both with the same --num-eval-episodes.\n" in page
     assert "## Training time" in page
+
+
+def test_links_lead_to_files_whose_names_have_spaces_and_parentheses(tmp_path):
+    folder = tmp_path / "trial (2) ü"
+    folder.mkdir()
+    write_run(folder, VISION, 0.2)
+    page_of(folder, tmp_path / "my page.md")
+    page = (tmp_path / "my page.md").read_text()
+    links = re.findall(r"\]\(([^)\s]+)\)", page)
+    linked = [tmp_path / unquote(link) for link in links if link.endswith(("000.json", ".png", ".csv"))]
+    assert {path.suffix for path in linked} == {".json", ".png", ".csv"}
+    assert all(path.is_file() for path in linked)
