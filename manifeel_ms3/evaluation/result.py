@@ -174,10 +174,17 @@ def results_in(*folders: Path) -> list[dict[str, Any]]:
 def results_by_file(*folders: Path) -> dict[Path, dict[str, Any]]:
     """The results that `results_in` returns, by the paths of their files.
 
+    Hidden folders are left out, such as one that a killed process was copying results into.
+
     Raises:
         ResultError: There is no result, or one is broken.
     """
-    found = [path for folder in folders for path in sorted(folder.rglob("*.json")) if path.stem.isdigit()]
+    found = [
+        path
+        for folder in folders
+        for path in sorted(folder.rglob("*.json"))
+        if path.stem.isdigit() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    ]
     if not found:
         raise ResultError(
             f"{[str(folder) for folder in folders]} hold no results; train with --num-eval-episodes 50, or run `manifeel study`"

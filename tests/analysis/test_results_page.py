@@ -2,10 +2,11 @@
 
 import json
 import re
+import shutil
 from urllib.parse import unquote
 
 from manifeel_ms3.analysis.paper import TACFF, VISION
-from manifeel_ms3.evaluation.result import result_of
+from manifeel_ms3.evaluation.result import result_of, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.outcomes import made_up
 from tests.tasks_and_marks import PEG
@@ -36,3 +37,9 @@ def test_links_lead_to_files_whose_names_have_spaces_and_parentheses(tmp_path):
     linked = [tmp_path / unquote(link) for link in links if link.endswith(("000.json", ".png", ".csv"))]
     assert {path.suffix for path in linked} == {".json", ".png", ".csv"}
     assert all(path.is_file() for path in linked)
+
+
+def test_results_that_a_killed_process_was_copying_are_left_out(tmp_path):
+    write_run(tmp_path / "cpu", VISION, 0.2)
+    shutil.copytree(tmp_path / "cpu", tmp_path / ".cpu.here-1-abc.partial/cpu")
+    assert len(results_in(tmp_path)) == 2
