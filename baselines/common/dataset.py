@@ -59,7 +59,8 @@ def _prepared(spec: ObservationSpec, file: Path, number: int, recorded: Demonstr
     Raises:
         DemonstrationError: A number is not finite.
     """
-    episode = {key: prepare(key, recorded[key], spec) for key in spec.keys} | dict(actions=recorded["actions"])
+    episode = {key: prepare(key, recorded[key], spec) for key in spec.keys}
+    episode["actions"] = recorded["actions"].astype(np.float32)  # other programs record other types, too
     for key in ("actions", POSE, *spec.force_fields):
         finite = np.isfinite(episode[key]).reshape(len(episode[key]), -1).all(1)
         if not finite.all():  # the ranges by which all demonstrations are scaled would not be finite either

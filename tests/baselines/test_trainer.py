@@ -13,7 +13,7 @@ import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 
 from baselines.common.checkpoint import TRAINING_STATE, WEIGHTS, prune, read_tensors
-from baselines.common.dataset import SampleOrder
+from baselines.common.dataset import SampleOrder, read_episodes
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
@@ -28,8 +28,9 @@ from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, MissingExtraError, PluginError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG
 from manifeel_ms3.evaluation.result import PATHS
-from tests.sample import states_sample
+from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG
+from tests.trajectories import changed_copy
 
 from .two_processes import end_before_the_evaluation, in_two_processes, resume_and_compare
 
@@ -113,6 +114,15 @@ def test_the_task_is_that_of_the_demonstrations_unless_another_is_named():
     args = TrainArgs((states_sample(gear),)).with_task_defaults()
     assert (args.env_id, args.cameras) == (gear, ("wrist",))
     assert TrainArgs((states_sample(gear),), env_id="PegInsertion").with_task_defaults().env_id == PEG
+
+
+def test_actions_that_were_recorded_in_double_precision_are_read_as_networks_take_them(tmp_path):
+    recorded = observed_sample(PEG)
+    precise = changed_copy(recorded, tmp_path, "actions", lambda actions: actions.astype("float64"))
+    *_, expected = read_episodes([recorded], PEG, SPEC, None)
+    *_, found = read_episodes([precise], PEG, SPEC, None)
+    assert found["actions"].dtype == "float32"
+    assert (found["actions"] == expected["actions"]).all()
 
 
 def test_each_epoch_holds_every_sample_once():
