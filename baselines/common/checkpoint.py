@@ -79,9 +79,16 @@ def make_last(folder: Path) -> None:
     """Make the link `last`, beside a checkpoint, point to it.
 
     Raises:
+        CheckpointError: There is a folder in the place of the link.
         FileWriteError: The link cannot be written.
     """
-    with atomic_write(folder.with_name(LAST)) as partial:
+    last = folder.with_name(LAST)
+    if last.is_dir() and not last.is_symlink():
+        raise CheckpointError(
+            f"{last} is a folder and not a link, as a program leaves it that follows links when it copies a run, such as scp; "
+            "remove it if its checkpoint is beside it under its step, such as 00005000, and rename it to that otherwise"
+        )
+    with atomic_write(last) as partial:
         partial.unlink(missing_ok=True)  # left by a process that was killed here
         partial.symlink_to(folder.name)
 

@@ -272,3 +272,13 @@ def test_a_damaged_state_of_training_is_refused_in_one_line(harm, tmp_path):
         unpack(state, optimizer, model, tmp_path, rank=0)
     assert str(tmp_path) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_copy_of_a_run_that_followed_its_links_is_named_and_loses_nothing(tmp_path):
+    for name in ("00000002", "last"):
+        save_checkpoint(tmp_path / name, dict(step=2), {}, {})
+    with pytest.raises(CheckpointError, match="last is a folder and not a link"):
+        make_last(tmp_path / "00000002")
+    shutil.rmtree(tmp_path / "last")
+    make_last(tmp_path / "00000002")
+    assert (tmp_path / "last").resolve() == tmp_path / "00000002"
