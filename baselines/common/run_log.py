@@ -87,7 +87,8 @@ class RunLog:
 
     def __init__(self, folder: Path, config: dict[str, Any], step: int, wandb_run: WandbRun | None):
         if step == 0:  # also without `wandb_run`: a new run must not go on in that of an earlier one when it is resumed
-            (folder / WANDB_ID).unlink(missing_ok=True)
+            with failures_named(folder):  # it may be a file
+                (folder / WANDB_ID).unlink(missing_ok=True)
         self._wandb = _start_wandb(wandb_run, config, folder) if wandb_run else None
         self.entries = entries_until(folder / LOG, step)
         """Entries of the earlier log that are kept."""

@@ -282,3 +282,10 @@ def test_a_copy_of_a_run_that_followed_its_links_is_named_and_loses_nothing(tmp_
     shutil.rmtree(tmp_path / "last")
     make_last(tmp_path / "00000002")
     assert (tmp_path / "last").resolve() == tmp_path / "00000002"
+
+
+def test_a_file_in_the_place_of_a_run_is_named_and_stays(tmp_path):
+    (tmp_path / "run").write_text("notes")
+    with pytest.raises(FileWriteError, match="run cannot be written"):
+        train(tiny_args(tmp_path / "run"))
+    assert (tmp_path / "run").read_text() == "notes"
