@@ -72,7 +72,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 
     Raises:
         InvalidArgumentError: The file to write is the file to read, or an argument is not allowed.
-        DemonstrationError: A trajectory file is missing or broken, or was recorded with other arguments.
+        DemonstrationError: A trajectory file is missing or broken, was recorded with other arguments, or holds a seed twice.
         InUseError: Another process writes the file.
         WorkFailedError: A worker process died.
     """
@@ -85,7 +85,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     source_kwargs = None
     if args.control_mode is not None:
         source_kwargs = source["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    episodes = {episode["episode_seed"]: episode for episode in source["episodes"][: args.num]}
+    episodes = _by_seed(args.path, source["episodes"][: args.num])
     with open_recording(args.out, header, list(episodes)) as recording:
         left = [seed for seed in episodes if seed not in recording.infos and seed not in recording.failed]
         if recording.is_complete and not left:
@@ -107,6 +107,21 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         _warn(recording)
         recording.finish()
     return args.out
+
+
+def _by_seed(path: Path, episodes: list[dict[str, Any]]) -> dict[int, dict[str, Any]]:
+    """The entries of a file's episodes by their seeds, which name the episodes of the file that is written.
+
+    Raises:
+        DemonstrationError: Two episodes have one seed.
+    """
+    found = {episode["episode_seed"]: episode for episode in episodes}
+    if len(found) < len(episodes):
+        raise DemonstrationError(
+            f"{path} holds {len(episodes)} episodes of {len(found)} seeds, and the written file would have one of each seed; "
+            "render the files that it was merged from"
+        )
+    return found
 
 
 def _origin(source: dict[str, Any]) -> dict[str, Any]:

@@ -238,6 +238,17 @@ def test_states_of_another_task_are_refused(folder, tmp_path):
         render_observations.main(render_observations.Args(states, tmp_path / "rendered.h5", "tacff", ()))
 
 
+def test_a_merged_file_with_two_episodes_of_a_seed_is_refused_rather_than_rendered_in_part(tmp_path):
+    copy = Path(shutil.copy(states_sample(PEG), tmp_path / STATES))
+    header = json.loads(states_sample(PEG).with_suffix(".json").read_text())
+    first, second = header["episodes"]
+    second["episode_seed"] = first["episode_seed"]
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    with pytest.raises(DemonstrationError, match="holds 2 episodes of 1 seeds"):
+        render_observations.main(render_observations.Args(copy, tmp_path / "rendered.h5", "tacff", ()))
+    assert not (tmp_path / "rendered.h5").exists()
+
+
 def test_a_truncated_file_and_a_missing_one_are_found(folder, tmp_path):
     copy = damaged(folder, tmp_path)
     whole = (copy / PEG / STATES).read_bytes()
