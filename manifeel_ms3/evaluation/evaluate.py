@@ -128,7 +128,7 @@ def main(args: Args) -> Path:
     evaluation = evaluation_from_args(args)
     origin = provenance(evaluation.env_id)  # of the code that runs; while it does, others may be committed
     seeds = evaluation_seeds(args.episodes) if args.seeds is None else read_seeds(args.seeds)
-    out = args.out or (args.checkpoint.parent.parent if args.checkpoint else Path()) / "evaluation.json"
+    out = args.out or default_out(args.checkpoint)
     _check_outputs(args, evaluation, seeds, out, origin)
     with owned(out):
         journal = Journal(out, _identity(evaluation) | origin, seeds, args.overwrite, args.overwrite_other)
@@ -142,6 +142,12 @@ def main(args: Args) -> Path:
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
     return out
+
+
+def default_out(checkpoint: Path | None) -> Path:
+    """Path of a result for which none is given: in the run folder of a checkpoint, or else in the working folder."""
+    folder = checkpoint.resolve().parent.parent if checkpoint else Path()  # a relative path may be as short as `last` or `.`
+    return folder / "evaluation.json"
 
 
 def _like_entry(args: Args, entry: Entry) -> Args:

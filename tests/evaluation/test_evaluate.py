@@ -13,7 +13,7 @@ import pytest
 from manifeel_ms3.errors import InvalidArgumentError, ServerError, UnknownNameError
 from manifeel_ms3.evaluation import entries
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
-from manifeel_ms3.evaluation.evaluate import Args, main, next_step
+from manifeel_ms3.evaluation.evaluate import Args, default_out, main, next_step
 from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result
@@ -63,6 +63,17 @@ def test_a_result_does_not_replace_a_recording(name, tmp_path):
     with pytest.raises(InvalidArgumentError, match=r"would replace a file of the recording .*peg\.h5; give another path"):
         main(Args(policy="tests.evaluation.policies:StandStill", env_id=PEG, obs_mode="tacff", episodes=1, out=tmp_path / name))
     assert {path.read_text() for path in tmp_path.iterdir()} == {"episodes", "their json"}
+
+
+def test_the_result_of_a_checkpoint_comes_into_its_run_folder_from_whatever_folder_it_is_named(tmp_path, monkeypatch):
+    checkpoint = tmp_path / "run/checkpoints/00000002"
+    checkpoint.mkdir(parents=True)
+    checkpoint.with_name("last").symlink_to(checkpoint.name)
+    names = {tmp_path: "run/checkpoints/last", tmp_path / "run": "checkpoints/last", checkpoint.parent: "last", checkpoint: "."}
+    for folder, name in names.items():
+        monkeypatch.chdir(folder)
+        assert default_out(Path(name)).absolute() == tmp_path / "run/evaluation.json"
+    assert default_out(None) == Path("evaluation.json")
 
 
 def test_a_result_names_the_commit_at_which_its_evaluation_began(tmp_path, monkeypatch):
