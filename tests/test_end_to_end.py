@@ -5,11 +5,13 @@ from pathlib import Path
 
 import pytest
 
+from baselines.common.checkpoint import make_last, save_checkpoint
 from baselines.common.encoders import EncoderConfig
 from baselines.diffusion_policy import train
 from baselines.diffusion_policy.policy import DiffusionConfig
 from manifeel_ms3.demonstrations import record
 from manifeel_ms3.evaluation import evaluate, report
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.result import ResultError
 from manifeel_ms3.tasks.visuotactile_env import VisuotactileEnv
 from tests.tasks_and_marks import PEG, needs_renderer
@@ -63,3 +65,17 @@ def test_the_reports_randomization_needs_no_simulation(monkeypatch):
 def test_report_without_an_evaluation(tmp_path):
     with pytest.raises(ResultError, match="cannot be read as a result"):
         report.main(report.Args(tmp_path))
+
+
+def test_a_report_shows_the_checkpoint_that_was_evaluated_and_not_a_later_one(tmp_path):
+    def trained(step: int) -> Path:
+        checkpoint = tmp_path / f"checkpoints/{step:08d}"
+        save_checkpoint(checkpoint, dict(step=step), {}, {})
+        make_last(checkpoint)
+        return checkpoint
+
+    first, second = trained(5), trained(10)
+    found = {step: report.evaluated_checkpoint(tmp_path, dict(config=dict(step=step))) for step in (5, 10)}
+    assert {step: checkpoint.resolve() for step, checkpoint in found.items()} == {5: first, 10: second}
+    with pytest.raises(CheckpointError, match="is of step 4, whose checkpoint is not in"):
+        report.evaluated_checkpoint(tmp_path, dict(config=dict(step=4)))

@@ -17,9 +17,10 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import read_json_lines, write_text
+from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.tasks.registry import task_spec
 
-from .checkpoint_config import TRAINING_LOSS
+from .checkpoint_config import TRAINING_LOSS, CheckpointError, checkpoint_config
 from .floors import floors_of
 from .gentle import success_under_force
 from .policy import PolicySource
@@ -60,7 +61,7 @@ class Args:
     """Arguments of the report."""
 
     run_dir: Path
-    """Folder of the training run, with evaluation.json, log.jsonl and checkpoints/last."""
+    """Folder of the training run, with evaluation.json, log.jsonl and the checkpoint that was evaluated."""
     out: Path | None = None
     """Path of the page; report.html in the run's folder if not given."""
 
@@ -122,18 +123,35 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
+def evaluated_checkpoint(run_dir: Path, result: dict[str, Any]) -> Path:
+    """The checkpoint of a run that has the step of a result; training may have gone on to another one since.
+
+    Raises:
+        CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted.
+    """
+    last, step = run_dir / CHECKPOINTS / "last", result["config"].get("step")
+    if checkpoint_config(last).get("step") == step:
+        return last
+    if not (found := last.with_name(str(step).zfill(8))).is_dir():
+        raise CheckpointError(
+            f"{run_dir / 'evaluation.json'} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
+            f"another one with `manifeel eval --checkpoint {last}`"
+        )
+    return found
+
+
 def main(args: Args) -> Path:
     """Write the page, and return its path.
 
     Raises:
         ResultError: The run's evaluation.json is missing or broken.
-        CheckpointError: The run's last checkpoint is missing or broken.
+        CheckpointError: The checkpoint of the evaluation is missing or broken.
         MachineError: This machine does not have the device of the evaluation.
     """
     result = read_result(args.run_dir / "evaluation.json")
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
-    policy = PolicySource(args.run_dir / "checkpoints/last").as_in(result).make()
+    policy = PolicySource(evaluated_checkpoint(args.run_dir, result)).as_in(result).make()
     outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(
