@@ -28,6 +28,7 @@ from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header, task_of
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
@@ -91,12 +92,15 @@ def main(args: Args) -> list[float]:
     """Train, write the weights, and return every `log_freq`-th loss.
 
     Raises:
-        InvalidArgumentError: A number is too small, or the representation does not take images of this size.
+        InvalidArgumentError: A number is too small, the representation does not take images of this size, or the path of the
+            weights is a folder.
         DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
         FileWriteError: The weights cannot be written.
         InUseError: Another process trains into the same file.
     """
     require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
+    if args.out.is_dir():  # which only the end of the training would meet
+        raise InvalidArgumentError(f"--out {args.out} is a folder; give the path of a file, such as {args.out / Args.out}")
     with owned(args.out):
         return _pretrain(args)
 

@@ -218,3 +218,8 @@ def test_every_network_of_touch_can_be_laid_out_for_training(name):
     lay_out_channels_last(encoder)  # weights of other ranks, such as those of video patches, stay as they are
     laid_out = [p.is_contiguous(memory_format=torch.channels_last) for p in encoder.parameters() if p.dim() == 4]
     assert all(laid_out)
+
+
+def test_weights_that_would_replace_a_folder_are_refused_before_the_training(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="is a folder; give the path of a file"):
+        pretrain.main(pretrain.Args("unit", (tmp_path / "not_read.h5",), out=tmp_path))
