@@ -157,7 +157,7 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
     no_settings = NO_SETTINGS | {"obs_mode"}
     named = {n: value for n, value in config.items() if n not in no_settings and (n, value) not in IMPLIED.items()}
     if named.get("steps", 0) is None and (epochs := config.get("epochs")) is not None:
-        named["steps"] = f"{epochs} epochs, at least {config['min_steps']}"
+        named["steps"] = f"{epochs} epochs, at least {config.get('min_steps', 1)}"
     return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
 
 

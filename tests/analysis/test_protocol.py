@@ -115,6 +115,12 @@ def test_a_run_of_several_processes_is_of_another_condition_than_one_that_does_n
     assert together == alone | {"num_processes": "2"}
 
 
+def test_a_length_in_epochs_needs_no_smallest_number_of_steps():
+    """A policy of another package may have settings by the same names, and not all of them."""
+    (steps,) = (value for name, value in settings_of(dict(steps=None, epochs=5), "rgb") if name == "steps")
+    assert steps == '"5 epochs, at least 1"'
+
+
 def test_results_of_different_initial_states_are_not_mixed(tmp_path, rng):
     write(tmp_path, 0, 10, [True, False])
     write(tmp_path, 1, 10, [True])
