@@ -18,7 +18,7 @@ from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
 from manifeel_ms3.rendering.looks import CONCRETE
 from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, fine_shadow, presentation_shader
 from manifeel_ms3.rendering.randomization import LARGEST, RandomLooks, VisualRandomization
-from manifeel_ms3.rendering.shader_pack import camera_shader, set_picture_formats
+from manifeel_ms3.rendering.shader_pack import camera_shader, picture_formats
 from manifeel_ms3.rendering.table import table_mesh, wood
 
 from .checks import checked_randomization
@@ -115,8 +115,8 @@ class SceneryEnv(SensingEnv):
         cast_no_shadow([self.scene.actors["table"], self.scene.actors["floor"], *(links[name] for name in FAR_LINKS)])
 
     def _setup_sensors(self, options: dict):
-        set_picture_formats()
-        super()._setup_sensors(options)
+        with picture_formats(self.scene):
+            super()._setup_sensors(options)
         self._require_textures()
 
     def _require_textures(self) -> None:

@@ -67,6 +67,19 @@ def test_an_image_for_people_is_large_and_changes_no_policys_image(make_env):
     assert small.render().shape == (1, 100, 200, 3)
 
 
+@needs_renderer
+def test_cameras_with_other_shaders_leave_the_images_of_the_rest_as_they_are(make_env):
+    small = dict(width=32, height=32)
+    options = dict(obs_mode="rgb", cameras=("front", "wrist"), render_mode="rgb_array", human_render_camera_configs=small)
+    usual = make_env(**options, sensor_configs=small)
+    mixed = make_env(**options, sensor_configs=small | dict(front=dict(shader_pack="default")))
+    wrist = images(usual)["rgb"]
+    seen = images(mixed)["rgb"]
+    assert seen.dtype == np.uint8
+    assert np.array_equal(seen, wrist)
+    assert torch.equal(mixed.render(), usual.render())
+
+
 def test_sizes_of_images_for_people_are_doubled_to_draw_them():
     by_name = dict(render_camera=dict(width=100, fov=1.0))
     assert drawn_sizes(by_name) == dict(render_camera=dict(width=200, fov=1.0))
