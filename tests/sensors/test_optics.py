@@ -110,6 +110,14 @@ def test_noise_is_seeded():
     assert (torch.corrcoef(colours) - torch.eye(3)).abs().max() < 0.02  # channels are independent
 
 
+def test_an_amount_of_noise_may_be_a_whole_number():
+    surface, images = torch.zeros(1, 240, 320), []
+    for amount in (3, 3.0):
+        optics = make_optics(**{"optics.noise": amount})
+        images.append(optics.shade(surface))
+    assert torch.equal(*images)
+
+
 def test_episodes_differ_in_light_as_far_as_asked():
     optics = make_optics(2, **{"randomization.gain": 0.2, "randomization.light_phase": 0.2})
     pads, press = torch.arange(2), ball(0.004, 8e-4).expand(2, -1, -1)

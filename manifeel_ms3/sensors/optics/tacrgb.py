@@ -204,7 +204,7 @@ class Optics:
         self._gain = torch.ones(num_pads, 3, device=device)
         self._phase = torch.tensor([[1.0, 0.0]], device=device).repeat(num_pads, 1)
         self._seed, self._frame = torch.zeros(2, num_pads, dtype=torch.int32, device=device)
-        self.noise = torch.full((num_pads,), optics.noise, device=device)
+        self.noise = torch.full((num_pads,), optics.noise, dtype=torch.float32, device=device)  # an option may be an int
         """Standard deviation (N,) of the read noise, grey levels."""
         self.drift = torch.zeros(num_pads, 3, device=device)
         """Drift (N, 3) of the colours in the next image, grey levels."""
