@@ -386,6 +386,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         measures, self._measured = self._measured or self.measure(), None
         held = self._steps_at_goal >= round(HOLD_SECONDS * self._control_freq)
         info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
+        info["elapsed_steps"] = self._elapsed_steps.clone()  # instead of ManiSkill's counter itself, which counts on
         if self.paper_goal_reached(measures) is not None:
             info["success_paper"] = self._success_paper.clone()
         if self._looks:

@@ -239,6 +239,13 @@ def test_looking_twice_changes_nothing(make_env):
     assert torch.equal(obs["sensor_data"]["tactile_right"]["force_field"], twice["sensor_data"]["tactile_right"]["force_field"])
 
 
+def test_info_is_that_of_its_step_for_good(make_env):
+    env = make_env(obs_mode="state", render_backend="none")
+    infos = [env.reset(seed=0)[1], *(env.step(np.zeros(6))[-1] for _ in range(2))]
+    env.reset()
+    assert [info["elapsed_steps"].item() for info in infos] == [0, 1, 2]
+
+
 def test_touch_is_computed_once_a_step_and_only_where_asked_for(make_env, monkeypatch):
     captures = []
     capture = TactileSensor.capture
