@@ -154,7 +154,7 @@ class TactileSensor(BaseSensor):
         (N, 10, 14), m. With units "tacsl", the force field is that of `taxels.tacsl_field`. Drift and noise
         (`ImperfectionConfig`) may make a normal reading negative. Sizes are those of the sensor's configuration.
         """
-        return dict(self._obs)
+        return {name: values.clone() for name, values in self._obs.items()}  # which callers may change
 
     def get_params(self) -> dict[str, torch.Tensor]:
         """Pose of the pad in the world, (N, 7), m and wxyz."""

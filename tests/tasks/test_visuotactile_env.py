@@ -246,6 +246,14 @@ def test_info_is_that_of_its_step_for_good(make_env):
     assert [info["elapsed_steps"].item() for info in infos] == [0, 1, 2]
 
 
+def test_changing_an_observation_does_not_change_the_sensors_reading(make_env):
+    env = make_env(obs_mode="tacff", render_backend="none")
+    field = env.reset(seed=0)[0]["sensor_data"]["tactile_right"]["force_field"]
+    felt = field.clone()
+    field.zero_()
+    assert torch.equal(env.unwrapped.get_obs()["sensor_data"]["tactile_right"]["force_field"], felt)
+
+
 def test_touch_is_computed_once_a_step_and_only_where_asked_for(make_env, monkeypatch):
     captures = []
     capture = TactileSensor.capture
