@@ -65,7 +65,7 @@ class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
             state.
 
     Raises:
-        InvalidArgumentError: The observation mode has no sensors, or images to be joined have different sizes.
+        InvalidArgumentError: The observation mode has no sensors or a pointcloud, or images to be joined have different sizes.
     """
 
     def __init__(
@@ -86,6 +86,8 @@ class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
 
     def observation(self, observation: Any) -> Observation:
         cameras, pads = self._sensors(observation)
+        if "pointcloud" in observation:
+            raise InvalidArgumentError("a pointcloud cannot be flattened; join other textures, such as 'rgb+depth', with touch")
         rest = {name: data for name, data in observation.items() if name not in ("sensor_data", "sensor_param")}
         flat: Observation = dict(state=common.flatten_state_dict(rest, use_torch=True, device=self.base_env.device))
         flat |= dict(rgb=self._images(cameras), depth=_joined(cameras, "depth"))

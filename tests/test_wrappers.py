@@ -100,6 +100,12 @@ def test_a_mode_without_sensors_is_refused(make_env):
         FlattenVisuotactileObservationWrapper(make_env(obs_mode="state", render_backend="none"))
 
 
+@needs_renderer
+def test_a_pointcloud_is_refused(make_env):
+    with pytest.raises(InvalidArgumentError, match=r"pointcloud cannot be flattened.*'rgb\+depth'"):
+        FlattenVisuotactileObservationWrapper(make_env(obs_mode="pointcloud+tacff", **SMALL))
+
+
 def test_cpu_gym_wrapper_gives_numpy_without_a_batch(make_env):
     env = CPUGymWrapper(FlattenVisuotactileObservationWrapper(make_env(**TOUCH)), ignore_terminations=True, record_metrics=True)
     env.reset(seed=0)
