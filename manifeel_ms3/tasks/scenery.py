@@ -126,8 +126,8 @@ class SceneryEnv(SensingEnv):
             InvalidArgumentError: They do not.
         """
         wanted = {name for name, is_wanted in vars(self.obs_mode_struct.visual).items() if is_wanted}
-        for name in self._camera_names:
-            pictures = self._sensors[name].config.shader_config.texture_names
+        for name, camera in self._sensors.items():
+            pictures = camera.config.shader_config.texture_names
             drawn = {texture for textures in pictures.values() for texture in textures}
             if missing := sorted(wanted - drawn):
                 raise InvalidArgumentError(
@@ -139,7 +139,7 @@ class SceneryEnv(SensingEnv):
         """Remember how the scene looks: random looks are drawn around that."""
         self._random_looks, self._looks = None, dict[str, torch.Tensor]()
         if self.visual_randomization != VisualRandomization() and self.scene.can_render():
-            cameras = {name: self._sensors[name].camera._render_cameras[0] for name in self._camera_names}
+            cameras = {name: sensor.camera._render_cameras[0] for name, sensor in self._sensors.items()}
             self._random_looks = RandomLooks(self.visual_randomization, self.scene, self._lamps[0], cameras)
 
     def _draw_looks(self, seed: int, episode: int) -> None:

@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+import sapien
 import torch
+from mani_skill.sensors.camera import CameraConfig
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.rendering.shader_pack import camera_shader
+from manifeel_ms3.tasks import PegInsertionEnv
 from tests.tasks_and_marks import needs_renderer
 
 EVERYTHING = dict(
@@ -70,6 +74,30 @@ def test_each_kind_changes_the_image_and_leaves_the_state(make_env, env, plain, 
     look(plain, 5)
     assert torch.equal(alone.unwrapped.get_state(), plain.unwrapped.get_state())
     assert torch.equal(env.unwrapped.get_state(), plain.unwrapped.get_state())
+
+
+class PegFromAboveEnv(PegInsertionEnv):
+    """PegInsertion with one more camera."""
+
+    @property
+    def _default_sensor_configs(self):
+        pose = sapien.Pose([0.5, 0.0, 0.6], [0.7071, 0.0, 0.7071, 0.0])
+        above = CameraConfig("above", pose, 32, 32, fov=1.0, near=0.01, far=100, shader_config=camera_shader())
+        return [*super()._default_sensor_configs, above]
+
+
+@needs_renderer
+def test_a_camera_that_a_task_adds_is_one_of_its_cameras():
+    seen = {}
+    for size in (0.0, 0.03):
+        env = PegFromAboveEnv(obs_mode="rgb", cameras=(), visual_randomization=dict(camera_position=size))
+        obs, info = env.reset(seed=5)
+        seen[size] = obs["sensor_data"]["above"]["rgb"]
+        env.close()
+    assert info["looks"]["above_position"].abs().max() > 0.001
+    assert not torch.equal(*seen.values())
+    with pytest.raises(InvalidArgumentError, match="camera 'above' draw no albedo"):
+        PegFromAboveEnv(obs_mode="rgb+albedo", cameras=())
 
 
 @needs_renderer
