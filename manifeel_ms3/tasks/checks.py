@@ -129,10 +129,40 @@ def check_seed(seed: Any) -> None:
         InvalidArgumentError: A seed is not a whole number from 0 to 2**32 - 1.
     """
     seeds = seed if isinstance(seed, list | tuple | np.ndarray) else [seed]
-    if seed is not None and not all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds):
+    are_sound = len(seeds) > 0 and all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds)
+    if seed is not None and not are_sound:
         raise InvalidArgumentError(
             f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one such number for each environment"
         )
+
+
+def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) -> torch.Tensor:
+    """Check the arguments of a reset, and return the indices (n,) of the environments that it resets.
+
+    Args:
+        seed: Seed, or one seed for each environment.
+        env_idx: Indices as a tensor, an array or a list; all environments if None.
+        num_envs: Number of environments.
+        device: Device of the result.
+
+    Raises:
+        InvalidArgumentError: A seed is not allowed, or the indices are none, or not those of environments, each at most once.
+    """
+    check_seed(seed)
+    every = torch.arange(num_envs, device=device)
+    if env_idx is None:
+        return every
+    try:
+        chosen = torch.as_tensor(env_idx, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        chosen = every[:0]
+    is_list = chosen.ndim == 1 and len(chosen) > 0 and chosen.dtype in (torch.int32, torch.int64)
+    if not is_list or not torch.isin(chosen, every).all() or len(chosen.unique()) < len(chosen):
+        raise InvalidArgumentError(
+            f"the option env_idx={env_idx!r} must list environments to reset by their indices, from 0 to {num_envs - 1}, each "
+            "at most once; of a mask, give mask.nonzero()[:, 0]"
+        )
+    return chosen
 
 
 def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[str]) -> tuple[dict, dict]:

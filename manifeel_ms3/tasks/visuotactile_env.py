@@ -27,7 +27,7 @@ from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .checks import check_argument_names, check_base_arguments, check_seed, checked_randomization, split_sensor_configs
+from .checks import check_argument_names, check_base_arguments, checked_randomization, checked_reset, split_sensor_configs
 from .obs_modes import PAD, has_images, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
@@ -307,13 +307,12 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         would take a given one.
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
-        check_seed(seed)
+        env_idx = checked_reset(seed, options.get("env_idx"), self.num_envs, self.device)
         state = take_given_state(options)
         if seed is not None:
             self._episodes_of_seed = np.zeros(self.num_envs, np.int64)
             if self.num_envs == 1:
                 options["reconfigure"] = True
-        env_idx = torch.as_tensor(options.get("env_idx", torch.arange(self.num_envs)), device=self.device)
         if "env_idx" in options:
             options["env_idx"] = env_idx  # a list is accepted, too
         with self._others_unchanged(env_idx):

@@ -231,6 +231,21 @@ def test_environments_to_reset_can_be_listed(make_env):
     assert env.reset(seed=1, options=dict(env_idx=[0]))[0].equal(first)
 
 
+@pytest.mark.parametrize("env_idx", [[], [1], [-1], [0, 0], 0, [0.0], "a", torch.tensor([True])])
+def test_what_is_no_list_of_environments_is_refused(make_env, env_idx):
+    env = make_env(obs_mode="state", render_backend="none")
+    env.reset(seed=1)
+    before = env.step(np.full(6, 0.3))[0]
+    with pytest.raises(InvalidArgumentError, match=r"env_idx=.*from 0 to 0"):
+        env.reset(options=dict(env_idx=env_idx))
+    assert torch.equal(env.unwrapped.get_obs(), before)
+
+
+def test_a_list_without_a_seed_is_refused(make_env):
+    with pytest.raises(InvalidArgumentError, match=r"seed=\[\]"):
+        make_env(obs_mode="state", render_backend="none").reset(seed=[])
+
+
 def test_looking_twice_changes_nothing(make_env):
     env = make_env(obs_mode="tacff", render_backend="none")
     env.reset(seed=0)
