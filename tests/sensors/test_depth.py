@@ -7,6 +7,7 @@ import pytest
 import sapien
 import torch
 import trimesh
+from mani_skill.envs.sapien_env import BaseEnv
 from sapien.render import RenderMaterial
 
 from manifeel_ms3.errors import InvalidFileError, MachineError
@@ -162,6 +163,25 @@ def test_several_objects_and_the_table_are_felt_without_registration_or_renderer
     names = {surface.body.name for surface in sensor._depth.surfaces}
     assert {"table", "cube", "slab", "gel_left"} <= names
     assert not names & {"gel_right", "panda_rightfinger", "panda_hand"}
+    env.close()
+
+
+class TwoRobotsEnv(BaseEnv):
+    """Two equal robots that face each other."""
+
+    SUPPORTED_ROBOTS = [("panda_gelsight", "panda_gelsight")]  # noqa: RUF012 (as in ManiSkill)
+
+    def _load_agent(self, options):
+        super()._load_agent(options, [sapien.Pose(), sapien.Pose([1, 0, 0], [0, 0, 0, 1])])
+
+
+def test_all_of_another_robot_of_the_same_kind_is_felt():
+    env = TwoRobotsEnv(robot_uids=("panda_gelsight", "panda_gelsight"), control_mode="pd_joint_pos", render_backend="none")
+    own, other = (agent.robot for agent in env.agent.agents)
+    surfaces = TactileSensor(sensor_config("gelsight_r15", "pad", "gel_right"), env.scene, own)._depth.surfaces
+    felt = {robot.name: {s.body.name for s in surfaces if s.body.articulation is robot} for robot in (own, other)}
+    assert felt[own.name] == {"panda_leftfinger", "gel_left"}
+    assert felt[other.name] >= {"panda_link7", "panda_hand", "panda_rightfinger", "gel_right", "gel_left"}
     env.close()
 
 

@@ -259,7 +259,7 @@ class RaycastDepth:
         pad: Link that carries the pad.
         pad_pose: Pose of the pad frame in that link's frame.
         size: Size of the face, m.
-        excluded: Names of the links that are not felt.
+        excluded: Names of the links of the pad's robot that are not felt.
         sag: Depth of a domed face's corners under its highest point, m.
     """
 
@@ -274,7 +274,7 @@ class RaycastDepth:
     ):
         self.pad, self.device = pad, torch.device(scene.device)
         self._pad_pose = pad_pose
-        self.surfaces = scene_surfaces(scene, excluded)
+        self.surfaces = scene_surfaces(scene, excluded, pad.articulation)
         meshes = [_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces]
         self._rays = MeshRays(meshes, size, self.device, sag)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)

@@ -15,7 +15,7 @@ import sapien.physx as physx
 import torch
 import trimesh
 from mani_skill.envs.scene import ManiSkillScene
-from mani_skill.utils.structs import Actor, Link
+from mani_skill.utils.structs import Actor, Articulation, Link
 
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 
@@ -44,16 +44,26 @@ def give_relief(actor: Actor, mesh: trimesh.Trimesh) -> None:
     setattr(actor, RELIEF, mesh)
 
 
-def scene_surfaces(scene: ManiSkillScene, excluded: set[str]) -> list[Surface]:
-    """Surfaces of all actors and links of the scene that collide or have a relief, except the links named in `excluded`.
+def scene_surfaces(scene: ManiSkillScene, excluded: set[str], robot: Articulation | None = None) -> list[Surface]:
+    """Surfaces of all actors and links of the scene that collide or have a relief, except some links.
+
+    Args:
+        scene: The scene.
+        excluded: Names of the links that are left out.
+        robot: Robot whose links these are; another one may have links of the same names. Those of all robots if not given.
 
     Raises:
         InvalidFileError: A body has a mesh without triangles.
         InvalidArgumentError: A body has a shape of a type that has no mesh.
     """
-    links = [link for articulation in scene.articulations.values() for link in articulation.links]
+    links = [
+        link
+        for articulation in scene.articulations.values()
+        for link in articulation.links
+        if link.name not in excluded or (robot is not None and articulation is not robot)
+    ]
     surfaces = []
-    for body in [*scene.actors.values(), *(link for link in links if link.name not in excluded)]:
+    for body in [*scene.actors.values(), *links]:
         entities = [obj if isinstance(obj, sapien.Entity) else obj.entity for obj in body._objs]
         relief = getattr(body, RELIEF, None)
         found = [_felt_mesh(entity) if relief is None else relief for entity in entities]
