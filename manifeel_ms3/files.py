@@ -296,6 +296,18 @@ def file_hash(*paths: Path) -> str:
     return digest.hexdigest()
 
 
+def visible_files(folder: Path, pattern: str) -> list[Path]:
+    """The files of a folder and its folders that match a pattern, except for those in hidden folders.
+
+    A process that is killed while it writes leaves a hidden folder.
+    """
+    return [path for path in sorted(folder.rglob(pattern)) if not any(map(_is_hidden, path.relative_to(folder).parts))]
+
+
+def _is_hidden(name: str) -> bool:
+    return name.startswith(".")
+
+
 def move(source: Path, target: Path) -> None:
     """Rename a file or a folder, and write the new name to the disk.
 

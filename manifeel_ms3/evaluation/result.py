@@ -9,7 +9,7 @@ import jsonschema
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
-from manifeel_ms3.files import write_json
+from manifeel_ms3.files import visible_files, write_json
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.provenance import git_commit, machine, package_versions
 from manifeel_ms3.tasks.registry import task_spec
@@ -179,12 +179,7 @@ def results_by_file(*folders: Path) -> dict[Path, dict[str, Any]]:
     Raises:
         ResultError: There is no result, or one is broken.
     """
-    found = [
-        path
-        for folder in folders
-        for path in sorted(folder.rglob("*.json"))
-        if path.stem.isdigit() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
-    ]
+    found = [path for folder in folders for path in visible_files(folder, "*.json") if path.stem.isdigit()]
     if not found:
         raise ResultError(
             f"{[str(folder) for folder in folders]} hold no results; train with --num-eval-episodes 50, or run `manifeel study`"

@@ -26,6 +26,7 @@ from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
 from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.evaluation.redaction import redacted
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
+from manifeel_ms3.files import visible_files
 from manifeel_ms3.provenance import package_versions
 
 from .submission import ABOUT, Rerun, RerunFile, Submission, SubmissionError
@@ -83,14 +84,14 @@ def chance_to_pass(total: int, invented: int, drawn: int) -> float:
 
 
 def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
-    """Checkpoints by their hashes: the given folders themselves, or all that are inside of them.
+    """Checkpoints by their hashes: the given folders themselves, or all that are inside of them and of no hidden folder.
 
     Raises:
         InvalidArgumentError: A folder is no checkpoint and holds none.
     """
     found = {}
     for folder in folders:
-        here = [folder] if (folder / CONFIG).is_file() else sorted(path.parent for path in folder.rglob(WEIGHTS))
+        here = [folder] if (folder / CONFIG).is_file() else sorted(path.parent for path in visible_files(folder, WEIGHTS))
         if not here:
             raise InvalidArgumentError(f"--checkpoint {folder} is no checkpoint and holds none; give runs/x/checkpoints")
         found.update({published_hash(checkpoint): checkpoint for checkpoint in here})

@@ -1,6 +1,6 @@
 """Measures how the pads hold each task's part: `python -m tests.agents.held_parts` prints the table of docs/sensor.md."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium as gym
@@ -37,7 +37,9 @@ class Kind:
     half_width: float | None = None
     """Half the distance between the pads, in m, on a part that does not start in the hand, with the gels indented."""
     grip: float = GRIP
-    """Force of each pad, in N, with which the task holds it."""
+    """Force of each pad, in N, with which it is held."""
+    is_regripped: bool = False
+    """Whether it is held with `grip` in place of the force that its screwing task grips it with."""
     is_round: bool = False
     """Whether its surface between the pads is round, so that it slips at a smaller torque than flat parts."""
 
@@ -53,7 +55,7 @@ KINDS = {
     "power plug": Kind("PowerPlugInsertion", "plug", 0.030),
     "gear": Kind("GearAssembly", "plug", 0.040),
     "reorientation peg": Kind("PegReorientation", "plug", 0.039),
-    "nut": Kind("NutBoltAssembly", "held", 0.005),
+    "nut": Kind("NutBoltAssembly", "held", 0.005, is_regripped=True),
     "bulb": Kind("BulbInstallation", "held", 0.060, grip=14.2, is_round=True),
     "battery": Kind("ObjectSearch", "battery", 0.010, 0.0125 - BATTERY_INDENTATION),
     "golf ball": Kind("BallSorting", "golf", 0.012, 0.02075 - BALL_INDENTATION, is_round=True),
@@ -69,6 +71,8 @@ class HeldPart:
         kind = self.kind
         self._wrapped = gym.make(f"ManiFeel-{kind.task}-v1", obs_mode="none", render_backend="none", sim_backend="physx_cpu")
         self.env: Any = self._wrapped.unwrapped
+        if kind.is_regripped:
+            self.env.screw = replace(self.env.screw, grip_force=kind.grip)
 
     def close(self) -> None:
         self._wrapped.close()

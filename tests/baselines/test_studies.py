@@ -317,6 +317,10 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {num_demos: 5}}]", "'num_demos' is set by .* use `num_demos`"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {demo-path: x.h5}}]", "'demo-path' is set by .* use `demos`"),
+        (
+            "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {num-eval-episodes: 9}}]",
+            "'num-eval-episodes' is set by .* use `episodes`",
+        ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {overwrite: true}}]", "'overwrite' is set by .* another --root"),
         (
             "grids: [{tasks: [ManiFeel-PegInsertion-v1], encoder_flags: {t3: {obs-mode: rgb}}}]",

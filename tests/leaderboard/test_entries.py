@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.checkpoint_config import published_hash
 from manifeel_ms3.evaluation.entries import find_entry
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.checks import check
-from manifeel_ms3.leaderboard.rerun import checkpoint_sources, run_again
+from manifeel_ms3.leaderboard.rerun import checkpoint_sources, checkpoints_in, run_again
 from manifeel_ms3.leaderboard.submission import read_submission
 from manifeel_ms3.provenance import machine
 from tests.outcomes import made_up
@@ -99,3 +99,10 @@ def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp
 def test_an_entry_brings_its_own_checkpoint(tmp_path):
     with pytest.raises(ValueError, match="--entry brings its checkpoint"):
         evaluate.main(evaluate.Args(entry=ENTRY, checkpoint=tmp_path))
+
+
+def test_checkpoints_that_a_killed_process_was_writing_are_left_out(tmp_path):
+    whole = save_tiny_checkpoint(tmp_path / "checkpoints/00000001")
+    partial = save_tiny_checkpoint(tmp_path / "checkpoints/.00000002.here-1-abc.partial")
+    (partial / "config.json").unlink()
+    assert checkpoints_in([tmp_path]) == {published_hash(whole): whole}
