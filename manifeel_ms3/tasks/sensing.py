@@ -11,6 +11,7 @@ from mani_skill.sensors.camera import Camera
 from mani_skill.utils import common
 from mani_skill.utils.visualization.misc import tile_images
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors import TactileSensor, TactileSensorConfig
 
 from .images import same_height, same_size
@@ -111,12 +112,22 @@ class SensingEnv(BaseEnv):
         return {name: config.full_scale for name, config in self._tactile_configs.items()}
 
     def render_sensors(self):
-        images = [image for sensor in self.get_sensor_images().values() for image in sensor.values()]
+        images = self._all_sensor_images()
+        if not images:
+            raise InvalidArgumentError(
+                "render_mode='sensors' shows the observed cameras and pads, but there are none; name some in `cameras`, or in "
+                "`tactile_sensors` with an obs_mode that has touch"
+            )
         return tile_images(same_size(images), nrows=2)
 
     def render_all(self):
-        sensors = self.render_sensors()
-        return torch.cat(same_height([self.render_rgb_array(), sensors]), dim=2)
+        images = self._all_sensor_images()
+        sensors = [tile_images(same_size(images), nrows=2)] if images else []
+        return torch.cat(same_height([self.render_rgb_array(), *sensors]), dim=2)
+
+    def _all_sensor_images(self) -> list[torch.Tensor]:
+        """Images of all cameras and pads, uint8 (N, H, W, 3) each; none where nothing is observed, as in a file of states."""
+        return [image for sensor in self.get_sensor_images().values() for image in sensor.values()]
 
     def print_sim_details(self):
         super().print_sim_details()

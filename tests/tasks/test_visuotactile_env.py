@@ -302,6 +302,15 @@ def test_render_modes_show_cameras_and_touch(make_env):
 
 
 @needs_renderer
+def test_without_cameras_and_touch_the_overview_alone_is_rendered(make_env):
+    env = make_env(obs_mode="none", cameras=[], tactile_sensors=[], render_mode="all")  # as in recorded files of states
+    env.reset(seed=0)
+    assert torch.equal(env.render(), env.unwrapped.render_rgb_array())
+    with pytest.raises(InvalidArgumentError, match="name some in `cameras`"):
+        env.unwrapped.render_sensors()
+
+
+@needs_renderer
 def test_dim_light_is_dim(make_env):
     normal, _ = make_env(obs_mode="rgb").reset(seed=0)
     dim, _ = make_env(obs_mode="rgb", lighting="dim").reset(seed=0)
