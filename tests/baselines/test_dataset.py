@@ -79,6 +79,11 @@ def test_number_of_demonstrations(demos):
         read_episodes([demos], PEG, SPEC, 9)
 
 
+def test_the_bar_ends_when_all_episodes_are_read(demos, capsys):
+    read_episodes([demos, demos], PEG, SPEC, 3)
+    assert [line.split("/")[0][-1] for line in capsys.readouterr().out.splitlines()] == ["2", "1"]  # episodes of each file
+
+
 @pytest.mark.parametrize("key", ["actions", "obs/extra/tcp_pose", f"obs/{SPEC.force_fields[0]}"])
 def test_an_episode_that_is_not_finite_is_named_before_it_spoils_the_ranges_of_all(demos, tmp_path, key):
     def with_nan(values):
