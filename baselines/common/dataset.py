@@ -47,7 +47,7 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
                 break
             track = partial(bar.track, description=f"reading {file.name}")
             recorded = known.read(file, spec.keys, num=left, progress=track, env_id=env_id)
-            # unlike a loop, `map` holds no episode while it reads; it asks for an episode first, so that the bar reaches its end
+            # unlike a loop, `map` holds no episode while it reads; episodes come first, so that the bar reaches its end
             episodes.extend(map(partial(_prepared, spec, file), recorded, range(left)))
             _require_same_shapes(file, episodes[0], episodes[-left:])
     return episodes
