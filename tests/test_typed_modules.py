@@ -46,9 +46,10 @@ def test_a_task_is_shown_where_its_module_is_typed_with_it(folder):
 
 
 def test_it_is_recorded_by_worker_processes_and_its_file_imports_nothing(folder):
-    bare = ("--obs-mode", "none", "--env-kwargs", json.dumps(dict(render_backend="none")))
+    bare = ("--obs-mode", "tacff", "--env-kwargs", json.dumps(dict(render_backend="none")))
     recorded = manifeel(folder, "record", "my_task:MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)
     assert recorded.returncode == 0, recorded.stderr
+    assert "--env-id my_task:MyLab-Press-v1 --obs-mode tacff" in recorded.stderr  # the command that trains on it
     assert json.loads((folder / "press.json").read_text())["env_info"]["env_id"] == "my_task:MyLab-Press-v1"
     replayed = manifeel(folder, "replay", "press.h5")
     assert "'MyLab-Press-v1' is not registered" in replayed.stderr

@@ -16,6 +16,7 @@ from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
+from manifeel_ms3.typed_modules import imported
 
 from .formats.maniskill_h5 import HEADER, ORIGIN, DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
@@ -361,7 +362,9 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
         header: The json beside the trajectory file.
     """
     seen = header["env_info"]["env_kwargs"]
-    sensing = f"--env-id {task_of(header)} --obs-mode {seen['obs_mode']}"
+    with_module = header["env_info"]["env_id"]
+    typed = with_module.rpartition(":")[0] in imported()  # without its module, another command would not find the task
+    sensing = f"--env-id {with_module if typed else task_of(header)} --obs-mode {seen['obs_mode']}"
     if "cameras" in seen:  # other programs name them only where they are not the task's policy camera
         sensing += f" --cameras {' '.join(seen['cameras'])}"
     if (pads := seen.get("tactile_sensors")) and "right" not in pads:  # policies observe the right one unless told otherwise
