@@ -37,7 +37,7 @@ OF_THE_STUDY = {
     "seed": "`seeds`",
     "keep": "`checkpoints`",
     "demos": "`demos`",
-    "num-eval-episodes": "`episodes`",
+    "eval-episodes": "`episodes`",
     "run-dir": "--root",
     "resume": "the same command again",
     "overwrite": "another --root",
