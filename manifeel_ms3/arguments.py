@@ -117,7 +117,5 @@ def checked_action(action: Any, shapes: Sequence[tuple[int, ...]], device: torch
         expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
         raise InvalidArgumentError(f"the action has shape {tuple(tensor.shape)}, the task takes {expected}")
     if not torch.isfinite(tensor).all():
-        raise InvalidArgumentError(
-            f"the action holds NaN or infinity: {tensor.tolist()}; give finite numbers (they are clipped to [-1, 1])"
-        )
+        raise InvalidArgumentError(f"the action holds NaN or infinity: {tensor.tolist()}; give finite numbers")
     return tensor

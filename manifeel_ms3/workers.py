@@ -134,7 +134,7 @@ class WorkerDiedError(WorkFailedError):
     def __init__(self, task: Any, exit_code: int | None):
         super().__init__(
             f"the process that worked on {task!r} ended with exit code {exit_code}: it crashed, or was killed, as happens "
-            "where memory runs out; run the command again, perhaps with fewer processes"
+            "where memory or the disk is full; run the command again, perhaps with fewer processes"
         )
         self.exit_code = exit_code
 
