@@ -20,10 +20,11 @@ class ActionChunks(EpisodePolicy):
         spec: Observations of the policy.
         obs_horizon: Number of observations that condition a prediction.
         ask: Function that returns the actions (n, A) of a prediction.
+        limit: Largest size of a component of an action; infinite for controllers that take joint angles or poses.
     """
 
-    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask):
-        self.spec, self.obs_horizon, self._ask = spec, obs_horizon, ask
+    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask, limit: float = 1.0):
+        self.spec, self.obs_horizon, self._ask, self._limit = spec, obs_horizon, ask, limit
         self.reset()
 
     @property
@@ -50,7 +51,7 @@ class ActionChunks(EpisodePolicy):
             observation = {key: np.stack([step[key] for step in window]) for key in window[0]}
             self._actions.extend(self._ask(PolicyRequest(self._seed, self._step, observation)))
         self._step += 1
-        return self._actions.popleft().clip(-1.0, 1.0)
+        return self._actions.popleft().clip(-self._limit, self._limit)
 
     def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
         prepared = {}

@@ -109,7 +109,9 @@ class PolicyAgent(EpisodePolicy):
         if not isinstance(steps, int) or steps < least:
             raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of at least {least}")
         self.inference_steps = steps
-        self.make_episode_part = partial(ActionChunks, self.policy.spec, self.policy.config.obs_horizon)
+        self.make_episode_part = partial(
+            ActionChunks, self.policy.spec, self.policy.config.obs_horizon, limit=self.policy.action_normalizer.limit
+        )
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False
 

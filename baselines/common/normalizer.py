@@ -83,6 +83,11 @@ class ActionNormalizer(Normalizer):
         super().__init__(action_dim)
         self.root, self.pairs = root, [list(pair) for pair in pairs]
 
+    @property
+    def limit(self) -> float:
+        """Largest size of a component of an action: 1, or infinity if demonstrations go beyond, as those of joint angles do."""
+        return 1.0 if torch.stack([self.low, self.high]).abs().max() <= 1 else torch.inf
+
     def fit(self, data: torch.Tensor) -> None:
         super().fit(self._spread(data))
 

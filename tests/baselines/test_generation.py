@@ -7,14 +7,17 @@ import pytest
 import torch
 
 from baselines.common.action_chunks import ActionChunks
+from baselines.common.checkpoint import WEIGHTS, read_tensors, write_tensors
 from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import POSE, observation_spec
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy
+from baselines.diffusion_policy import train as diffusion
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicyRequest
+from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 SPEC = observation_spec("none", (), (), 16)
 STEPS = 30
@@ -95,6 +98,19 @@ def test_a_prediction_is_asked_for_with_the_last_observations_the_seed_and_the_s
     episode.reset()
     episode.act(dict(extra=dict(tcp_pose=pose_at(0)[None])))
     assert (requests[-1].seed, requests[-1].step) == (0, 0)
+
+
+@pytest.mark.parametrize(("lowest", "highest"), [(-3.0, -2.0), (0.5, 1.0)])
+def test_actions_have_the_range_of_the_demonstrations_which_goes_beyond_1_for_joint_angles(tmp_path, lowest, highest):
+    checkpoint = save_tiny_checkpoint(tmp_path / "checkpoint")
+    fitted = {f"action_normalizer.{end}": torch.full((6,), value) for end, value in (("low", lowest), ("high", highest))}
+    write_tensors(checkpoint / WEIGHTS, read_tensors(checkpoint / WEIGHTS) | fitted)
+    policy = diffusion.SPEC.load(checkpoint)
+    touch = dict(tactile_right=dict(force_field=torch.zeros(1, 10, 14, 3)))
+    action = policy.act(dict(sensor_data=touch, extra=dict(tcp_pose=torch.as_tensor(pose_at(0))[None])))
+    assert action.min() >= lowest - 1e-5
+    assert action.max() <= highest + 1e-5
+    assert np.ptp(action) > 0
 
 
 class Learns(Recites):
