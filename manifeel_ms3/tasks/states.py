@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from mani_skill.utils import common
 
+from manifeel_ms3.arguments import by_name
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .sensing import SensingEnv
@@ -78,14 +79,18 @@ class RestorableEnv(SensingEnv):
         self._touch_is_stale[running] = were_stale
 
 
-def take_given_state(options: dict[str, Any]) -> Any:
+def take_given_state(options: dict[str, Any], env: RestorableEnv) -> Any:
     """Take the state in which an episode is to begin out of the options of a reset.
+
+    Args:
+        options: Options of the reset, from which the state is removed.
+        env: Environment that is reset.
 
     Returns:
         The tree or the vectors that ManiSkill's option `reset_to_env_states` holds; None if it is not given.
 
     Raises:
-        InvalidArgumentError: The option holds no state.
+        InvalidArgumentError: The option holds no state, or one of other bodies than the environment's.
     """
     given = options.pop("reset_to_env_states", None)
     if given is None:
@@ -95,7 +100,29 @@ def take_given_state(options: dict[str, Any]) -> Any:
             "the option reset_to_env_states holds no env_states; give dict(reset_to_env_states=dict(env_states=state)) with a "
             "state of get_state_dict or get_state"
         )
-    return given["env_states"]
+    state = given["env_states"]
+    if isinstance(state, Mapping):
+        _require_bodies_of(state, env.get_state_dict())
+    return state
+
+
+def _require_bodies_of(state: Tree, present: Tree) -> None:
+    """Check that a state holds some of the bodies of an environment, and nothing that the environment does not have.
+
+    A state may lack bodies and controllers, and its controllers may be those of another control mode.
+
+    Raises:
+        InvalidArgumentError: It does not.
+    """
+    bodies = {part: present.get(part, {}) for part in ("actors", "articulations")}
+    given = {part: by_name(f"env_states[{part!r}]", state.get(part, {}), "that of get_state_dict") for part in bodies}
+    unknown = sorted(map(str, set(state) - {*present, *bodies, "controller"}))
+    unknown += [f"{part}/{name}" for part, held in given.items() for name in held if name not in bodies[part]]
+    if unknown or not any(given.values()):
+        raise InvalidArgumentError(
+            f"the state in the option reset_to_env_states holds {unknown or 'no body'}; this environment has "
+            f"{[f'{part}/{name}' for part, held in bodies.items() for name in held]}: give a state of its get_state_dict"
+        )
 
 
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:

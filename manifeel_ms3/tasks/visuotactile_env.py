@@ -308,7 +308,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
         env_idx = checked_reset(seed, options.get("env_idx"), self.num_envs, self.device)
-        state = take_given_state(options)
+        state = take_given_state(options, self)
         if seed is not None:
             self._episodes_of_seed = np.zeros(self.num_envs, np.int64)
             if self.num_envs == 1:

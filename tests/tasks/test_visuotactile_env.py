@@ -16,6 +16,7 @@ from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks import registry, visuotactile_env
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.states import is_part_of
 from tests.tasks_and_marks import needs_renderer
 
 
@@ -500,6 +501,26 @@ def test_an_episode_that_begins_in_a_given_state_begins_anew(make_env, seed, fla
     assert base.get_state() == pytest.approx(vector, abs=1e-6)
     with pytest.raises(InvalidArgumentError, match="holds no env_states; give"):
         env.reset(options=dict(reset_to_env_states=tree))
+
+
+def test_a_state_of_other_bodies_does_not_begin_an_episode(make_env):
+    env = make_env(obs_mode="tacff", render_backend="none")
+    env.reset(seed=0)
+    state = env.unwrapped.get_state_dict()
+    body = torch.zeros(1, 13)
+    for given, said in (
+        ({}, "holds no body; this environment has .*articulations/panda_gelsight"),
+        (dict(controller=state["controller"]), "holds no body"),
+        (dict(actors={}), "holds no body"),
+        (state | dict(goal=body), r"holds \['goal'\]"),
+        (dict(actors=dict(cup=body), articulations=state["articulations"]), r"holds \['actors/cup'\]"),
+        (dict(actors=body), r"env_states\['actors'\]=.* must be a dict"),
+    ):
+        with pytest.raises(InvalidArgumentError, match=said):
+            env.reset(options=dict(reset_to_env_states=dict(env_states=given)))
+        assert is_part_of(state, env.unwrapped.get_state_dict())
+    without_controller = dict(actors=state["actors"], articulations=state["articulations"])  # as other programs write it
+    env.reset(options=dict(reset_to_env_states=dict(env_states=without_controller)))
 
 
 def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):
