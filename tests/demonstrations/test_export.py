@@ -18,7 +18,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import task_spec
 from tests.sample import KEYS, observed_sample, states_sample
 from tests.tasks_and_marks import PEG
-from tests.trajectories import renumbered
+from tests.trajectories import changed_copy, renumbered
 
 SAMPLE = observed_sample(PEG)
 
@@ -175,6 +175,25 @@ def test_a_lerobot_dataset_counts_its_frames_and_tells_their_times(tmp_path):
         assert (entry["dataset_from_index"], entry["dataset_to_index"]) == (begin, begin + length)
         assert (entry["data/chunk_index"], entry["data/file_index"]) == (0, e)
         begin += length
+
+
+def test_a_lerobot_dataset_has_the_control_rate_of_its_recording(tmp_path):
+    pytest.importorskip("pyarrow")
+    recorded = changed_copy(SAMPLE, tmp_path, "rewards", np.negative, sim_config=dict(control_freq=20))
+    folder = export.main(export.Args(recorded, "lerobot", tmp_path / "videos", videos=True))
+    import imageio.v2 as imageio
+    import pyarrow.parquet as pq
+
+    assert json.loads((folder / "meta/info.json").read_text())["fps"] == 20
+    table = pq.read_table(folder / "data/chunk-000/file-000.parquet")
+    assert np.allclose(table["timestamp"].to_pylist(), np.arange(table.num_rows) / 20)  # s
+    entry = pq.read_table(folder / "meta/episodes").to_pylist()[1]
+    name = "videos/observation.images.wrist"
+    assert entry[f"{name}/to_timestamp"] == pytest.approx(entry["length"] / 20)
+    with imageio.get_reader(folder / name / "chunk-000/file-001.mp4") as video:
+        assert (video.get_meta_data()["fps"], video.count_frames()) == (20, entry["length"])
+    last = list(lerobot.read_lerobot(folder, KEYS))[1]
+    assert len(last["actions"]) == entry["length"]
 
 
 def test_the_cameras_of_a_lerobot_dataset_can_be_videos(tmp_path):

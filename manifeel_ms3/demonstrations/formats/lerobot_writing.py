@@ -54,15 +54,15 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     writer, entries, start = _Features(header, videos), [], 0
     task = _instruction(header)
     for e, episode in enumerate(read_trajectories(path, keys, progress=progress, outcomes=tuple(OUTCOMES))):
-        values = _features_of(episode, keys, e, start)
+        values = _features_of(episode, keys, e, start, writer.fps)
         writer.describe(values)
         place = dict(chunk_index=e // FILES_PER_CHUNK, file_index=e % FILES_PER_CHUNK)
         file = folder / DATA.format(**place)
         file.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(pa.table({name: _column(v) for name, v in values.items() if name not in writer.as_video}), file)
         for name in writer.as_video:
-            _write_video(folder / VIDEO.format(video_key=name, **place), values[name])
-        entries.append(_entry(e, task, start, values, place, writer.as_video))
+            _write_video(folder / VIDEO.format(video_key=name, **place), values[name], writer.fps)
+        entries.append(_entry(e, start, values, place, task, writer))
         start = entries[-1]["dataset_to_index"]
     (folder / "meta/episodes/chunk-000").mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(entries), folder / "meta/episodes/chunk-000/file-000.parquet")
@@ -95,6 +95,11 @@ def _instruction(header: dict[str, Any]) -> str:
         return env_id
 
 
+def _control_freq(header: dict[str, Any]) -> int:
+    """Control steps per second of a recording: that of all tasks, unless its arguments have another one."""
+    return (header["env_info"]["env_kwargs"].get("sim_config") or {}).get("control_freq", CONTROL_FREQ)
+
+
 class _Features:
     """The features of a dataset, as meta/info.json describes them.
 
@@ -107,6 +112,8 @@ class _Features:
         modes = {episode.get("control_mode") for episode in header["episodes"]}
         self._action_axes = ACTION_AXES.get(str(modes.pop())) if len(modes) == 1 else None
         self._videos = videos
+        self.fps = _control_freq(header)
+        """Frames per second."""
         self.features: dict[str, dict[str, Any]] = {}
         self.as_video: list[str] = []
         """Features that are stored as videos."""
@@ -129,7 +136,7 @@ class _Features:
     def _described(self, name: str, values: np.ndarray) -> dict[str, Any]:
         shape: list[int] = list(values.shape[1:]) or [1]
         if name in self.as_video:
-            return dict(dtype="video", shape=shape, names=IMAGE_AXES, info=_video_info(shape))
+            return dict(dtype="video", shape=shape, names=IMAGE_AXES, info=_video_info(shape, self.fps))
         if values.dtype == np.uint8:
             return dict(dtype="image", shape=shape, names=IMAGE_AXES)
         return dict(dtype=str(values.dtype), shape=shape, names=self._axes(name, shape))
@@ -143,34 +150,34 @@ class _Features:
         return FIELD_AXES if len(shape) == 3 else None
 
 
-def _video_info(shape: list[int]) -> dict[str, Any]:
+def _video_info(shape: list[int], fps: int) -> dict[str, Any]:
     """Description of a video by the names that lerobot gives its parts."""
-    size = {"video.height": shape[0], "video.width": shape[1], "video.channels": shape[2], "video.fps": CONTROL_FREQ}
+    size = {"video.height": shape[0], "video.width": shape[1], "video.channels": shape[2], "video.fps": fps}
     form = {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False, "has_audio": False}
     return size | form
 
 
-def _features_of(episode: dict[str, np.ndarray], keys: list[str], number: int, start: int) -> dict[str, np.ndarray]:
+def _features_of(episode: dict[str, np.ndarray], keys: list[str], number: int, start: int, fps: int) -> dict[str, np.ndarray]:
     """The features of an episode, (T, ...) by their names; `start` is the number of frames before it."""
     length = len(episode["actions"])
     frame = np.arange(length)
     values = {feature_name(key): episode[key][:length] for key in keys} | dict(action=episode["actions"])
     values |= {name: episode[array].astype(kind) for array, (name, kind) in OUTCOMES.items() if array in episode}
     values["next.done"] = frame == length - 1
-    values["timestamp"] = (frame / CONTROL_FREQ).astype(np.float32)
+    values["timestamp"] = (frame / fps).astype(np.float32)
     return values | dict(zip(COUNTERS, (frame, np.full(length, number), start + frame, np.zeros(length, int)), strict=True))
 
 
 def _entry(
-    number: int, task: str, start: int, values: dict[str, np.ndarray], place: dict[str, int], as_video: list[str]
+    number: int, start: int, values: dict[str, np.ndarray], place: dict[str, int], task: str, writer: _Features
 ) -> dict[str, Any]:
     """An episode's entry in meta/episodes."""
     length = len(values["action"])
-    times = dict(from_timestamp=0.0, to_timestamp=length / CONTROL_FREQ)  # each episode has a video file of its own
+    times = dict(from_timestamp=0.0, to_timestamp=length / writer.fps)  # each episode has a video file of its own
     return (
         dict(episode_index=number, tasks=[task], length=length)
         | {f"data/{name}": value for name, value in place.items()}
-        | {f"videos/{video}/{name}": value for video in as_video for name, value in (place | times).items()}
+        | {f"videos/{video}/{name}": value for video in writer.as_video for name, value in (place | times).items()}
         | dict(dataset_from_index=start, dataset_to_index=start + length)
         | {f"stats/{name}/{what}": value for name, v in values.items() for what, value in episode_statistics(v).items()}
         | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
@@ -188,7 +195,7 @@ def _info(described: _Features, num_episodes: int, num_frames: int) -> dict[str,
         chunks_size=FILES_PER_CHUNK,
         data_files_size_in_mb=DATA_FILE_MB,
         video_files_size_in_mb=VIDEO_FILE_MB,
-        fps=CONTROL_FREQ,
+        fps=described.fps,
         splits=dict(train=f"0:{num_episodes}"),
         data_path=DATA,
         video_path=VIDEO if described.as_video else None,
@@ -210,14 +217,14 @@ def _column(values: np.ndarray) -> Any:
     return pa.array(values.tolist(), kind)
 
 
-def _write_video(path: Path, images: np.ndarray) -> None:
+def _write_video(path: Path, images: np.ndarray, fps: int) -> None:
     with missing_extras_named():
         import imageio.v2 as imageio
     path.parent.mkdir(parents=True, exist_ok=True)
     writer: Any  # the stubs of imageio do not know `append_data`
     options = ["-crf", str(CRF), "-g", str(KEYFRAME_EVERY)]
     with imageio.get_writer(
-        path, fps=CONTROL_FREQ, codec="libx264", quality=None, pixelformat="yuv420p", macro_block_size=2, output_params=options
+        path, fps=fps, codec="libx264", quality=None, pixelformat="yuv420p", macro_block_size=2, output_params=options
     ) as writer:
         for image in images:
             writer.append_data(image)
