@@ -129,3 +129,10 @@ def test_depth_of_a_ball_by_the_law_of_the_layer(curvature, radius):
     both = 1 / (1 / radius + curvature)  # m, of a ball that leaves the same gap over a flat face
     load = np.pi * gel.normal_stiffness * both * 5e-4**2
     assert ball_depth(gel, radius, load) == pytest.approx(5e-4, rel=0.02)
+
+
+def test_depth_of_a_ball_in_a_gel_that_is_too_soft_to_stop_it_halfway():
+    gel, radius = GelConfig(youngs_modulus=2e4), 0.01
+    load = 2 / 3 * np.pi * gel.normal_stiffness * radius**3  # of a ball that is in up to its equator
+    assert ball_depth(gel, radius, load) == pytest.approx(radius, rel=0.01)
+    assert ball_depth(gel, radius, 2 * load) > radius

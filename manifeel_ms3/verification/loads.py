@@ -243,5 +243,7 @@ def ball_depth(gel: GelConfig, radius: float, load: float) -> float:
     def excess(depth: float) -> float:
         return gel.normal_stiffness * area * np.maximum(depth - gap, 0.0).sum() - load
 
-    root: Any = brentq(excess, 0.0, radius / 2)  # its annotation includes the full output, which is not requested
+    under_ball = gap[np.isfinite(gap)]
+    deepest = under_ball.max() + load / (gel.normal_stiffness * area * under_ball.size)  # where all of the ball carries
+    root: Any = brentq(excess, 0.0, deepest)  # its annotation includes the full output, which is not requested
     return float(root)
