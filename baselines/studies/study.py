@@ -17,8 +17,9 @@ from baselines.common.train_args import TrainArgs
 from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.command_line import PACKAGE
-from manifeel_ms3.errors import InvalidFileError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import SHOWN_LENGTH
+from manifeel_ms3.tasks.checks import check_argument_names
 from manifeel_ms3.tasks.registry import short_name, task_spec, tasks_of_table
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
@@ -220,7 +221,7 @@ def _shown(value: Any) -> str:
 
 
 def _grid(entry: Any, place: str) -> Grid:
-    """A grid whose tasks and policies are registered; a table of the paper is replaced by its tasks."""
+    """A grid whose tasks and policies are registered, and whose tasks have the arguments; a table is replaced by its tasks."""
     try:
         if isinstance(entry, dict) and isinstance(tasks := entry.get("tasks"), str):
             entry = entry | dict(tasks=tasks_of_table(tasks.removeprefix(TABLE)) if tasks.startswith(TABLE) else [tasks])
@@ -228,13 +229,16 @@ def _grid(entry: Any, place: str) -> Grid:
         recorded = [grid.demos or task_spec(task).paper_demos for task in grid.tasks]
         for task in grid.pretrain.values():
             task_spec(task)
+        for task in grid.tasks:
+            names = grid.task_args.keys() | set().union(*grid.evaluation_args)
+            check_argument_names(task_spec(task).env_class, names - {"max_episode_steps"})  # which gym.make takes
         for policy in grid.policies:
             policy_spec(policy)
         train = _train_flags(grid.train, f"{place}: train")
         of_encoders = {
             name: _train_flags(flags, f"{place}: encoder_flags/{name}") for name, flags in grid.encoder_flags.items()
         }
-    except UnknownNameError as error:
+    except InvalidArgumentError as error:
         raise StudyError(f"{place}: {error}") from error
     if unknown := set(grid.pretrain) - set(get_args(Representation)):
         raise StudyError(f"{place}: pretrain {sorted(unknown)} cannot be pretrained; choose from {get_args(Representation)}")

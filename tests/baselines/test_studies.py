@@ -310,6 +310,8 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
             "grids: [{tasks: table III, pretrain: {resnet18: ManiFeel-PegInsertion-v1}}]",
             r"pretrain \['resnet18'\] cannot be pre",
         ),
+        ("grids: [{tasks: table I, task_args: {fitt: paper}}]", r"grids/0: .* has no arguments \['fitt'\]; choose from"),
+        ("grids: [{tasks: table I, evaluation_args: [{}, {imperfection: {delay: 2}}]}]", r"no arguments \['imperfection'\]"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1]}]\nresources: {training: {}}", "'training'.* are not known"),
         (
             "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {seed: 5}}]",
