@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -75,16 +76,31 @@ def require_positive(**flags: int | None) -> None:
     _require(1, {f"{_flag(name)} ": given for name, given in flags.items()})
 
 
-def require_not_negative(**flags: int) -> None:
+def require_not_negative(**flags: int | None) -> None:
     """Check that whole numbers of a command line are at least 0.
 
     Args:
-        **flags: Numbers by the names of their flags, with underscores.
+        **flags: Numbers by the names of their flags, with underscores; None if a flag was not given.
 
     Raises:
         InvalidArgumentError: A number is less than 0.
     """
     _require(0, {f"{_flag(name)} ": given for name, given in flags.items()})
+
+
+def require_file(flag: str, path: Path, example: str) -> None:
+    """Check, before the work begins, that the path of a file that is to be written is not that of a folder.
+
+    Args:
+        flag: Flag with the path.
+        path: The path; a file need not be there yet.
+        example: Name of a file in the folder, for the message.
+
+    Raises:
+        InvalidArgumentError: The path is that of a folder.
+    """
+    if path.is_dir():
+        raise InvalidArgumentError(f"{flag} {path} is a folder; give the path of a file, such as {path / example}")
 
 
 def _flag(name: str) -> str:

@@ -16,6 +16,7 @@ goes on with the other episodes.
 
 import json
 import logging
+import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from manifeel_ms3.arguments import is_number, require_positive
+from manifeel_ms3.arguments import is_number, require_file, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
@@ -46,6 +47,8 @@ from .variant import SENSING
 log = logging.getLogger(__name__)
 BACKEND = dict(sim_backend="physx_cpu")
 """Backend of the simulation, the one that demonstrations are recorded with."""
+POLICY_PADS = ("right",)
+"""Finger pads that a --policy observes if none are given."""
 
 
 @dataclass
@@ -56,8 +59,8 @@ class Args:
     """Checkpoint folder, with config.json and weights."""
     entry: str | None = None
     """Entry of the leaderboard, such as cpu/PegInsertion/rgb+tacff, whose checkpoint is evaluated again with the settings of
-    its result; the command reports in how many episodes the outcomes agree. --env-kwargs, --inference-steps, --device and
-    --batch-size change single settings; the outcomes are then not compared."""
+    its result; the command reports in how many episodes the outcomes agree. --env-kwargs, --inference-steps, --device,
+    --batch-size and --stop-at-success change single settings; the outcomes are then not compared."""
     policy: str | None = None
     """Policy to evaluate instead of a checkpoint: a class that can be imported ("module:Class"), or the address of a server
     ("http://localhost:8000")."""
@@ -69,8 +72,9 @@ class Args:
     """Observation mode of the policy, such as rgb+tacff, for a --policy; a checkpoint brings its own."""
     cameras: tuple[str, ...] | None = None
     """Cameras that the policy observes, for a --policy; the task's policy camera if not given. A checkpoint brings its own."""
-    tactile_sensors: tuple[str, ...] = ("right",)
-    """Finger pads that the policy observes, for a --policy: left, right, or both. A checkpoint brings its own."""
+    tactile_sensors: tuple[str, ...] | None = None
+    """Finger pads that the policy observes, for a --policy: left, right, or both; the right one if not given. A checkpoint
+    brings its own."""
     sensor: str | None = None
     """Sensor on the fingers, for a --policy: gelsight_r15, gelsight_mini, digit, or one of another package. A checkpoint brings
     that of its demonstrations, and --env-kwargs '{"sensor": "digit"}' evaluates it with another one."""
@@ -168,7 +172,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
         device=args.device or inference["device"],
         batch_size=args.batch_size or inference["batch_size"],
         inference_steps=args.inference_steps or made["config"].get(INFERENCE_STEPS),
-        stop_at_success=made["stop_at_success"],
+        stop_at_success=args.stop_at_success or made["stop_at_success"],
         env_kwargs=json.dumps(made["env_kwargs"] | json_object("--env-kwargs", args.env_kwargs)),
     )
 
@@ -194,8 +198,7 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
         MissingExtraError: Videos are requested, and the extra `report` is not installed.
     """
     try:
-        if out.is_dir():
-            raise InvalidArgumentError(f"--out {out} is a folder; give the path of a file, such as {out / 'evaluation.json'}")
+        require_file("--out", out, "evaluation.json")
         if out.suffix in (".json", ".h5") and (recording := out.with_suffix(".h5")).exists():
             raise InvalidArgumentError(f"--out {out} would replace a file of the recording {recording}; give another path")
     except OSError as error:
@@ -254,7 +257,8 @@ def evaluation_from_args(args: Args) -> Evaluation:
         )
     env_id = task_spec(args.env_id).env_id
     check_obs_mode("--env-kwargs", given, args.obs_mode)
-    sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=args.tactile_sensors, sensor=args.sensor)
+    pads = POLICY_PADS if args.tactile_sensors is None else args.tactile_sensors
+    sensing = dict(obs_mode=args.obs_mode, cameras=args.cameras, tactile_sensors=pads, sensor=args.sensor)
     source = PolicySource(policy=args.policy, kwargs=args.policy_kwargs, answer_timeout=args.step_timeout)
     config = dict(policy_name=redacted(args.policy), policy_kwargs=policy_kwargs, obs_mode=args.obs_mode)
     env_kwargs = {n: v for n, v in sensing.items() if v is not None} | BACKEND | given
@@ -293,11 +297,10 @@ def _require_own(args: Args, config: dict[str, Any]) -> None:
     """Check that what a checkpoint brings is not asked for in another form.
 
     Raises:
-        InvalidArgumentError: The task, the observation mode or the cameras that are given are not the checkpoint's.
+        InvalidArgumentError: The task, the observation mode, the cameras or the pads that are given are not the checkpoint's.
     """
-    given = dict(
-        env_id=args.env_id and task_spec(args.env_id).env_id, obs_mode=args.obs_mode, cameras=args.cameras and [*args.cameras]
-    )
+    lists = {name: None if (names := getattr(args, name)) is None else [*names] for name in ("cameras", "tactile_sensors")}
+    given = dict(env_id=args.env_id and task_spec(args.env_id).env_id, obs_mode=args.obs_mode) | lists
     for name, value in given.items():
         if value not in (None, own := config[name]):
             raise InvalidArgumentError(
@@ -334,14 +337,28 @@ def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:
     return path
 
 
-def next_step(_args: Args, made: Path) -> str:
+def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     episodes = read_result(made)["episodes"]
     outcome = f"{made}: {sum(episode['success_once'] for episode in episodes)} of {len(episodes)} episodes succeed"
     if errors := [episode["error"] for episode in episodes if episode["error"]]:
         first = " ".join("".join(letter if letter.isprintable() else " " for letter in errors[0]).split())[:SHOWN_LENGTH]
         outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {first})"
-    return f"{outcome}; `manifeel film {made} --out FILE.mp4` shows one, `manifeel results` sets all results beside the paper's"
+    film = shlex.join(["manifeel", "film", str(made), *_policy_flags(args, made), "--out", "FILE.mp4"])
+    return f"{outcome}; `{film}` shows one, `manifeel results --results FOLDER` sets all results beside the paper's"
+
+
+def _policy_flags(args: Args, made: Path) -> list[str]:
+    """Flags that name the policy of a result to `manifeel film`, which else takes checkpoints/last beside the result."""
+    checkpoint = find_entry(args.entry).checkpoint if args.entry else args.checkpoint
+    flags = []
+    if args.policy is not None:
+        flags += ["--policy", redacted(args.policy)]
+    elif checkpoint is not None and checkpoint.resolve() != (made.parent / "checkpoints/last").resolve():
+        flags += ["--checkpoint", str(checkpoint)]
+    if kwargs := json_object("--policy-kwargs", args.policy_kwargs):
+        flags += ["--policy-kwargs", json.dumps(redacted(kwargs))]
+    return flags
 
 
 if __name__ == "__main__":

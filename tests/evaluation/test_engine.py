@@ -265,6 +265,7 @@ def test_a_device_that_is_not_there_is_named_before_anything_starts(checkpoint, 
         (dict(env_id="USBInsertion"), "--env-id ManiFeel-USBInsertion-v1: .* was trained with ManiFeel-PegInsertion-v1; leave"),
         (dict(obs_mode="rgb+tacff"), "--obs-mode rgb.tacff: .* was trained with tacff; leave it out"),
         (dict(cameras=("side",)), r"--cameras \['side'\]: .* was trained with \['wrist'\]; leave it out"),
+        (dict(tactile_sensors=("left",)), r"--tactile-sensors \['left'\]: .* was trained with \['right'\]; leave it out"),
     ],
 )
 def test_what_a_checkpoint_brings_cannot_be_asked_for_in_another_form(checkpoint, tmp_path, given, said):

@@ -123,6 +123,19 @@ def test_the_command_says_how_many_episodes_the_policy_failed_by_an_error(tmp_pa
     assert "0 of 2 episodes succeed; " in next_step(Args(), out)
 
 
+def test_the_command_that_films_a_result_names_the_policy_unless_it_lies_beside_the_result(tmp_path):
+    evaluated("StandStill", tmp_path, episodes=1)
+    out, own = tmp_path / "evaluation.json", "tests.evaluation.policies:StandStill"
+    last, other = tmp_path / "checkpoints/last", tmp_path / "other run/checkpoints/last"
+    assert f"`manifeel film {out} --out FILE.mp4`" in next_step(Args(last), out)
+    assert f"`manifeel film {out} --checkpoint '{other}' --out FILE.mp4`" in next_step(Args(other), out)
+    kwargs = """--policy-kwargs '{"size": 6, "token": "(redacted)"}'"""
+    given = Args(policy=own, policy_kwargs='{"size": 6, "token": "abcd1234"}')
+    assert f"`manifeel film {out} --policy {own} {kwargs} --out FILE.mp4`" in next_step(given, out)
+    entry = "cpu/PegInsertion/rgb+tacff"
+    assert f"--checkpoint {entries.find_entry(entry).checkpoint} --out" in next_step(Args(entry=entry), out)
+
+
 def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
     with pytest.raises(PolicyError, match=r"OSError: no weights.*--policy-kwargs"):
         evaluated("CannotBeMade", tmp_path)

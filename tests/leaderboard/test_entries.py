@@ -85,6 +85,7 @@ def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp
         (dict(env_kwargs='{"fit": "tight"}'), "env_kwargs"),
         (dict(inference_steps=1), "config"),
         (dict(policy_kwargs='{"seed": 1}'), "policy_kwargs"),
+        (dict(stop_at_success=True), "stop_at_success"),
     ):
         caplog.clear()
         other = read_result(evaluate.main(evaluate.Args(entry="tiny/Peg/tacff", episodes=1, **changes)))
