@@ -18,6 +18,7 @@ from typing import Annotated
 
 import tyro
 
+from manifeel_ms3.arguments import require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicySource
@@ -90,10 +91,14 @@ def main(args: Hash | Submit | Build) -> Path:
     Raises:
         SubmissionError: The submission cannot be accepted; the message lists what is wrong with it.
         FileExistsAlreadyError: The leaderboard has a submission of the same name.
-        InvalidArgumentError: No policy is given to run episodes with, or a folder of --checkpoint holds no checkpoint.
+        InvalidArgumentError: No policy is given to run episodes with, a folder of --checkpoint holds no checkpoint, or a number
+            is not allowed.
     """
     if isinstance(args, Build):
         return _build(args)
+    if isinstance(args, Submit):
+        require_positive(num_eval_envs=args.workers)
+        require_not_negative(rerun=args.rerun)
     submission = read_submission(args.folder)
     if isinstance(args, Hash):
         named = name_checkpoints(submission, args.checkpoint)

@@ -164,6 +164,12 @@ def test_a_submission_needs_a_policy_from_the_command_line(submission, tmp_path)
         main(Submit(submission, board=tmp_path / "board"))
 
 
+def test_a_number_of_episodes_or_processes_that_is_not_possible_is_named(submission, tmp_path):
+    for changes, named in ((dict(rerun=-1), "--rerun -1 must be at least 0"), (dict(workers=0), "--num-eval-envs 0 must be")):
+        with pytest.raises(InvalidArgumentError, match=named):
+            submit(submission, tmp_path / "board", **changes)
+
+
 def test_the_policy_that_a_result_names_is_never_imported(submission, tmp_path):
     change(submission, lambda result: result.update(policy="this:Policy"))
     check(read_submission(submission))
