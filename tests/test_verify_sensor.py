@@ -81,8 +81,11 @@ def test_what_cannot_be_verified_is_named(tmp_path):
         main(Args("biotac"))
     with pytest.raises(UnknownNameError, match="wobble"):
         main(Args(imperfections='{"wobble": 1}'))
-    with pytest.raises(InvalidArgumentError, match="positive forces"):
-        main(Args(loads=(1.0, -3.0)))
+    for loads in ((1.0, -3.0), (1.0, float("nan")), (float("inf"),)):
+        with pytest.raises(InvalidArgumentError, match="positive forces"):
+            main(Args(loads=loads))
+    with pytest.raises(InvalidArgumentError, match=r"--report .* is a folder; give the path of a file, such as .*sensor\.html"):
+        main(Args(report=tmp_path))
     with pytest.raises(InvalidArgumentError, match="folds"):
         main(Args("digit", tactile='{"gel.curvature": [80.0, 80.0]}'))
 

@@ -17,6 +17,7 @@ from typing import Literal
 
 import tyro
 
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import run
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
@@ -153,8 +154,11 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
     """Test every claim whose conditions have been run.
 
     Raises:
+        InvalidArgumentError: The path of the table is that of a folder.
         ResultError: There is no result, one is broken, or some cannot be told apart.
     """
+    if args.out:
+        require_file("--out", args.out, "claims.md")
     collected = collect(results_in(*args.results))
     found = of_the_protocol(collected)
     for condition in set(collected) - set(found):

@@ -16,6 +16,7 @@ from urllib.parse import quote
 import numpy as np
 import tyro
 
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
@@ -142,8 +143,10 @@ def main(args: Args) -> Path:
     A figure of the loss in training that was drawn before stays on the page where the logs of training are not at hand.
 
     Raises:
+        InvalidArgumentError: The path of the page is that of a folder.
         ResultError: There is no result, or one is broken.
     """
+    require_file("--out", args.out, "results.md")
     by_file = results_by_file(*args.results)
     results = list(by_file.values())
     collected = collect(results)

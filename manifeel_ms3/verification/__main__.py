@@ -20,6 +20,7 @@ import numpy as np
 import torch
 import tyro
 
+from manifeel_ms3.arguments import is_number, require_file
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import write_text
@@ -76,8 +77,9 @@ def main(args: Args) -> int:
     with missing_extras_named():
         import matplotlib as _  # noqa: F401  (fails before the first load if it is missing)
     tactile, imperfections = json_object("--tactile", args.tactile), json_object("--imperfections", args.imperfections)
-    if not args.loads or min(args.loads) <= 0:
+    if not args.loads or not all(is_number(load) and load > 0 for load in args.loads):
         raise InvalidArgumentError(f"--loads {args.loads} must be positive forces in N, such as 1 10")
+    require_file("--report", args.report, "sensor.html")
     config = task_sensor(args.sensor, "tactile_right", "gel_right", tactile, imperfections)
     with progress_bar() as bar:
         task = bar.add_task("pressing", total=len(SHAPES))

@@ -5,7 +5,11 @@ import re
 import shutil
 from urllib.parse import unquote
 
+import pytest
+
+from manifeel_ms3.analysis import claims, results_page
 from manifeel_ms3.analysis.paper import TACFF, VISION
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.result import result_of, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.outcomes import made_up
@@ -37,6 +41,15 @@ def test_links_lead_to_files_whose_names_have_spaces_and_parentheses(tmp_path):
     linked = [tmp_path / unquote(link) for link in links if link.endswith(("000.json", ".png", ".csv"))]
     assert {path.suffix for path in linked} == {".json", ".png", ".csv"}
     assert all(path.is_file() for path in linked)
+
+
+def test_a_folder_in_the_place_of_the_page_or_the_table_is_refused_before_anything_is_drawn(tmp_path):
+    write_run(tmp_path / "run", VISION, 0.5)
+    before = sorted(tmp_path.rglob("*"))
+    for module in (results_page, claims):
+        with pytest.raises(InvalidArgumentError, match="is a folder; give the path of a file"):
+            module.main(module.Args((tmp_path,), tmp_path))
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_results_that_a_killed_process_was_copying_are_left_out(tmp_path):
