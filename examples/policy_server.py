@@ -7,6 +7,7 @@ manifeel eval --policy http://localhost:8000 --env-id ManiFeel-PegInsertion-v1 -
 import argparse
 import io
 from collections import OrderedDict
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock
 
@@ -71,4 +72,5 @@ class Handler(BaseHTTPRequestHandler):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Serve a policy over HTTP.")
     parser.add_argument("--port", type=int, default=8000, help="Port that the server listens on.")
-    ThreadingHTTPServer(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends it
+        ThreadingHTTPServer(("127.0.0.1", parser.parse_args().port), Handler).serve_forever()
