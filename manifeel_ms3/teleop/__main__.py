@@ -12,6 +12,7 @@ from typing import Any, Literal
 import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.network import LOOPBACK_NAMES
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
@@ -20,6 +21,8 @@ from .operator import Operator, steerable_axes
 from .session import Session
 
 log = logging.getLogger(__name__)
+LAST_PORT = 2**16 - 1
+"""Largest number of a port (TCP)."""
 
 
 @dataclass
@@ -58,6 +61,8 @@ def main(args: Args) -> Path:
         DeviceError: The device cannot be used.
         MissingExtraError: viser, which serves the page, is not installed.
     """
+    if not 1 <= args.port <= LAST_PORT:  # the system would take it modulo 65536
+        raise InvalidArgumentError(f"--port {args.port} is not a port; give a number from 1 to {LAST_PORT}, such as 8080")
     with missing_extras_named():
         from .page import Page
     args = replace(args, env_id=task_spec(args.env_id).env_id)
