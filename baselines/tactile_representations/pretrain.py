@@ -24,11 +24,10 @@ from tyro.conf import arg
 from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
-from manifeel_ms3.arguments import require_positive
+from manifeel_ms3.arguments import require_file, require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header, task_of
-from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
@@ -99,8 +98,7 @@ def main(args: Args) -> list[float]:
         InUseError: Another process trains into the same file.
     """
     require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
-    if args.out.is_dir():  # which only the end of the training would meet
-        raise InvalidArgumentError(f"--out {args.out} is a folder; give the path of a file, such as {args.out / Args.out}")
+    require_file("--out", args.out, str(Args.out))
     with owned(args.out):
         return _pretrain(args)
 
