@@ -34,8 +34,9 @@ from manifeel_ms3.network import LOOPBACK
 from . import cost
 from .command_lines import require_valid_flags, shell_command
 from .jobs import FAILED, STARTED, Status, is_done, perform_in, read_status, restore_child_signals, status_of
+from .planning import Job, jobs_of
 from .publish import publish
-from .study import KINDS, Job, Kind, Resources, Study, jobs_of, read_study
+from .study import KINDS, Kind, Resources, Study, read_study
 
 log = logging.getLogger(__name__)
 RETRIES = 3

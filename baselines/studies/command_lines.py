@@ -11,10 +11,9 @@ from baselines.common.train_args import check_run
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.paths import CHECKPOINTS
 
-from .study import OF_THE_STUDY, Job, Kind, Resources, StudyError
+from .planning import Job
+from .study import OBS_MODE, OF_THE_STUDY, Kind, Resources, StudyError
 
-OBS_MODE = "rgb+tacrgb+tacff"
-"""Observation mode of all recordings, which hold everything that any policy of a study observes."""
 STEP = "$step"
 """Variable of the shell that holds the name of a checkpoint."""
 

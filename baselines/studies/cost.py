@@ -24,9 +24,10 @@ from manifeel_ms3.provenance import machine
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import all_tasks, make_env, task_spec
 
-from .command_lines import OBS_MODE, device_arguments, train_flags, training_args
+from .command_lines import device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
-from .study import KINDS, SIMULATING, Job, Kind
+from .planning import Job
+from .study import KINDS, OBS_MODE, SIMULATING, Kind
 
 TRIALS = "trials.json"
 """Name of the file of measured trials, in the folder of all jobs."""

@@ -39,7 +39,8 @@ from .command_lines import (
     training_args,
     trajectory_of,
 )
-from .study import SIMULATING, Job, Resources
+from .planning import Job
+from .study import SIMULATING, Resources
 
 Status = Literal["waiting", "running", "failed", "done"]
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"

@@ -18,7 +18,7 @@ from manifeel_ms3.paths import CHECKPOINTS, data_dir
 from manifeel_ms3.tasks.registry import task_spec
 
 from .jobs import is_done
-from .study import Job
+from .planning import Job
 
 
 def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) -> int:

@@ -9,8 +9,8 @@ import torch
 from baselines.common.checkpoint import read_tensors
 from baselines.diffusion_policy import train as diffusion
 from baselines.studies import half_precision
+from baselines.studies.planning import Job
 from baselines.studies.publish import publish
-from baselines.studies.study import Job
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS
 from manifeel_ms3.paths import CHECKPOINTS

@@ -24,7 +24,8 @@ from baselines.studies import __main__ as study_command
 from baselines.studies import cost
 from baselines.studies.command_lines import require_valid_flags, shell_command, training_args
 from baselines.studies.jobs import is_done, perform
-from baselines.studies.study import OF_THE_STUDY, Job, Resources, StudyError, jobs_of, read_study
+from baselines.studies.planning import Job, jobs_of
+from baselines.studies.study import OF_THE_STUDY, Resources, StudyError, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis import results_page as page_of_results
@@ -297,6 +298,23 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ("grids: [{tasks: []}]", "`tasks` is empty, so that there would be no job"),
         ("grids: [{tasks: table I}]\nresources: {train: {cpus: 0}}", "resources/train: `cpus` is 0; at least 0.1 is needed"),
         ("grids: [{tasks: table I}]\nresources: {train: {gpus: .nan}}", "resources/train: `gpus` is nan; at least 0 is needed"),
+        (
+            "grids: [{tasks: table I}]\nresources: {record: {cpus: .inf}}",
+            "`cpus` is inf; at least 0.1 is needed",
+        ),
+        (
+            "grids: [{tasks: table I, obs_modes: [rgb, rgb+tacrbg]}]",
+            "grids/0: obs_mode=.*: token 'tacrbg' is unknown",
+        ),
+        (
+            "grids: [{tasks: table I, obs_modes: [state]}]",
+            "obs_modes: a part of 'state'='state' is unknown; choose",
+        ),
+        (
+            "grids: [{tasks: table I, cameras: [policy, wirst]}]",
+            r"cameras='wirst' is unknown; choose from \['policy', ",
+        ),
+        ("grids: [{tasks: table I, encoders: [resnet81]}]", "grids/0: encoders='resnet81' is unknown; choose from"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], seed: 1}]", "'seed'.* are not known"),
         ("grids: [{seeds: [0]}]", "tasks"),
         (

@@ -12,7 +12,8 @@ from baselines.diffusion_policy.policy import DiffusionPolicy
 from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost, jobs
-from baselines.studies.study import jobs_of, read_study
+from baselines.studies.planning import jobs_of
+from baselines.studies.study import read_study
 from manifeel_ms3.provenance import machine
 from tests.tiny_study import TINY
 

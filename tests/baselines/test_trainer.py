@@ -22,7 +22,7 @@ from baselines.common.training import RecentLosses, Trainer, TrainingError, fast
 from baselines.diffusion_policy import train as diffusion
 from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
-from baselines.studies.study import OF_THE_MACHINE
+from baselines.studies.planning import OF_THE_MACHINE
 from manifeel_ms3.analysis.condition import NO_SETTINGS, OF_MODALITIES, settings_of
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, MissingExtraError, PluginError, WorkFailedError

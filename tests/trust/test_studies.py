@@ -18,7 +18,8 @@ from packaging.requirements import Requirement
 
 from baselines.studies import __main__ as study_command
 from baselines.studies.jobs import DONE, FAILED, STARTED, is_done, perform
-from baselines.studies.study import Job, Resources, StudyError, jobs_of, read_study
+from baselines.studies.planning import Job, jobs_of
+from baselines.studies.study import Resources, StudyError, read_study
 from manifeel_ms3.command_line import INTERRUPTED, PACKAGE
 from manifeel_ms3.errors import InUseError, MachineError
 from manifeel_ms3.evaluation.result import read_result
@@ -189,7 +190,8 @@ ESTIMATE = """
 import json, sys
 from pathlib import Path
 from baselines.studies import cost
-from baselines.studies.study import jobs_of, read_study
+from baselines.studies.planning import jobs_of
+from baselines.studies.study import read_study
 from manifeel_ms3.provenance import machine
 
 study = read_study(Path("study.yaml"))

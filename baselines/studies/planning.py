@@ -1,0 +1,128 @@
+"""The jobs that the grids of a study stand for."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.metadata import version
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from baselines.common.checkpoint import as_json
+from baselines.registry import policy_spec
+from manifeel_ms3.command_line import PACKAGE
+from manifeel_ms3.tasks.registry import short_name, task_spec
+
+from .study import Grid, Kind, Study, StudyError
+
+OF_THE_MACHINE = ("device", "precision", "compile")
+"""Settings of a preset that depend on the machine on which it is read."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording, one pretraining of an encoder, one training run or one evaluation.
+
+    Its folder is named by everything that it depends on.
+    """
+
+    kind: Kind
+    """Kind of the job."""
+    title: str
+    """Description of the job, for people."""
+    settings: dict[str, Any]
+    """Everything that the job's outcome depends on, apart from the jobs in `needs`."""
+    needs: tuple["Job", ...] = ()
+    """Jobs whose output this one reads."""
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of everything that the job depends on."""
+        content = json.dumps([self.kind, self.settings, [job.key for job in self.needs]], sort_keys=True)
+        return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+    def folder(self, root: Path) -> Path:
+        """Folder of the job's output and of the files that hold its status."""
+        return root / self.kind / self.key
+
+
+def jobs_of(study: Study) -> list[Job]:
+    """Every job of a study once, in the order of its grids; each stands after the jobs that it needs."""
+    jobs: dict[str, Job] = {}
+    for grid in study.grids:
+        for evaluate in _evaluations(grid):
+            for job in _with_needs(evaluate):
+                jobs.setdefault(job.key, job)
+    return list(jobs.values())
+
+
+def _with_needs(job: Job) -> Iterator[Job]:
+    """A job after all those that it needs."""
+    for need in job.needs:
+        yield from _with_needs(need)
+    yield job
+
+
+def _evaluations(grid: Grid) -> Iterator[Job]:
+    """The evaluations of each policy that the grid trains."""
+    choices = (grid.tasks, grid.policies, grid.obs_modes, grid.encoders, grid.cameras, grid.num_demos, grid.seeds)
+    for task, policy, mode, encoder, camera, num_demos, seed in product(*choices):
+        if encoder and "tacrgb" not in mode.split("+"):
+            continue
+        camera = task_spec(task).policy_camera if camera == "policy" else camera
+        record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
+        train = _training(grid, record, policy, mode, encoder, num_demos, seed)
+        settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop_at_success=grid.stop_at_success)
+        settings["half_precision"] = grid.half_precision
+        for further in grid.evaluation_args:
+            env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
+            title = ", ".join((train.title, json.dumps(further))) if further else train.title
+            yield Job("evaluate", title, settings | dict(env_kwargs=env_kwargs, version=version(PACKAGE)), (train,))
+
+
+def _recording(task: str, count: int, camera: str, env_kwargs: str) -> Job:
+    settings = dict(env_id=task, num=count, camera=camera, env_kwargs=env_kwargs, revision=task_spec(task).revision)
+    return Job("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
+
+
+def _pretraining(encoder: str, task: str) -> Job:
+    """The training of an encoder of TacRGB on the recording that Table I needs anyway."""
+    record = _recording(task, task_spec(task).paper_demos, task_spec(task).policy_camera, "{}")
+    settings = dict(encoder=encoder, version=version(PACKAGE))
+    return Job("pretrain", f"{encoder} on {short_name(task)}", settings, (record,))
+
+
+def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num_demos: int | None, seed: int) -> Job:
+    task, camera = record.settings["env_id"], record.settings["camera"]
+    flags = {"env-id": task, "obs-mode": mode, "cameras": camera, "seed": seed, "keep": grid.checkpoints} | grid.train
+    some = num_demos is not None and num_demos < record.settings["num"]
+    if some:
+        flags["num-demos"] = num_demos
+    if encoder:
+        flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
+    demonstrations = f"{num_demos} demonstrations" if some else ""
+    title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
+    recipe = _hash_of_preset(policy, grid.preset)
+    settings = dict(policy=policy, preset=grid.preset, recipe=recipe, flags=flags, version=version(PACKAGE))
+    pretrained = (_pretraining(encoder, grid.pretrain[encoder]),) if encoder in grid.pretrain else ()
+    return Job("train", title, settings, (record, *pretrained))
+
+
+@cache
+def _hash_of_preset(policy: str, preset: str) -> str:
+    """Hash of a preset's settings, so that a run that was made before the preset changed counts as another run.
+
+    Raises:
+        StudyError: The policy has no such preset.
+    """
+    presets = policy_spec(policy).presets
+    if preset not in presets:
+        raise StudyError(f"the policy {policy} has no preset {preset!r}; choose from {list(presets)}")
+    settings = {name: value for name, value in as_json(presets[preset].args).items() if name not in OF_THE_MACHINE}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def _env_kwargs(grid: Grid) -> str:
+    return json.dumps(grid.task_args, sort_keys=True)
