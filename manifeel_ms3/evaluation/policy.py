@@ -34,7 +34,7 @@ class Policy(Protocol):
         ...
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """Action (A,) in [-1, 1] for the environment's observation (`num_envs=1`, tensors with a leading 1)."""
+        """Action (A,) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
         ...
 
 
@@ -64,7 +64,7 @@ class EpisodePolicy(ABC):
 
     @abstractmethod
     def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """Action (A,) in [-1, 1] for the environment's observation (`num_envs=1`, tensors with a leading 1)."""
+        """Action (A,) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
 
 
 def with_defaults(policy: Policy) -> EpisodePolicy:

@@ -1,8 +1,8 @@
 """A policy in another process or on another machine, reached over HTTP; `examples/policy_server.py` is a server for it.
 
 `POST /reset` has an empty body and an empty answer. The body of `POST /act` is an npz with one array for each observation,
-named by its path ("sensor_data/wrist/rgb", uint8 (H, W, 3)); the answer is an npz with the array "action", (A,). An error is a
-status other than 200, with the message as text.
+named by its path ("sensor_data/wrist/rgb", uint8 (H, W, 3)), or "state" where the observation is the state alone; the answer is
+an npz with the array "action", (A,). An error is a status other than 200, with the message as text.
 
 Every request has the header `X-Episode`, a name of the episode that no other episode has. The server keeps the states of
 episodes apart by it, since several processes may run episodes at the same time, and repeats the header in its answer.
@@ -35,6 +35,7 @@ from uuid import uuid4
 import numpy as np
 from mani_skill.utils import common
 
+from manifeel_ms3.arguments import is_number
 from manifeel_ms3.errors import InvalidArgumentError, ServerError
 
 from .policy import STEP_TIMEOUT, PolicyUnavailableError
@@ -70,11 +71,13 @@ class RemotePolicy:
         timeout: Longest time to wait for an answer, in s.
 
     Raises:
-        InvalidArgumentError: The address is not that of a web server.
+        InvalidArgumentError: The address is not that of a web server, or the time is not a positive number.
     """
 
     def __init__(self, address: str, timeout: float = STEP_TIMEOUT):
         parts = _parts_of(address)
+        if not is_number(timeout) or timeout <= 0:
+            raise InvalidArgumentError(f"timeout={timeout!r} of the policy's server must be a number of seconds above 0")
         login, _, host = parts.netloc.rpartition("@")
         self.address, self.timeout = parts._replace(netloc=host).geturl().rstrip("/"), timeout
         self._headers = {"Content-Type": "application/octet-stream"}
@@ -87,9 +90,9 @@ class RemotePolicy:
         self._episode = uuid4().hex
         self._post("reset", b"")
 
-    def act(self, obs: dict[str, Any]) -> np.ndarray:
+    def act(self, obs: Any) -> np.ndarray:
         buffer = io.BytesIO()
-        arrays: dict[str, Any] = dict(flat_observation(obs))
+        arrays: dict[str, Any] = dict(flat_observation(obs if isinstance(obs, dict) else dict(state=obs)))
         np.savez(buffer, **arrays)
         return read_action(self._post("act", buffer.getvalue()))
 

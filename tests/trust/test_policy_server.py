@@ -18,6 +18,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from manifeel_ms3.errors import InvalidArgumentError, ServerError
 from manifeel_ms3.evaluation.evaluate import Args, main
@@ -182,6 +183,23 @@ def test_b04_what_is_not_the_policys_fault_ends_the_evaluation(status):
 def test_what_is_no_address_is_refused(address):
     with pytest.raises(InvalidArgumentError, match="give one like http://localhost:8000"):
         RemotePolicy(address)
+
+
+@pytest.mark.parametrize("timeout", [0, -1, float("nan"), float("inf"), "10", None])
+def test_a_time_limit_that_is_none_is_refused(timeout):
+    with pytest.raises(InvalidArgumentError, match=r"timeout=.* must be a number of seconds above 0"):
+        RemotePolicy(NOT_THERE, timeout)
+
+
+def test_the_state_alone_is_sent_by_its_name():
+    class Doubles:
+        def act(self, obs):
+            return 2 * obs["state"]
+
+    with served(example(MyPolicy=Doubles).Handler) as address:
+        policy = RemotePolicy(address)
+        policy.reset()
+        assert policy.act(torch.arange(3.0)[None]).tolist() == [0, 2, 4]
 
 
 # ------------------------------------------------------------------------------- hostile answers
