@@ -35,8 +35,9 @@ The dataset has LeRobot's format {form}.
 """
 BACK = """
 `observation.state` is the pose of the tool in the robot's base frame (m, quaternion wxyz). `observation.images.tactile_*` are
-what a GelSight pad's camera sees. {touch}Actions are in [-1, 1]. `next.reward`, `next.success` and `next.done`
-are those after the frame's action.
+what a GelSight pad's camera sees. {touch}Actions are in [-1, 1] in the
+control modes with `delta` in their names, which the default is one of. `next.reward`, `next.success` and `next.done` are those
+after the frame's action.
 
 The task was made with these arguments:
 
