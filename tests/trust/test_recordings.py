@@ -25,7 +25,7 @@ from manifeel_ms3.teleop.operator import Operator
 from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
 from tests.tasks_and_marks import PEG
-from tests.trajectories import bytes_of
+from tests.trajectories import arrays_of, bytes_of
 from tests.trust.kills import PATIENCE, forked, recorded, start_recording, worker_processes
 
 HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
@@ -372,6 +372,33 @@ def test_a_full_disk_keeps_every_episode_and_can_be_gone_on_from(tmp_path):
         recording.begin()
         recording.finish()
     assert seeds(path) == [0]
+
+
+@pytest.mark.parametrize("room", [1_000, 100_000, 200_000, 500_000])
+def test_a_disk_that_is_full_in_the_middle_of_a_file_ends_no_process(tmp_path, room):
+    """HDF5 frees memory twice where it cannot write the chunks of an array, and takes the process with it."""
+    path = tmp_path / "t.h5"
+    images = np.random.default_rng(0).integers(0, 255, (20, 64, 64, 3), dtype=np.uint8)  # 240 kB, which gzip does not shrink
+    arrays = dict(actions=np.zeros((20, 6), np.float32), obs=dict(rgb=images))
+    info = dict(elapsed_steps=20, success=True, peak_contact_force=1.0)
+
+    def full(say) -> None:
+        with open_recording(path, HEADER) as recording:
+            recording.begin()
+            for seed in range(3):
+                write_episode(recording.drafts, RecordedEpisode(seed, arrays))
+                recording.accept(seed, info)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
+            with pytest.raises(ManifeelError, match=r"t.h5 cannot be written \(.*File too large"):
+                recording.finish()
+            if room < images.nbytes:
+                with pytest.raises(ManifeelError, match=r"seed_00000003.h5 cannot be written \(.*File too large"):
+                    write_episode(recording.drafts, RecordedEpisode(3, arrays))
+            say("refused")
+
+    assert forked(full)[2] == ["refused"]
+    assert seeds(path) == [0, 1, 2]
+    assert np.array_equal(arrays_of(path)["traj_2/obs/rgb"], images)
 
 
 def test_a_missing_folder_of_episodes_is_named(tmp_path):

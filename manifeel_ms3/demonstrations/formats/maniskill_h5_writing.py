@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -70,15 +71,39 @@ def _write_tree(group: h5py.Group, tree: dict[str, Any]) -> None:
             group.create_dataset(name, data=value)
 
 
+class _FileOfHDF5(FileIO):
+    """A file whose writes never fail for HDF5, which crashes the process where the disk is full; `failure` keeps the error."""
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        data = memoryview(data).cast("B")
+        try:
+            written = 0
+            while written < len(data) and not self.failure:
+                written += super().write(data[written:])
+        except OSError as error:
+            self.failure = error
+        return len(data)
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self.failure = error
+            return size or 0
+
+
 @contextmanager
 def _new_h5(path: Path) -> Iterator[h5py.File]:
     """A new HDF5 file, which appears whole or not at all."""
-    with atomic_write(path) as partial:
+    with atomic_write(path) as partial, _FileOfHDF5(partial, "w+") as raw:
         try:
-            with h5py.File(partial, "w") as file:
+            with h5py.File(raw, "w") as file:
                 yield file
-        except RuntimeError as error:  # h5py raises it if it cannot close a file because the disk is full
-            raise OSError(str(error)) from error
+        finally:
+            if raw.failure:
+                raise raw.failure
 
 
 def is_index(path: Path) -> bool:
