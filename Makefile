@@ -3,6 +3,7 @@
 # make data             Record the paper's number of demonstrations of every task, in hours; it continues where it was stopped.
 # make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
 # make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
+# make results          Make the pages with published results anew, from the result files in leaderboard/cpu and docs/.
 # make lock             Pin the newest versions that pyproject.toml allows in requirements.lock.
 # Every target first installs what is missing. Demonstrations and a trained policy that are there are kept, also after a change
 # of TASK_ARGS or of the code: delete runs/demo to begin anew.
@@ -18,7 +19,7 @@ WORKERS := $(shell nproc)
 # keep compiled modules even if the shell forbids it, so that not every process compiles them again
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: setup demo data benchmark-smoke test lint types docs lock
+.PHONY: setup demo data benchmark-smoke test lint types docs results lock
 setup: $(READY)
 
 $(READY): pyproject.toml requirements.lock scripts/setup.sh
@@ -63,6 +64,12 @@ types: $(READY)
 
 docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
+
+results: $(READY)
+	$(PYTHON) -m manifeel_ms3.analysis.results_page --results leaderboard/cpu docs/cpu docs/cpu_long --out docs/results.md
+	$(PYTHON) -m docs.make_readme_results
+	$(PYTHON) -m docs.make_fidelity
+	$(PYTHON) -m docs.make_task_cards
 
 # for Python 3.10 to 3.12; only this target needs uv. --upgrade takes newer versions than those that were pinned.
 # sympy: torch needs it, and torch itself is left out (pyproject.toml says why).

@@ -51,7 +51,7 @@ def test_a_claim_that_was_run_is_answered_and_the_others_say_so(tmp_path):
 
 
 def published() -> dict[Condition, ConditionResults]:
-    return collect(results_in(ROOT / "leaderboard/cpu", ROOT / "docs/table_ii"))
+    return collect(results_in(ROOT / "leaderboard/cpu", ROOT / "docs/cpu"))
 
 
 def test_what_the_readme_says_of_touch_is_what_the_published_results_say():
