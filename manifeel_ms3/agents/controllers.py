@@ -64,7 +64,7 @@ def solve_ik(kinematics: Kinematics, pose: Pose, q0: torch.Tensor, iterations: i
         iterations: Number of steps on a GPU.
     """
     joints = kinematics.active_joint_indices
-    lowest, highest = kinematics.articulation.get_qlimits()[:, joints].unbind(-1)
+    lowest, highest = kinematics.articulation.get_qlimits()[0, joints].unbind(-1)  # those of all environments
     if kinematics.use_gpu_ik:
         q = q0.clone()
         for _ in range(iterations):

@@ -5,9 +5,12 @@ import mani_skill.envs  # noqa: F401 (registers its tasks)
 import numpy as np
 import pytest
 import torch
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.agents import PandaGelSight
+from manifeel_ms3.agents.controllers import solve_ik
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.errors import InvalidArgumentError
 
@@ -236,3 +239,18 @@ def test_joint_targets_are_reached(make_env):
     for _ in range(15):
         env.step(goal)
     assert env.unwrapped.agent.robot.get_qpos()[0, :7].numpy() == pytest.approx(goal, abs=2e-3)
+
+
+def test_a_reset_of_some_environments_on_a_gpu_finds_the_joint_angles_of_these(make_env):
+    """ManiSkill's solver for GPUs is plain torch, which the CPU computes here, for two of four robots."""
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    agent = env.unwrapped.agent
+    kinematics = Kinematics(agent.urdf_path, agent.ee_link_name, agent.robot, agent._kinematics.active_joint_indices)
+    kinematics._setup_gpu()
+    agent.robot.qlimits = agent.robot.get_qlimits().repeat(4, 1, 1)
+    wanted = agent.tcp_pose_at_base
+    near = agent.robot.get_qpos() + torch.tensor([[0.05], [-0.05]])
+    for joints in solve_ik(kinematics, Pose.create(wanted.raw_pose.repeat(2, 1)), near, iterations=10):
+        reached = agent.tool_pose_at(joints[None])
+        assert torch.allclose(reached.to_transformation_matrix(), wanted.to_transformation_matrix(), atol=1e-5)
