@@ -9,11 +9,12 @@ import torch
 import trimesh
 from mani_skill.envs.sapien_env import BaseEnv
 from sapien.render import RenderMaterial
+from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.geometry.containers import CONTAINER_HEIGHT, CONTAINER_OUTER, container
 from manifeel_ms3.sensors import TactileSensor, sensor_config
-from manifeel_ms3.sensors.depth.raycast import MeshRays
+from manifeel_ms3.sensors.depth.raycast import MeshRays, in_pad_frames
 from manifeel_ms3.sensors.depth.surfaces import entity_mesh
 from manifeel_ms3.verification.press import PadBench
 from tests.tasks_and_marks import needs_renderer
@@ -250,6 +251,16 @@ def test_velocity_counts_from_the_centre_of_mass():
     of_body = linear + np.cross(spin, np.c_[points, np.zeros(2)] - centre)
     assert velocity[0].numpy() == pytest.approx(-of_body[:, :2], abs=1e-4)  # the pad rests
     env.close()
+
+
+def test_each_of_several_pads_takes_the_twists_of_all_bodies_in_its_own_frame():
+    turns = Rotation.from_rotvec([[0.0, 0.0, 0.3], [1.0, 0.0, 0.0]])
+    pads = np.concatenate([np.ones((2, 3)), turns.as_quat()[:, [3, 0, 1, 2]]], axis=1)
+    twist = np.random.default_rng(0).standard_normal((2, 3, 6))
+    seen = in_pad_frames(torch.tensor(twist), torch.tensor(pads))
+    for pad in range(2):
+        parts = [turns[pad].inv().apply(twist[pad, :, part]) for part in (slice(0, 3), slice(3, 6))]
+        assert seen[pad].numpy() == pytest.approx(np.concatenate(parts, axis=1))
 
 
 @needs_renderer

@@ -296,7 +296,6 @@ class RaycastDepth:
 
     def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Heights (N, C), m, and velocity (N, C, 2), m/s, pad frame, of the pad along the surface that it faces."""
-        to_pad = quaternion_to_matrix(self._pad_world[:, 3:]).transpose(1, 2)[:, None]
         origin = self._pad_world[:, :3]
         pad_linear, pad_spin = _motion(self.pad, origin)
         twist = torch.zeros(*self._world.shape[:2], 6, device=self.device)
@@ -304,7 +303,13 @@ class RaycastDepth:
             env = surface.env_idx
             linear, spin = _motion(surface.body, origin[env])
             twist[env, b] = torch.cat([pad_linear[env] - linear, pad_spin[env] - spin], dim=-1)
-        return self._rays.sliding(grid, (to_pad @ twist.unflatten(-1, (2, 3))[..., None])[..., 0].flatten(-2))
+        return self._rays.sliding(grid, in_pad_frames(twist, self._pad_world))
+
+
+def in_pad_frames(twist: torch.Tensor, pads: torch.Tensor) -> torch.Tensor:
+    """Twists (N, B, 6), velocity and spin, of the world's frame in the frames of pads at poses (N, 7), m and wxyz."""
+    to_pad = quaternion_to_matrix(pads[:, 3:]).transpose(1, 2)[:, None, None]
+    return (to_pad @ twist.unflatten(-1, (2, 3))[..., None])[..., 0].flatten(-2)
 
 
 def _by_env(env_idx: torch.Tensor, meshes: list[trimesh.Trimesh], num_envs: int) -> list[trimesh.Trimesh | None]:
