@@ -1,7 +1,13 @@
-"""Padding of images to a common size, so that they can be tiled."""
+"""Padding of images to a common size, and tiling."""
 
 import torch
+from mani_skill.utils.visualization.misc import tile_images
 from torch.nn.functional import pad
+
+
+def tiled(images: list[torch.Tensor]) -> torch.Tensor:
+    """Images (N, H, W, 3) of any sizes beside each other in two rows, on their device; ManiSkill's tiles are on the CPU."""
+    return tile_images(same_size(images), nrows=2).to(images[0].device)
 
 
 def same_size(images: list[torch.Tensor]) -> list[torch.Tensor]:

@@ -9,12 +9,11 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import sensor_data_to_pointcloud
 from mani_skill.sensors.camera import Camera
 from mani_skill.utils import common
-from mani_skill.utils.visualization.misc import tile_images
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors import TactileSensor, TactileSensorConfig
 
-from .images import same_height, same_size
+from .images import same_height, tiled
 
 
 class SensingEnv(BaseEnv):
@@ -118,11 +117,11 @@ class SensingEnv(BaseEnv):
                 "render_mode='sensors' shows the observed cameras and pads, but there are none; name some in `cameras`, or in "
                 "`tactile_sensors` with an obs_mode that has touch"
             )
-        return tile_images(same_size(images), nrows=2)
+        return tiled(images)
 
     def render_all(self):
         images = self._all_sensor_images()
-        sensors = [tile_images(same_size(images), nrows=2)] if images else []
+        sensors = [tiled(images)] if images else []
         return torch.cat(same_height([self.render_rgb_array(), *sensors]), dim=2)
 
     def _all_sensor_images(self) -> list[torch.Tensor]:
