@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers import CPUGymWrapper, FrameStack, RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
@@ -41,7 +42,8 @@ def make_eval_envs(
         env_kwargs: Arguments of `gym.make`.
         other_kwargs: `obs_horizon`, the number of observations that are stacked by ManiSkill's `FrameStack`, which takes flat
             observations only (`obs_mode="state"`, or a wrapper that flattens); they are not stacked if not given.
-        video_dir: Folder of videos of the first environment, which then needs `render_mode="rgb_array"`; none if not given.
+        video_dir: Folder of videos of the first environment, or with "physx_cuda" of all of them beside each other; they need
+            `render_mode="rgb_array"`. No videos if not given.
         wrappers: Wrappers that are applied first; they must be picklable on the CPU.
     """
     env_id, kwargs = task_spec(env_id).env_id, env_kwargs or {}
@@ -70,5 +72,9 @@ def _wrapped(env: gym.Env, wrappers: Sequence[Wrapper], video_dir: str | None) -
     for wrapper in wrappers:
         env = wrapper(env)
     if video_dir:
-        env = RecordEpisode(cast(Any, env), output_dir=video_dir, save_trajectory=False, info_on_video=True)
+        # of several environments, ManiSkill ends a video after a number of steps, since they may be reset one by one
+        steps = find_max_episode_steps_value(env) if cast(Any, env.unwrapped).num_envs > 1 else None
+        env = RecordEpisode(
+            cast(Any, env), output_dir=video_dir, save_trajectory=False, info_on_video=True, max_steps_per_video=steps
+        )
     return env
