@@ -69,6 +69,10 @@ def mean_success(*tasks: ConditionResults) -> Estimate:
     return _estimate(value, np.mean(drawn, axis=0), tasks, lowest=0.0)
 
 
+Pair = tuple[ConditionResults, ConditionResults]
+"""Two conditions that were evaluated on the same initial states."""
+
+
 def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estimate, float]:
     """How much more often the first condition succeeds than the second, and the p-value of no difference.
 
@@ -79,22 +83,32 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
     Raises:
         ResultError: The two were evaluated on different episodes.
     """
-    if first.episode_seeds != second.episode_seeds:
-        raise ResultError(
-            f"{first.name} and {second.name} were evaluated on different initial states, {len(first.episode_seeds)} and "
-            f"{len(second.episode_seeds)} of them; evaluate both with the same --num-eval-episodes"
-        )
-    checkpoints = min(first.success.shape[1], second.success.shape[1])
-    rng = np.random.default_rng(0)
-    starts = _weights(rng, len(first.episode_seeds))
-    sides = [_rates(side, checkpoints) for side in (first, second)]
-    value = float(sides[0].mean() - sides[1].mean())
-    drawn = np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides))
-    rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
-    p_value = float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
+    estimate, p_value = mean_difference([(first, second)])
+    sides = _paired_rates(first, second)
     if all(len(side) == 1 and set(np.unique(side)) <= {0.0, 1.0} for side in sides):
         p_value = _mcnemar(*(side[0] for side in sides))
-    return _estimate(value, drawn, (first, second), lowest=-1.0), p_value
+    return estimate, p_value
+
+
+def mean_difference(pairs: Sequence[Pair]) -> tuple[Estimate, float]:
+    """Mean over pairs of how much more often the first condition succeeds, and the p-value of no difference on average.
+
+    Each pair weighs the same; seeds and initial states are drawn for each pair apart, as for different tasks.
+
+    Raises:
+        ResultError: The conditions of a pair were evaluated on different episodes.
+    """
+    rng = np.random.default_rng(0)
+    values, resampled = [], []
+    for pair in pairs:
+        sides = _paired_rates(*pair)
+        starts = _weights(rng, len(pair[0].episode_seeds))
+        values.append(float(sides[0].mean() - sides[1].mean()))
+        resampled.append(np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides)))
+    drawn = np.mean(resampled, axis=0)
+    rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
+    p_value = float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
+    return _estimate(float(np.mean(values)), drawn, [side for pair in pairs for side in pair], lowest=-1.0), p_value
 
 
 def p_text(p_value: float | None) -> str | None:
@@ -155,6 +169,17 @@ def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.
 def _rates(results: ConditionResults, checkpoints: int | None = None) -> np.ndarray:
     """Success (training seeds, episodes) over the last checkpoints; over all of them if their number is not given."""
     return results.success[:, -(checkpoints or results.success.shape[1]) :].mean(1)
+
+
+def _paired_rates(first: ConditionResults, second: ConditionResults) -> list[np.ndarray]:
+    """Success (training seeds, episodes) of two conditions over equally many checkpoints of the same episodes."""
+    if first.episode_seeds != second.episode_seeds:
+        raise ResultError(
+            f"{first.name} and {second.name} were evaluated on different initial states, {len(first.episode_seeds)} and "
+            f"{len(second.episode_seeds)} of them; evaluate both with the same --num-eval-episodes"
+        )
+    checkpoints = min(first.success.shape[1], second.success.shape[1])
+    return [_rates(side, checkpoints) for side in (first, second)]
 
 
 def _weights(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -54,8 +54,8 @@ HEAD = """# Results
 An episode is a success if the task was solved at any step. A rate is the mean over training seeds, the last checkpoints (at
 most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states, or over initial
 states alone where there is one seed; "of" gives the number of each. "Std" is the standard deviation over training seeds. "At
-the end" is the share of the episodes in which the task is solved at the last step, too. It is lower, since demonstrations end
-soon after success, and policies have not learnt to stay there. "Gentle success" counts the episodes that succeed before the
+the end" is the share of the episodes in which the task is solved at the last step, too. It is often lower: demonstrations end
+soon after success, so that policies have not learnt to stay there. "Gentle success" counts the episodes that succeed before the
 contact force exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)). "Floor"
 is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "By the
 paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)); older results

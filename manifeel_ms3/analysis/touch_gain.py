@@ -1,26 +1,47 @@
 """What touch adds, task by task: a paragraph of numbers for each task that was run both with and without touch."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from manifeel_ms3.evaluation.gentle import is_gentle
 from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition, by_condition
 from .episode_endings import Results, endings_of
-from .estimates import SIGNIFICANT, difference, has_enough_seeds
+from .estimates import SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
+from .markdown import markdown_table
 from .matching import Found, answering
-from .paper import MODES, TABLE_I, VISION, Rate, paper_condition
+from .paper import MODES, TABLE_I, VISION, Rate, paper_condition, tasks_in_table
 from .presets import TrainingSettings
+from .protocol import ConditionResults
 
 TEXT = """
 ## What touch adds, and how episodes fail
 
 Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. Where a condition has
 fewer than three training seeds, the interval covers the initial states only and says nothing about how much training varies.
+Each change is tested alone, without a correction for their number.
 How an episode fails is determined by a rule of its task. The [audit](audit.md) shows how much the camera and touch can reveal
 at all.
 
 """
+MEANS_TEXT = """
+### What touch adds on average
+
+The mean change over the tasks of a category that were run with at least three training seeds of each condition, by three
+measures: success at any step, as the paper counts it, success at the last step, and gentle success. Its interval is narrower
+than that of a single task, and is of these tasks, not of others. "The paper" is the mean of its changes over the same tasks.
+
+"""
+MEASURES: dict[str, Callable[[dict[str, Any], float], bool | None]] = {
+    "success": lambda episode, _limit: episode["success_once"],
+    "at the end": lambda episode, _limit: episode.get("success_at_end"),
+    "gentle success": is_gentle,
+}
+"""What counts as a success of an episode, given the task's limit of the contact force in N."""
 NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), strict=True))
 """Names of the observation modes in the text."""
 
@@ -37,6 +58,50 @@ def touch_gains(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
     if paragraphs:
         yield TEXT
         yield "\n".join(paragraphs)
+    if rows := list(_mean_rows(found)):
+        yield MEANS_TEXT
+        yield markdown_table(("category", "settings", "touch", "tasks", *MEASURES, "the paper"), rows)
+
+
+def _mean_rows(found: Found) -> Iterator[tuple[Any, ...]]:
+    """A row for each category, set-up and kind of touch in which two tasks or more have enough training seeds."""
+    for category in ("insertion", "screwing", "exploration"):
+        pairs: dict[tuple[TrainingSettings, str], dict[str, Pair]] = {}
+        for task in tasks_in_table("I", category):
+            seen = answering(paper_condition(task, VISION), found)
+            for mode in MODES[1:]:
+                for settings, touched in answering(paper_condition(task, mode), found).items():
+                    if settings not in seen:
+                        continue
+                    pair = found[touched], found[seen[settings]]
+                    if has_enough_seeds(*pair) and pair[0].episode_seeds == pair[1].episode_seeds:
+                        pairs.setdefault((settings, mode), {})[task] = pair
+        for (settings, mode), of_task in pairs.items():
+            if len(of_task) > 1:
+                papers = np.mean([rates[mode].mean - rates[VISION].mean for rates in map(_papers_rates, of_task)])
+                cells = (_mean_change(list(of_task.values()), measure) for measure in MEASURES)
+                yield category, settings, NAMES[mode], ", ".join(of_task), *cells, f"{100 * papers:+.0f}"
+
+
+def _mean_change(pairs: Sequence[Pair], measure: str) -> str | None:
+    """The mean change of a measure as text; None where an episode lacks it."""
+    sides = [_measured(side, measure) for pair in pairs for side in pair]
+    known = [side for side in sides if side is not None]
+    if len(known) < len(sides):
+        return None
+    return mean_difference(list(zip(known[::2], known[1::2], strict=True)))[0].signed
+
+
+def _measured(results: ConditionResults, measure: str) -> ConditionResults | None:
+    """Results whose success is another measure; None where an episode, or the task's limit of the force, lacks it."""
+    if measure == "gentle success" and results.force_limit is None:
+        return None
+    met = [MEASURES[measure](episode, results.force_limit or 0.0) for episode in results.episodes]
+    return None if None in met else replace(results, success=np.array(met, float).reshape(results.success.shape))
+
+
+def _papers_rates(task: str) -> dict[str, Rate]:
+    return dict(zip(MODES, TABLE_I[task], strict=True))
 
 
 def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> Iterator[str]:
@@ -53,7 +118,7 @@ def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> It
 
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
-    rates: dict[str, Rate] = dict(zip(MODES, TABLE_I[task], strict=True))
+    rates = _papers_rates(task)
     papers = f"the paper: {100 * (rates[mode].mean - rates[VISION].mean):+.0f}"
     touched, seen = found[conditions[mode]], found[conditions[VISION]]
     try:

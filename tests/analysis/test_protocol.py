@@ -8,7 +8,15 @@ import pytest
 
 from manifeel_ms3.analysis.condition import NO_SETTINGS, Condition, condition_of, settings_of
 from manifeel_ms3.analysis.episode_endings import census_table
-from manifeel_ms3.analysis.estimates import _weights, difference, has_enough_seeds, holm, mean_success, resampled_success
+from manifeel_ms3.analysis.estimates import (
+    _weights,
+    difference,
+    has_enough_seeds,
+    holm,
+    mean_difference,
+    mean_success,
+    resampled_success,
+)
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
 from manifeel_ms3.tasks.registry import task_spec
@@ -189,6 +197,17 @@ def test_a_difference_is_found_where_there_is_one(rng):
     none, p = difference(runs(rng, 0.5), runs(rng, 0.5))
     assert none.low < 0 < none.high
     assert p > 0.05
+
+
+def test_a_mean_difference_weighs_tasks_the_same_and_varies_less_than_one_of_them(rng):
+    pairs = [(runs(rng, 0.6), runs(rng, 0.4)) for _ in range(4)]
+    alone = [difference(*pair)[0] for pair in pairs]
+    together, p = mean_difference(pairs)
+    assert together.value == pytest.approx(np.mean([one.value for one in alone]))
+    width = np.mean([one.high - one.low for one in alone])
+    assert together.high - together.low == pytest.approx(width / 2, rel=0.15)  # four independent tasks
+    assert p < 0.05
+    assert mean_difference(pairs[:1]) == difference(*pairs[0])
 
 
 def test_two_single_runs_are_compared_by_mcnemars_exact_test():
