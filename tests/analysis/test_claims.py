@@ -117,6 +117,26 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
     assert re.search(change.format(""), paragraph)
 
 
+def test_the_page_says_what_touch_adds_on_average_over_the_tasks_of_a_category(tmp_path):
+    for task, seed in product(("PegInsertion", "USBInsertion"), range(3)):
+        write_run(tmp_path, VISION, 0.2, seed, task=task)
+        write_run(tmp_path, TACFF, 0.5 if task == "PegInsertion" else 0.3, seed, task=task)
+    write_run(tmp_path, VISION, 0.2, task="GearAssembly")  # one training seed: not in the mean
+    write_run(tmp_path, TACFF, 0.9, task="GearAssembly")
+    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("| insertion | "))
+    change = r"\+20 \[\+\d+, \+\d+\]"
+    papers = r"\+1[67]"  # +26 and +7 points
+    assert re.search(rf"TacFF \| PegInsertion, USBInsertion \| {change} \| {change} \| {change} \| {papers} \|", row)
+
+
+def test_a_claim_stands_beside_the_papers_difference(tmp_path):
+    for policy, seed in product(("diffusion_policy", "flow_matching"), range(3)):
+        write_run(tmp_path, TACRGB, 0.5, seed, task="BallSortingDim", policy=policy)
+    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("| 4. ") and "undecided" in line)
+    assert "diffusion_policy over flow_matching (front, rgb+tacrgb, 50 demonstrations) | " in row  # each preset has its encoder
+    assert "] | +4 | " in row  # Table II: 73 and 69 %
+
+
 def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     for seed, rate in enumerate((0.1, 0.2, 0.3)):
         write_run(tmp_path, VISION, rate, seed, checkpoints=12, training_seconds=1800.0, trained_on=TRAINED_ON)
