@@ -17,8 +17,8 @@ from manifeel_ms3.evaluation.statistics import wilson_interval
 
 from .protocol import ConditionResults
 
-RESAMPLES = 4000
-"""Number of resamples of a bootstrap; the ends of an interval over 50 initial states then vary by up to two points."""
+RESAMPLES = 40_000
+"""Number of resamples of a bootstrap: another draw changes a p-value near 0.05 by 0.002 (standard deviation)."""
 TAILS = (0.025, 0.975)
 """Quantiles at the ends of an interval of 95 %."""
 SIGNIFICANT = 0.05
@@ -188,7 +188,8 @@ def _weights(rng: np.random.Generator, count: int) -> np.ndarray:
     The spread of resampled means is too small by sqrt((count - 1) / count), which matters for three training seeds; the
     weights make up for it, and the sum of them stays one.
     """
-    drawn = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES) / count
+    chosen = rng.integers(count, size=(RESAMPLES, count)) + count * np.arange(RESAMPLES)[:, None]
+    drawn = np.bincount(chosen.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
     return 1 / count + (drawn - 1 / count) * np.sqrt(count / max(count - 1, 1))
 
 

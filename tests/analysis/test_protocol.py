@@ -210,6 +210,12 @@ def test_a_mean_difference_weighs_tasks_the_same_and_varies_less_than_one_of_the
     assert mean_difference(pairs[:1]) == difference(*pairs[0])
 
 
+def test_another_draw_of_resamples_hardly_changes_a_p_value(rng):
+    first, second = runs(rng, 0.5), runs(rng, 0.45)
+    (_, p), (_, reverse) = difference(first, second), difference(second, first)  # seeds are drawn for the first one first
+    assert p == pytest.approx(reverse, abs=0.02)
+
+
 def test_two_single_runs_are_compared_by_mcnemars_exact_test():
     """Of 50 episodes, the first run alone solves 8, the second alone 1: the p-value is 2 (1 + 9) / 2^9."""
     first, second = np.zeros((2, 1, 1, 50))
