@@ -47,6 +47,8 @@ POLL_SECONDS = 2
 """Time between two updates of the table, in s; set once, not tuned."""
 RESOURCES = (("CPU", "cpus"), ("GPU", "gpus"))
 """Ray's name of each resource, and the field of `Resources` that asks for it."""
+SHARE_DECIMALS = 4
+"""Decimals with which Ray counts shares of a resource."""
 RAY_SETTINGS = {
     "RAY_worker_niceness": "0",
     "RAY_kill_child_processes_on_worker_exit_with_raylet_subreaper": "true",  # the children of a killed worker end with it
@@ -212,7 +214,10 @@ def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job 
     """The first waiting job whose needed jobs have ended and whose resources are free; None if there is none."""
     taken = [study.resources[job.kind] for job in running.values()]
     available = ray.cluster_resources()
-    free = {name: available.get(name, 0.0) - sum(getattr(one, field) for one in taken) for name, field in RESOURCES}
+    free = {
+        name: round(available.get(name, 0.0) - sum(getattr(one, field) for one in taken), SHARE_DECIMALS)
+        for name, field in RESOURCES
+    }
     unfinished = {job.key for job in (*waiting, *running.values())}
     for job in waiting:
         needs = study.resources[job.kind]

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,14 @@ grids:
     assert all(job.settings["flags"]["image-size"] == 224 for job in touched)
     assert {job.settings["camera"] for job in jobs if job.kind == "record"} == {"wrist", "front"}
     assert len({job.key for job in jobs}) == len(jobs)
+
+
+def test_five_jobs_share_a_gpu_of_which_each_takes_a_fifth(study, monkeypatch):
+    monkeypatch.setattr(study_command.ray, "cluster_resources", lambda: dict(CPU=8.0, GPU=1.0))
+    tiny = replace(read_study(study), resources=dict(record=Resources(cpus=1, gpus=0.2)))
+    job = jobs_of(tiny)[0]
+    assert study_command._next_job(tiny, [job], dict.fromkeys("abcd", job)) is job
+    assert study_command._next_job(tiny, [job], dict.fromkeys("abcde", job)) is None
 
 
 def test_other_looks_are_further_evaluations_of_the_same_policies():
