@@ -41,7 +41,7 @@ class Handler(BaseHTTPRequestHandler):
                 raise ValueError(f"a body of {length} bytes is refused")
             body = self.rfile.read(length)
             with self.lock:
-                status, content = self.reset() if self.path == "/reset" else self.act(body)
+                status, content = self.answer(body)
         except Exception as error:  # the evaluation records the message, and goes on with the next episode
             status, content = 500, f"{type(error).__name__}: {error}".encode()
         self.send_response(status)
@@ -49,6 +49,13 @@ class Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         self.wfile.write(content)
+
+    def answer(self, body):
+        if self.path == "/reset":
+            return self.reset()
+        if self.path == "/act":
+            return self.act(body)
+        return 404, f"{self.path} is neither /reset nor /act; give --policy http://host:port without a path".encode()
 
     def reset(self):
         self.policies[self.headers["X-Episode"]] = MyPolicy()

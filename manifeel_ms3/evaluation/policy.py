@@ -190,7 +190,7 @@ class PolicySource:
         except Exception as error:  # the constructor may raise anything
             raise PolicyError(
                 f"{redacted(name)} cannot be made ({type(error).__name__}: {error}); give module:Class, importable from here, "
-                "and its arguments as --policy-kwargs"
+                "and its arguments as --policy-kwargs, or the address of a server, which begins with http://"
             ) from error
 
     def as_in(self, result: dict[str, Any]) -> "PolicySource":

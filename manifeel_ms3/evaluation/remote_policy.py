@@ -33,6 +33,7 @@ from urllib.request import (
 from uuid import uuid4
 
 import numpy as np
+import torch
 from mani_skill.utils import common
 
 from manifeel_ms3.arguments import is_number
@@ -90,9 +91,10 @@ class RemotePolicy:
         self._episode = uuid4().hex
         self._post("reset", b"")
 
-    def act(self, obs: Any) -> np.ndarray:
+    def act(self, obs: dict[str, Any] | torch.Tensor) -> np.ndarray:
         buffer = io.BytesIO()
-        arrays: dict[str, Any] = dict(flat_observation(obs if isinstance(obs, dict) else dict(state=obs)))
+        tree = obs if isinstance(obs, dict) else dict(state=obs)  # in the mode "state", the observation is the vector itself
+        arrays: dict[str, Any] = dict(flat_observation(tree))
         np.savez(buffer, **arrays)
         return read_action(self._post("act", buffer.getvalue()))
 

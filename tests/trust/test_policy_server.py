@@ -98,6 +98,26 @@ def test_a08_the_example_forgets_the_oldest_episodes_and_says_so():
             used.act(OBSERVATION)
 
 
+def test_the_example_gets_the_vector_of_the_mode_state_by_its_name():
+    class Repeats:
+        def act(self, obs):
+            assert list(obs) == ["state"]
+            return obs["state"]
+
+    with served(example(MyPolicy=Repeats).Handler) as address:
+        policy = RemotePolicy(address)
+        policy.reset()
+        assert policy.act(torch.arange(6.0)[None]).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_the_example_serves_no_policy_at_another_path():
+    with (
+        served(example().Handler) as address,
+        pytest.raises(PolicyUnavailableError, match="404: /act/reset is neither /reset nor /act"),
+    ):
+        RemotePolicy(f"{address}/act").reset()
+
+
 def test_a08_a_server_that_does_not_know_episodes_is_refused(tmp_path):
     class Old(BaseHTTPRequestHandler):
         def do_POST(self):
