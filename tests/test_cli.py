@@ -75,6 +75,21 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
     assert train_command(path, header).endswith("--cameras wrist --tactile-sensors left")
 
 
+@pytest.mark.parametrize(
+    ("recorded", "learnt"),
+    [("rgb+depth+tacff", "rgb+tacff"), ("rgbd", "rgb"), ("state_dict+tacrgb", "tacrgb"), ("state+tacff", ""), ("state", "")],
+)
+def test_the_command_after_a_recording_asks_for_observations_that_policies_take(recorded, learnt, tmp_path):
+    path = tmp_path / "x.h5"
+    header = read_header(observed_sample(PEG))
+    header["env_info"]["env_kwargs"]["obs_mode"] = recorded
+    path.with_suffix(".json").write_text(json.dumps(header))
+    shutil.copy(observed_sample(PEG), path)
+    said = next_step(None, path)
+    assert (f"--obs-mode {learnt} " in said) == bool(learnt)
+    assert ("`manifeel render-observations" in said) == (not learnt)
+
+
 SAYS_IT_ALL = {"tasks", "doctor", "view", "teleop"}
 """Commands that make nothing, or whose page or window itself says what they make."""
 

@@ -14,7 +14,7 @@ from manifeel_ms3.files import FileWriteError, move, read_json, remove_folder, w
 from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
-from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.obs_modes import TACTILE_TOKENS, split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
 from manifeel_ms3.typed_modules import imported
 
@@ -351,6 +351,9 @@ def next_step(_args: Any, path: Path) -> str:
     held = f"{path} holds {count} episode{'s' * (count != 1)}"
     if seen["obs_mode"] == "none":
         return f"{held}; `manifeel render-observations {path} --out FILE` adds observations"
+    if not _learnable(seen["obs_mode"]):
+        rendered = f"`manifeel render-observations {path} --out FILE` makes a file with cameras and touch instead"
+        return f"{held}; no policy is trained on the obs_mode {seen['obs_mode']}: {rendered}"
     return f"{held}; `manifeel view {path}` shows them, `{train_command(path, header)}` trains a policy"
 
 
@@ -364,9 +367,19 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
     seen = header["env_info"]["env_kwargs"]
     with_module = header["env_info"]["env_id"]
     typed = with_module.rpartition(":")[0] in imported()  # without its module, another command would not find the task
-    sensing = f"--env-id {with_module if typed else task_of(header)} --obs-mode {seen['obs_mode']}"
+    mode = _learnable(seen["obs_mode"]) or seen["obs_mode"]
+    sensing = f"--env-id {with_module if typed else task_of(header)} --obs-mode {mode}"
     if "cameras" in seen:  # other programs name them only where they are not the task's policy camera
         sensing += f" --cameras {' '.join(seen['cameras'])}"
     if (pads := seen.get("tactile_sensors")) and "right" not in pads:  # policies observe the right one unless told otherwise
         sensing += f" --tactile-sensors {' '.join(pads)}"
     return f"manifeel train diffusion_policy cpu --demo-path {demonstrations} {sensing}"
+
+
+def _learnable(obs_mode: str) -> str:
+    """The part of an observation mode that policies are trained on; empty if there is none.
+
+    Every policy needs the pose of the tool, which is a part of a vector in the mode `state`.
+    """
+    tokens = ["rgb" if token == "rgbd" else token for token in obs_mode.split("+")]
+    return "" if "state" in tokens else "+".join(token for token in tokens if token in ("rgb", *TACTILE_TOKENS))
