@@ -69,7 +69,7 @@ class Args:
     ("microsoft/resnet-18", or a folder), or your own function ("module:function") from (N, H, W, 3) uint8 to (N, D)."""
     modality: Literal["tacrgb", "tacff"] = "tacrgb"
     """Modality that is read from trajectory files: "tacrgb" or "tacff"."""
-    pad: str = "tactile_right"
+    pad: Literal["tactile_left", "tactile_right"] = "tactile_right"
     """Finger pad that is read from trajectory files: "tactile_left" or "tactile_right"."""
     limit: int = 2000
     """Largest number of images in each set; if there are more, this number is drawn at random."""
@@ -136,15 +136,26 @@ def main(args: Args) -> Similarity:
 
 
 def _features_of(sets: list[list[np.ndarray]], extract: Features) -> list[np.ndarray]:
-    """Features (N, D) of each set of images."""
+    """Features (N, D) of each set of images.
+
+    Raises:
+        SimilarityError: The function gives something else than finite numbers (N, D).
+    """
     features = []
     with progress_bar() as bar:
         task = bar.add_task("features", total=sum(map(len, sets)))
         for images in sets:
             parts = []
             for k in range(0, len(images), BATCH):
-                parts.append(np.asarray(extract(np.stack(images[k : k + BATCH])), np.float64))
-                bar.advance(task, len(parts[-1]))
+                batch = np.stack(images[k : k + BATCH])
+                part = np.asarray(extract(batch), np.float64)
+                if part.ndim != 2 or len(part) != len(batch) or not np.isfinite(part).all():
+                    raise SimilarityError(
+                        f"--features makes an array {part.shape} of {batch.shape[0]} images, or numbers that are not finite; "
+                        "a function of your own must return finite numbers (N, D) for N images"
+                    )
+                parts.append(part)
+                bar.advance(task, len(part))
             features.append(np.concatenate(parts))
     return features
 

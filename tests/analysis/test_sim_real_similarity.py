@@ -26,6 +26,18 @@ def brightness(images: np.ndarray) -> np.ndarray:
     return images.mean((1, 2))
 
 
+def unflattened(images: np.ndarray) -> np.ndarray:
+    return images
+
+
+def of_one_image(images: np.ndarray) -> np.ndarray:
+    return brightness(images[:1])
+
+
+def not_finite(images: np.ndarray) -> np.ndarray:
+    return np.full((len(images), 3), np.inf)
+
+
 def test_fid_of_normal_distributions_is_the_closed_form():
     """|m1 - m2|^2 + tr(S1 + S2 - 2 (S1 S2)^1/2); with diagonal covariances the last is the sum of (s1 - s2)^2."""
     first, second = (RNG.standard_normal((200_000, 4)) * scale + shift for scale, shift in ((1.0, 0.0), ([1, 2, 3, 0.5], 0.3)))
@@ -99,6 +111,9 @@ def test_a_modality_or_a_number_that_is_not_allowed_is_refused(folders, capsys):
     with pytest.raises(SystemExit):  # and not compared as if it were a force field
         tyro.cli(Args, args=[*given, "--modality", "tacrbg"])
     assert "tacrgb" in capsys.readouterr().err
+    with pytest.raises(SystemExit):  # and not refused as if the recording had no touch
+        tyro.cli(Args, args=[*given, "--pad", "right"])
+    assert "tactile_right" in capsys.readouterr().err
     for name in ("limit", "resamples"):
         with pytest.raises(InvalidArgumentError, match=f"--{name} 0 must be at least 1"):
             sim_real_similarity.main(tyro.cli(Args, args=[*given, f"--{name}", "0"]))
@@ -139,6 +154,14 @@ def test_inception_with_weights_at_hand(folders, monkeypatch):
     result = sim_real_similarity.main(Args(folders / "sim", folders / "real", "inception", resamples=2, out=folders / "out"))
     assert (result.features, result.dimensions) == ("inception", 2048)
     assert result.fid.value > 0
+
+
+@pytest.mark.parametrize("wrong", ["unflattened", "of_one_image", "not_finite"])
+def test_features_of_another_form_are_refused(folders, wrong):
+    features = OWN.replace("brightness", wrong)
+    with pytest.raises(SimilarityError, match=r"must return finite numbers \(N, D\) for N images"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", features, out=folders / "out"))
+    assert not (folders / "out").exists()
 
 
 def test_what_cannot_be_used_is_named(folders, monkeypatch):
