@@ -345,7 +345,17 @@ def next_step(args: Args, made: Path) -> str:
         first = " ".join("".join(letter if letter.isprintable() else " " for letter in errors[0]).split())[:SHOWN_LENGTH]
         outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {first})"
     film = shlex.join(["manifeel", "film", str(made), *_policy_flags(args, made), "--out", "FILE.mp4"])
-    return f"{outcome}; `{film}` shows one, `manifeel results --results FOLDER` sets all results beside the paper's"
+    return f"{outcome}; `{film}` shows one, {_page_of(args, made)}"
+
+
+def _page_of(args: Args, made: Path) -> str:
+    """Which command makes a page with a result: that of all results if the file is named by a gradient step."""
+    if made.stem.isdigit():
+        return f"`{shlex.join(['manifeel', 'results', '--results', str(made.parent)])}` sets it beside the paper's"
+    checkpoints = (made.parent / "checkpoints").resolve()
+    if args.checkpoint is not None and made.name == "evaluation.json" and args.checkpoint.resolve().parent == checkpoints:
+        return f"`{shlex.join(['manifeel', 'report', '--run-dir', str(made.parent)])}` writes a page about the run"
+    return "`manifeel results` reads results that are named by the gradient step, as by --out FOLDER/00007000.json"
 
 
 def _policy_flags(args: Args, made: Path) -> list[str]:

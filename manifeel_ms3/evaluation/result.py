@@ -182,7 +182,8 @@ def results_by_file(*folders: Path) -> dict[Path, dict[str, Any]]:
     found = [path for folder in folders for path in visible_files(folder, "*.json") if path.stem.isdigit()]
     if not found:
         raise ResultError(
-            f"{[str(folder) for folder in folders]} hold no results; train with --num-eval-episodes 50, or run `manifeel study`"
+            f"{[str(folder) for folder in folders]} hold no results named by the gradient step, such as 00007000.json; train "
+            "with --num-eval-episodes 50, run `manifeel study`, or give `manifeel eval` such a name as --out"
         )
     return {path: read_result(path) for path in found}
 

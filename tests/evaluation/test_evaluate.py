@@ -16,7 +16,7 @@ from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.evaluate import Args, default_out, main, next_step
 from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
-from manifeel_ms3.evaluation.result import ResultError, read_result
+from manifeel_ms3.evaluation.result import ResultError, read_result, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
 from tests.tasks_and_marks import PEG
 from tests.trust.files_of_strangers import rewrite_json
@@ -134,6 +134,19 @@ def test_the_command_that_films_a_result_names_the_policy_unless_it_lies_beside_
     assert f"`manifeel film {out} --policy {own} {kwargs} --out FILE.mp4`" in next_step(given, out)
     entry = "cpu/PegInsertion/rgb+tacff"
     assert f"--checkpoint {entries.find_entry(entry).checkpoint} --out" in next_step(Args(entry=entry), out)
+
+
+def test_the_command_that_comes_next_takes_a_result_of_this_name(tmp_path):
+    evaluated("StandStill", tmp_path, episodes=1)
+    out, last, step = tmp_path / "evaluation.json", tmp_path / "checkpoints/last", tmp_path / "a run/00007000.json"
+    assert f"`manifeel report --run-dir {tmp_path}` writes a page about the run" in next_step(Args(last), out)
+    with pytest.raises(ResultError, match=r"hold no results named by the gradient step.*as --out"):
+        results_in(tmp_path)
+    assert "named by the gradient step, as by --out FOLDER/00007000.json" in next_step(Args(tmp_path / "x"), out)
+    step.parent.mkdir()
+    out.rename(step)
+    assert f"`manifeel results --results '{step.parent}'` sets it beside the paper's" in next_step(Args(last), step)
+    assert len(results_in(tmp_path)) == 1
 
 
 def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
