@@ -68,7 +68,7 @@ class Args:
     """Features that images are compared by: "inception" (FID's own; needs the extra `similarity`), a ResNet of transformers
     ("microsoft/resnet-18", or a folder), or your own function ("module:function") from (N, H, W, 3) uint8 to (N, D)."""
     modality: Literal["tacrgb", "tacff"] = "tacrgb"
-    """Modality that is read from trajectory files: "tacrgb" or "tacff"."""
+    """Modality that is read from trajectory files and folders: "tacrgb" (images) or "tacff" (force fields)."""
     pad: Literal["tactile_left", "tactile_right"] = "tactile_right"
     """Finger pad that is read from trajectory files: "tactile_left" or "tactile_right"."""
     limit: int = 2000
@@ -219,15 +219,18 @@ def images_of(source: Path, args: Args) -> list[np.ndarray]:
     Raises:
         SimilarityError: There are too few images, or one is broken.
     """
+    suffixes = IMAGES if args.modality == "tacrgb" else FIELDS
     if source.suffix in RECORDINGS:
         found = _recorded(source, args)
     else:
-        files = sorted(path for path in source.rglob("*") if path.suffix.lower() in IMAGES + FIELDS)
+        files = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes)
         if len(files) > args.limit:
             files = [files[k] for k in np.random.default_rng(0).choice(len(files), args.limit, replace=False)]
         found = [_image(path) for path in files]
     if len(found) < FEWEST:
-        raise SimilarityError(f"{source} holds {len(found)} of {IMAGES + FIELDS}; at least {FEWEST} are needed")
+        raise SimilarityError(
+            f"{source} holds {len(found)} of {suffixes}; --modality {args.modality} needs at least {FEWEST} of them"
+        )
     height, width = found[0].shape[:2]
     return [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in found]
 

@@ -168,6 +168,8 @@ def test_what_cannot_be_used_is_named(folders, monkeypatch):
     args = dict(out=folders / "out", resamples=2)
     with pytest.raises(SimilarityError, match="holds 0 of"):
         sim_real_similarity.main(Args(folders / "nowhere", folders / "real", OWN, **args))
+    with pytest.raises(SimilarityError, match=r"real holds 0 of .*npy.*; --modality tacff needs at least 10"):
+        sim_real_similarity.main(Args(folders / "sim_fields", folders / "real", OWN, "tacff", **args))
     with pytest.raises(SimilarityError, match="cannot be loaded as a ResNet"):
         sim_real_similarity.main(Args(folders / "sim", folders / "real", str(folders / "sim"), **args))
     monkeypatch.setitem(__import__("sys").modules, "torch_fidelity.feature_extractor_inceptionv3", None)
