@@ -1,5 +1,7 @@
 """Padding of images to a common size, and tiling."""
 
+from typing import Any, cast
+
 import torch
 from mani_skill.utils.visualization.misc import tile_images
 from torch.nn.functional import pad
@@ -7,7 +9,8 @@ from torch.nn.functional import pad
 
 def tiled(images: list[torch.Tensor]) -> torch.Tensor:
     """Images (N, H, W, 3) of any sizes beside each other in two rows, on their device; ManiSkill's tiles are on the CPU."""
-    return tile_images(same_size(images), nrows=2).to(images[0].device)
+    whole: Any = tile_images(cast(Any, same_size(images)), nrows=2)
+    return whole.to(images[0].device)
 
 
 def same_size(images: list[torch.Tensor]) -> list[torch.Tensor]:

@@ -357,8 +357,9 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
 
     def _step_action(self, action):
         if action is not None:
-            batch: Any = (self.num_envs, *self.single_action_space.shape)
-            action = checked_action(action, (batch[1:], batch) if self.num_envs == 1 else (batch,), self.device)
+            shape: Any = self.single_action_space.shape
+            batch = (self.num_envs, *shape)
+            action = checked_action(action, (shape, batch) if self.num_envs == 1 else (batch,), self.device)
         self._joint_forces = []
         action = super()._step_action(action)
         self._contact_force = self.agent.held_object_force(torch.stack(self._joint_forces)).amax(dim=0)

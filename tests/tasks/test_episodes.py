@@ -55,6 +55,14 @@ def test_a_list_without_a_seed_is_refused(make_env):
         make_env(obs_mode="state", render_backend="none").reset(seed=[])
 
 
+def test_a_list_of_seeds_that_are_not_one_for_each_environment_is_refused(make_env):
+    env = make_env(obs_mode="state", render_backend="none")
+    before = env.reset(seed=[5])[0]
+    with pytest.raises(InvalidArgumentError, match=r"seed=\[3, 4\] has 2 numbers.*1 in all"):
+        env.reset(seed=[3, 4])
+    assert torch.equal(env.unwrapped.get_obs(), before)
+
+
 def test_looking_twice_changes_nothing(make_env):
     env = make_env(obs_mode="tacff", render_backend="none")
     env.reset(seed=0)

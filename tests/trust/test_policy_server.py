@@ -211,17 +211,6 @@ def test_a_time_limit_that_is_none_is_refused(timeout):
         RemotePolicy(NOT_THERE, timeout)
 
 
-def test_the_state_alone_is_sent_by_its_name():
-    class Doubles:
-        def act(self, obs):
-            return 2 * obs["state"]
-
-    with served(example(MyPolicy=Doubles).Handler) as address:
-        policy = RemotePolicy(address)
-        policy.reset()
-        assert policy.act(torch.arange(3.0)[None]).tolist() == [0, 2, 4]
-
-
 # ------------------------------------------------------------------------------- hostile answers
 
 
