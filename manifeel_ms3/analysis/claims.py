@@ -126,12 +126,12 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
         rows += [(*what, *cells) for cells in ran or [(None, papers, None, None, "not run", None)]]
     names = ("claim", "task", "compared", "difference", "the paper", "p", "p, Holm", "verdict", "settings")
     table = markdown_table(names, rows)
-    tests = {one.conditions: one.p_holm for outcomes in answered.values() for one in outcomes if one.p_holm is not None}
-    remaining = sum(p_holm < SIGNIFICANT for p_holm in tests.values())
-    tested = {one.conditions: one.difference for outcomes in answered.values() for one in outcomes if one.p_holm is not None}
-    halves = [50 * (one.high - one.low) for one in tested.values()]
+    results = [one for outcomes in answered.values() for one in outcomes]
+    tested = {one.conditions: (one.p_holm, one.difference) for one in results if one.p_holm is not None}
+    remaining = sum(p_holm < SIGNIFICANT for p_holm, _ in tested.values())
+    halves = [50 * (change.high - change.low) for _, change in tested.values()]
     reach = REACH.format(points=median(halves)) if halves else ""
-    note = MANY_TESTS.format(seeds=FEWEST_SEEDS, count=len(tests), remaining=remaining, reach=reach)
+    note = MANY_TESTS.format(seeds=FEWEST_SEEDS, count=len(tested), remaining=remaining, reach=reach)
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
 
 
