@@ -355,7 +355,7 @@ def _page_of(args: Args, made: Path) -> str:
     checkpoints = (made.parent / "checkpoints").resolve()
     if args.checkpoint is not None and made.name == "evaluation.json" and args.checkpoint.resolve().parent == checkpoints:
         return f"`{shlex.join(['manifeel', 'report', '--run-dir', str(made.parent)])}` writes a page about the run"
-    return "`manifeel results` reads results that are named by the gradient step, as by --out FOLDER/00007000.json"
+    return "`manifeel results` reads files named by the step, as 00007000.json"
 
 
 def _policy_flags(args: Args, made: Path) -> list[str]:

@@ -146,11 +146,11 @@ def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) 
         device: Device of the result.
 
     Raises:
-        InvalidArgumentError: A seed, or the number of seeds, is not allowed, or the indices are none, or not those of
-            environments, each at most once.
+        InvalidArgumentError: A seed is not allowed, several environments have another number of seeds, or the indices are
+            none, or not those of environments, each at most once.
     """
     check_seed(seed)
-    if isinstance(seed, list | tuple | np.ndarray) and len(seed) not in (1, num_envs):
+    if num_envs > 1 and isinstance(seed, list | tuple | np.ndarray) and len(seed) not in (1, num_envs):
         raise InvalidArgumentError(
             f"seed={seed!r} has {len(seed)} numbers; give one number, or one for each environment: {num_envs} in all"
         )

@@ -142,7 +142,7 @@ def test_the_command_that_comes_next_takes_a_result_of_this_name(tmp_path):
     assert f"`manifeel report --run-dir {tmp_path}` writes a page about the run" in next_step(Args(last), out)
     with pytest.raises(ResultError, match=r"hold no results named by the gradient step.*as --out"):
         results_in(tmp_path)
-    assert "named by the gradient step, as by --out FOLDER/00007000.json" in next_step(Args(tmp_path / "x"), out)
+    assert "`manifeel results` reads files named by the step, as 00007000.json" in next_step(Args(tmp_path / "x"), out)
     step.parent.mkdir()
     out.rename(step)
     assert f"`manifeel results --results '{step.parent}'` sets it beside the paper's" in next_step(Args(last), step)

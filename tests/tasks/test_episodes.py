@@ -6,6 +6,7 @@ import sapien
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.checks import checked_reset
 from manifeel_ms3.tasks.states import is_part_of
 
 
@@ -55,12 +56,11 @@ def test_a_list_without_a_seed_is_refused(make_env):
         make_env(obs_mode="state", render_backend="none").reset(seed=[])
 
 
-def test_a_list_of_seeds_that_are_not_one_for_each_environment_is_refused(make_env):
-    env = make_env(obs_mode="state", render_backend="none")
-    before = env.reset(seed=[5])[0]
-    with pytest.raises(InvalidArgumentError, match=r"seed=\[3, 4\] has 2 numbers.*1 in all"):
-        env.reset(seed=[3, 4])
-    assert torch.equal(env.unwrapped.get_obs(), before)
+def test_seeds_that_are_not_one_for_each_of_several_environments_are_refused():
+    for seed in (7, [7], [7, 8, 9]):
+        assert checked_reset(seed, None, 3, torch.device("cpu")).tolist() == [0, 1, 2]
+    with pytest.raises(InvalidArgumentError, match=r"seed=\[3, 4\] has 2 numbers.*3 in all"):
+        checked_reset([3, 4], None, 3, torch.device("cpu"))
 
 
 def test_looking_twice_changes_nothing(make_env):
