@@ -11,6 +11,7 @@ the p-values after Holm's correction for all comparisons with a verdict say whic
 
 import logging
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -115,10 +116,13 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
         found: The results that enter comparisons.
         answered: What `results_of_claims` makes of them.
     """
+    tables: dict[str, dict[Condition, float]] = {}
+    for number, condition, rate in reported():
+        tables.setdefault(number, {})[condition] = rate.mean
     rows = []
     for comparison, outcomes in answered.items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
-        papers = _papers_difference(comparison)
+        papers = _papers_difference(comparison, tables.values())
         ran = [
             (one.difference.signed, papers, p_text(one.p_value), p_text(one.p_holm), one.verdict, one.settings)
             for one in outcomes
@@ -135,12 +139,9 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
 
 
-def _papers_difference(comparison: Comparison) -> str | None:
+def _papers_difference(comparison: Comparison, tables: Iterable[dict[Condition, float]]) -> str | None:
     """The difference in the first of the paper's tables that has both conditions, in points; None if there is none."""
-    tables: dict[str, dict[Condition, float]] = {}
-    for table, condition, rate in reported():
-        tables.setdefault(table, {})[condition] = rate.mean
-    for rates in tables.values():
+    for rates in tables:
         if comparison.first in rates and comparison.second in rates:
             return f"{100 * (rates[comparison.first] - rates[comparison.second]):+.0f}"
     return None

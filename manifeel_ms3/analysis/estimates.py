@@ -17,6 +17,8 @@ from manifeel_ms3.evaluation.statistics import wilson_interval
 
 from .protocol import ConditionResults
 
+Pair = tuple[ConditionResults, ConditionResults]
+"""Two conditions that were evaluated on the same initial states."""
 RESAMPLES = 40_000
 """Number of resamples of a bootstrap: another draw changes a p-value near 0.05 by 0.002 (standard deviation)."""
 TAILS = (0.025, 0.975)
@@ -67,10 +69,6 @@ def mean_success(*tasks: ConditionResults) -> Estimate:
     drawn = [_resampled_means(_rates(task), _weights(rng, len(task.episode_seeds)), rng) for task in tasks]
     value = float(np.mean([task.success.mean() for task in tasks]))
     return _estimate(value, np.mean(drawn, axis=0), tasks, lowest=0.0)
-
-
-Pair = tuple[ConditionResults, ConditionResults]
-"""Two conditions that were evaluated on the same initial states."""
 
 
 def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estimate, float]:
