@@ -1,27 +1,26 @@
 """README's table of results, made anew: `python -m docs.make_readme_results` in the repository's root.
 
-It shows Table I in the set-up in which most of it was run, with the results of the folder leaderboard/cpu. A test fails where
-README does not have what this makes.
+It shows Table I with the results of the folders that `make results` reads, each task with the preset of the fullest training in
+which it was run. A test fails where README does not have what this makes.
 """
 
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
-from manifeel_ms3.analysis.condition import Condition, condition_of
+from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds, holm
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
-from manifeel_ms3.analysis.paper_tables import HEADINGS, table_one
+from manifeel_ms3.analysis.paper_tables import HEADINGS, overview_of_table_one
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
-from manifeel_ms3.evaluation.result import results_by_file
+from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-RESULTS = ROOT / "leaderboard" / "cpu"
+RESULTS = [ROOT / folder for folder in ("leaderboard/cpu", "docs/cpu", "docs/cpu_long")]
 BLOCK = re.compile(r"(<!-- --8<-- \[start:results\] -->\n).*(?=<!-- --8<-- \[end:results\] -->)", re.DOTALL)
 """README's part between the marks with which the home page of the documentation includes it."""
 ROWS = {
@@ -37,9 +36,9 @@ ROWS = {
 }
 """First cells of the rows, in the order of the table."""
 TEXT = """
-**What touch adds, in numbers:** success rates of Diffusion Policy with small networks (the preset `{preset}`), each trained
-in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the paper's number of demonstrations, over {episodes} initial
-states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds; rows without it
+**What touch adds, in numbers:** success rates of Diffusion Policy with small networks (the preset `cpu`, or `cpu_long` where it
+was run, which trains longer on long tasks), each trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the
+paper's number of demonstrations, over {episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds; rows without it
 have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are significantly
 above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates with three seeds). The paper's
 rates, in brackets, come from much larger networks.
@@ -56,31 +55,26 @@ def block() -> str:
     Raises:
         ResultError: There is no result, or one is broken.
     """
-    results = list(results_by_file(RESULTS).values())
+    results = results_in(*RESULTS)
     found = of_the_protocol(collect(results))
-    if not (most := table_one(found)):
-        raise SystemExit(f"{RESULTS} has no result of the paper's Table I")
-    settings, conditions = most
+    overview = overview_of_table_one(found)
+    conditions = {(task, mode): condition for task, (_, by_mode) in overview.items() for mode, condition in by_mode.items()}
     here = {place: found[condition] for place, condition in conditions.items()}
     gains = _corrected_gains(here)
-    minutes = [seconds / 60 for seconds in _training_seconds(results, set(conditions.values()))]
+    trained = [result["config"] for result in results if condition_of(result) in conditions.values()]
+    minutes = [config["training_seconds"] / 60 for config in trained if "training_seconds" in config]
     text = TEXT.format(
-        preset=settings.preset,
         fastest=min(minutes),
         slowest=max(minutes),
-        episodes=min(len(found[condition].episode_seeds) for condition in conditions.values()),
-        seeds=max(len(found[condition].success) for condition in conditions.values()),
+        episodes=min(len(ours.episode_seeds) for ours in here.values()),
+        seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
         tests=len(gains),
     )
     raised = {place for place, p_holm in gains.items() if p_holm < SIGNIFICANT}
-    rows = [(label, *_cells(task, here, raised)) for task, label in ROWS.items()]
-    return f"{fill(text.strip(), WIDTH)}\n\n{markdown_table(('', *HEADINGS.values()), rows)}"
-
-
-def _training_seconds(results: list[dict[str, Any]], conditions: set[Condition]) -> list[float]:
-    configs = [result["config"] for result in results if condition_of(result) in conditions]
-    return [config["training_seconds"] for config in configs if "training_seconds" in config]
+    presets = {task: f"`{settings.preset}`" for task, (settings, _) in overview.items()}
+    rows = [(label, presets.get(task), *_cells(task, here, raised)) for task, label in ROWS.items()]
+    return f"{fill(text.strip(), WIDTH)}\n\n{markdown_table(('', 'preset', *HEADINGS.values()), rows)}"
 
 
 Results = dict[tuple[str, str], ConditionResults]

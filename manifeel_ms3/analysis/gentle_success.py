@@ -11,8 +11,7 @@ from manifeel_ms3.evaluation.gentle import success_under_force
 from .condition import Condition
 from .figures import save_figure
 from .matching import Found
-from .paper import MODES, TABLE_I
-from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, table_one
+from .paper_tables import COLOURS, DPI, HEADINGS, LEGEND_SIZE, overview_of_table_one
 from .protocol import ConditionResults
 from .success_curves import PANEL
 
@@ -35,7 +34,7 @@ def gentle_cell(results: ConditionResults) -> str | None:
 def draw_success_under_force(found: Found, out: Path) -> bool:
     """Draw the success of Table I's conditions against the force allowed: a panel for each task, a curve for each sensing.
 
-    The set-up is the one in which most conditions were run; tasks that were not run in it have no panel.
+    `overview_of_table_one` says which settings a task has; tasks that were not run have no panel.
 
     Args:
         found: The results that enter comparisons.
@@ -47,20 +46,18 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    if not (most := table_one(found)):
+    if not (overview := overview_of_table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    settings, conditions = most
-    tasks = [task for task in TABLE_I if any((task, mode) in conditions for mode in MODES)]
-    columns = min(len(tasks), COLUMNS)
-    rows = -(-len(tasks) // columns)
+    columns = min(len(overview), COLUMNS)
+    rows = -(-len(overview) // columns)
     fig = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained")
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
-    for ax, task in zip(panels, tasks, strict=False):
-        _draw_task(ax, found, {mode: conditions[task, mode] for mode in MODES if (task, mode) in conditions})
+    for ax, (task, (settings, conditions)) in zip(panels, overview.items(), strict=False):
+        _draw_task(ax, found, conditions)
         ax.set_title(f"{task}: Diffusion Policy, {settings.preset}")
-    for ax in panels[len(tasks) :]:
+    for ax in panels[len(overview) :]:
         ax.set_axis_off()
     save_figure(fig, out, DPI)
     return True

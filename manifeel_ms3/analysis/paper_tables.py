@@ -154,28 +154,30 @@ def linked(success: Estimate, file: str | None) -> str:
     return f"[{value}]({file}) {interval}" if file else f"{value} {interval}"
 
 
-def table_one(found: Found) -> tuple[TrainingSettings, dict[tuple[str, str], Condition]] | None:
-    """The conditions of Table I, by task and observation mode, in the set-up in which most of them were run.
+def overview_of_table_one(found: Found) -> dict[str, tuple[TrainingSettings, dict[str, Condition]]]:
+    """The settings of each task of Table I that was run, and its conditions by observation mode.
 
-    None if none was run.
+    Where a task was run with several settings, these are the ones with which most of its observation modes were run; among
+    equals, the ones of the fullest training (`presets.FULLEST`).
 
     Args:
         found: The results that enter comparisons.
     """
-    by_settings: dict[TrainingSettings, dict[tuple[str, str], Condition]] = {}
+    overview = {}
     for task in TABLE_I:
+        by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
         for mode in MODES:
             for settings, condition in answering(paper_condition(task, mode), found).items():
-                by_settings.setdefault(settings, {})[task, mode] = condition
-    return max(by_settings.items(), key=lambda item: len(item[1]), default=None)
+                by_settings.setdefault(settings, {})[mode] = condition
+        if by_settings:
+            overview[task] = min(by_settings.items(), key=lambda item: (-len(item[1]), item[0].fullness))
+    return overview
 
 
 def draw_sensing_by_task(found: Found, out: Path) -> bool:
     """Draw the success of Table I as bars: tasks side by side, a bar for each sensing, the paper's rates as black lines.
 
-    A task that was not run has the paper's lines alone.
-
-    The set-up is the one in which most conditions were run.
+    A task that was not run has the paper's lines alone. `overview_of_table_one` says which settings a task has.
 
     Args:
         found: The results that enter comparisons.
@@ -187,13 +189,14 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     Raises:
         MissingExtraError: The extra `report`, which draws, is not installed.
     """
-    if not (most := table_one(found)):
+    if not (overview := overview_of_table_one(found)):
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    settings, conditions = most
+    conditions = {(task, mode): condition for task, (_, by_mode) in overview.items() for mode, condition in by_mode.items()}
     drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
     tasks = list(TABLE_I)
+    names = [f"{task}\n({overview[task][0].preset})" if task in overview else task for task in tasks]
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
     for k, mode in enumerate(MODES):
@@ -203,8 +206,8 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
             label = "the paper" if place == k == 0 else None
             left = place + (k - 1.5) * BAR
             ax.plot([left, left + BAR], [rate.mean] * 2, color="black", lw=PAPER_LINE, label=label)
-    ax.set(ylabel="success", ylim=(0, 1), title=f"What touch adds: Diffusion Policy, {settings.preset}")
-    ax.set_xticks(range(len(tasks)), tasks, rotation=LABEL_ANGLE, ha="right")
+    ax.set(ylabel="success", ylim=(0, 1), title="What touch adds: Diffusion Policy")
+    ax.set_xticks(range(len(tasks)), names, rotation=LABEL_ANGLE, ha="right")
     ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
     save_figure(fig, out, DPI)
     return True

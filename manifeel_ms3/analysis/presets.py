@@ -13,6 +13,8 @@ from .condition import ENCODER, Condition, Settings, settings_of
 
 PAPER = "paper"
 """Name of the preset that has the paper's settings, in every policy that the paper reports."""
+FULLEST = (PAPER, "cpu_long", "cpu")
+"""Presets from the paper's own training to the shortest: an overview of Table I has the first in which a task was run."""
 PAPER_PRECISION = {"precision": json.dumps("fp32")}
 """Number format of the paper's training. The presets' own depends on the machine."""
 NOT_RECORDED = "not recorded"
@@ -36,6 +38,12 @@ class TrainingSettings:
     """Name of the policy's preset that the settings come nearest to; "" where the policy has no presets here."""
     changes: Settings
     """Settings that differ from the preset's, or all of them where there is no preset."""
+
+    @property
+    def fullness(self) -> tuple[int, int, str]:
+        """Key that puts the fullest training first (`FULLEST`), and settings with fewer changes before those with more."""
+        place = FULLEST.index(self.preset) if self.preset in FULLEST else len(FULLEST)
+        return place, len(self.changes), str(self)
 
     @property
     def sort_key(self) -> tuple[bool, int, str]:

@@ -8,7 +8,9 @@ from urllib.parse import unquote
 import pytest
 
 from manifeel_ms3.analysis import claims, results_page
-from manifeel_ms3.analysis.paper import TACFF, VISION
+from manifeel_ms3.analysis.paper import MODES, TACFF, VISION
+from manifeel_ms3.analysis.paper_tables import overview_of_table_one
+from manifeel_ms3.analysis.protocol import collect
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.result import result_of, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
@@ -56,3 +58,15 @@ def test_results_that_a_killed_process_was_copying_are_left_out(tmp_path):
     write_run(tmp_path / "cpu", VISION, 0.2)
     shutil.copytree(tmp_path / "cpu", tmp_path / ".cpu.here-1-abc.partial/cpu")
     assert len(results_in(tmp_path)) == 2
+
+
+def test_the_overview_of_table_one_has_the_fullest_training_of_which_every_sensing_was_run(tmp_path):
+    for preset, modes in (("cpu", MODES), ("cpu_long", MODES), ("paper", (VISION,))):
+        for mode in modes:
+            write_run(tmp_path, mode, 0.2, preset=preset)
+    write_run(tmp_path, VISION, 0.2, preset="cpu", task="USBInsertion")
+    overview = overview_of_table_one(collect(results_in(tmp_path)))
+    assert {task: (settings.preset, list(by_mode)) for task, (settings, by_mode) in overview.items()} == {
+        "PegInsertion": ("cpu_long", list(MODES)),
+        "USBInsertion": ("cpu", [VISION]),
+    }
