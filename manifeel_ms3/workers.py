@@ -36,6 +36,8 @@ Task = TypeVar("Task")
 
 SAFE_PATH = "PYTHONSAFEPATH"
 """Environment variable of Python 3.11 and later, with which a new interpreter finds no modules in the current folder."""
+_starting = threading.Lock()
+"""Lock of the start of the server process, during which an environment variable of this process has another value."""
 ENDED_EARLY = os.EX_SOFTWARE
 """Exit code that stands for 0 where a process ends in the midst of its work, for example by `os._exit(0)` in a policy."""
 
@@ -117,7 +119,7 @@ class WorkerContext(ForkServerContext):
 def _start_server() -> None:
     """Start the server process if it does not run, as it may have been killed. Its first process takes seconds to come."""
     forkserver.set_forkserver_preload(["manifeel_ms3.worker_server"])
-    with without_ctrl_c(), _safe_path():
+    with _starting, without_ctrl_c(), _safe_path():
         resource_tracker.ensure_running()  # before the server would start it, because its start lets Ctrl-C through again
         with without_ctrl_c():
             forkserver.ensure_running()

@@ -3,12 +3,13 @@
 import os
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import pytest
 
 from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
-from manifeel_ms3.workers import WorkerDiedError, WorkerPool
+from manifeel_ms3.workers import SAFE_PATH, WorkerContext, WorkerDiedError, WorkerPool
 from tests.command_process import run_code
 
 
@@ -182,6 +183,14 @@ from warp._src import context
 assert context.runtime is None
 print("imported")
 """
+
+
+def test_starts_in_several_threads_leave_the_environment_as_it_was(monkeypatch):
+    """Pebble's threads and that of a policy's process start processes, perhaps at the same time."""
+    monkeypatch.delenv(SAFE_PATH, raising=False)
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(lambda _: WorkerContext(), range(1000)))  # the executor raises what a thread raises
+    assert SAFE_PATH not in os.environ
 
 
 def test_the_server_uses_no_gpu(tmp_path):
