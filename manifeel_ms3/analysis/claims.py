@@ -26,7 +26,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition
 from .encoder_ranking import ranking_tables
-from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, mean_success, p_text
+from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper import reported
@@ -92,7 +92,7 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
     outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
     for (comparison, settings), pair in pairs.items():
         (gap, _), test = differences[pair], frozenset(pair)
-        best = max(mean_success(found[condition]).value for condition in pair)
+        best = max(float(found[condition].success.mean()) for condition in pair)
         verdict = _verdict(comparison, gap, best) if test in tests else "too few seeds"
         outcomes[comparison].append(ClaimResult(gap, tests.get(test), corrected.get(test), verdict, settings, test))
     return outcomes
