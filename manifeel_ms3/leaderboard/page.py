@@ -49,6 +49,8 @@ class Row:
     """Mean success with its interval."""
     results: ConditionResults
     """Success in every episode."""
+    files: list[dict[str, Any]]
+    """Contents of the result files of the condition."""
     inference_ms: float
     """Median over episodes of the mean time of an inference, in ms."""
     force: float
@@ -85,20 +87,19 @@ class Row:
 
 def rows_of(submission: Submission) -> list[Row]:
     """The success of each condition of a submission, by the paper's protocol."""
-    rows = []
+    rows, by_condition = [], dict[Condition, dict[Path, dict[str, Any]]]()
+    for path, result in submission.results.items():
+        by_condition.setdefault(condition_of(result), {})[path] = result
     for condition, results in collect(submission.results.values()).items():
-        paths, episodes = _paths(submission, condition), results.episodes
+        files, episodes = by_condition[condition], results.episodes
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))
-        limit, rerun = task_spec(condition.env_id).force_limit, rerun_of(submission, paths)
+        limit, rerun = task_spec(condition.env_id).force_limit, rerun_of(submission, files)
         gentle = None if limit is None else float(success_under_force(episodes, [limit])[0])
         floor = highest_floor(condition.env_id, condition.revision, condition.variant)
-        rows.append(Row(submission, condition, mean_success(results), results, latency, force, gentle, floor, rerun))
+        measured = (latency, force, gentle, floor, rerun)
+        rows.append(Row(submission, condition, mean_success(results), results, [*files.values()], *measured))
     return rows
-
-
-def _paths(submission: Submission, condition: Condition) -> list[Path]:
-    return [path for path, result in submission.results.items() if condition_of(result) == condition]
 
 
 def rows_on(board: Path) -> list[Row]:
@@ -151,7 +152,6 @@ def write_page(rows: list[Row], board: Path) -> Path:
 
 def _for_page(row: Row) -> dict[str, Any]:
     about, condition = row.submission.about, row.condition
-    results = [row.submission.results[path] for path in _paths(row.submission, condition)]
     texts = dict(
         task=condition.task,
         variant=condition.variant,
@@ -177,8 +177,8 @@ def _for_page(row: Row) -> dict[str, Any]:
         force=row.force,
         gentle=row.gentle,
         link=about.link,
-        config=json.dumps(dict(sorted(results[-1]["config"].items())), indent=1),
-        curves=json.dumps(_curves(results)),
+        config=json.dumps(dict(sorted(row.files[-1]["config"].items())), indent=1),
+        curves=json.dumps(_curves(row.files)),
         videos=[base64.b64encode(video).decode() for video in row.submission.videos],
     )
 
