@@ -1,7 +1,14 @@
-"""Settings in nested mappings: the entries in which two differ."""
+"""Settings in nested mappings: those of a dataclass, and the entries in which two mappings differ."""
 
+import json
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import Any
+
+
+def as_json(settings: Any) -> dict[str, Any]:
+    """The fields of a dataclass and of those inside it, in types that json can hold."""
+    return json.loads(json.dumps(asdict(settings), default=str))
 
 
 def differing(first: Mapping[str, Any], second: Mapping[str, Any], place: str = "") -> Iterator[tuple[str, Any, Any]]:

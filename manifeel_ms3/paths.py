@@ -16,6 +16,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 CHECKPOINTS = "checkpoints"
 """Name of the folder of checkpoints, in the folder of a training run and beside a published result."""
+LAST_LINK = "last"
+"""Name of the link, in that folder, to the checkpoint from which training continues; it always leads to a complete one."""
 
 
 def data_dir() -> Path:

@@ -1,6 +1,5 @@
 """Checkpoints: folders with config.json and safetensors files, which hold no code."""
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,7 @@ from manifeel_ms3.evaluation.checkpoint_config import CONFIG, TRAINING_STATE, WE
 from manifeel_ms3.evaluation.result import published_config
 from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 from manifeel_ms3.nested_settings import differing
-
-LAST = "last"
-"""Name of the link to the checkpoint from which training continues; it always leads to a complete one."""
+from manifeel_ms3.paths import LAST_LINK
 
 
 def save_checkpoint(
@@ -82,7 +79,7 @@ def make_last(folder: Path) -> None:
         CheckpointError: There is a folder in the place of the link.
         FileWriteError: The link cannot be written.
     """
-    last = folder.with_name(LAST)
+    last = folder.with_name(LAST_LINK)
     if last.is_dir() and not last.is_symlink():
         raise CheckpointError(
             f"{last} is a folder and not a link, as a program leaves it that follows links when it copies a run, such as scp; "
@@ -103,7 +100,7 @@ def newest_checkpoint(checkpoints: Path) -> Path:
 
     If there is no checkpoint, the path that the link `last` would have.
     """
-    return (saved_checkpoints(checkpoints) or [checkpoints / LAST])[-1]
+    return (saved_checkpoints(checkpoints) or [checkpoints / LAST_LINK])[-1]
 
 
 def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
@@ -115,7 +112,7 @@ def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
         in_use: Older checkpoints that stay, too.
     """
     folders = saved_checkpoints(checkpoints)
-    last = (checkpoints / LAST).resolve()
+    last = (checkpoints / LAST_LINK).resolve()
     for folder in folders[:-1]:
         if folder.resolve() != last:
             (folder / TRAINING_STATE).unlink(missing_ok=True)
@@ -258,8 +255,3 @@ def _restore_optimizer(packed: dict[str, torch.Tensor], optimizer: torch.optim.O
             own = parameters[int(index)]
             state.setdefault(int(index), {})[key] = torch.empty_like(own).copy_(tensor) if tensor.shape == own.shape else tensor
     optimizer.load_state_dict(optimizer.state_dict() | dict(state=state))
-
-
-def as_json(config: Any) -> dict[str, Any]:
-    """A dataclass as a dict of types that json can hold."""
-    return json.loads(json.dumps(dataclasses.asdict(config), default=str))

@@ -18,8 +18,9 @@ from torch.optim.lr_scheduler import LambdaLR
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config
 from manifeel_ms3.files import remove_folder, remove_leftovers
+from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.ownership import owned
-from manifeel_ms3.paths import CHECKPOINTS
+from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.tasks.registry import task_spec
@@ -27,8 +28,6 @@ from manifeel_ms3.tasks.registry import task_spec
 from .agent import spec_of
 from .background_evaluation import SUCCESS, BackgroundEvaluation
 from .checkpoint import (
-    LAST,
-    as_json,
     make_last,
     newest_checkpoint,
     pack,
@@ -298,7 +297,7 @@ class Trainer:
             self._log_evaluations(wait=True)
             prune(self.checkpoints, self.args.keep, set())
             self.log.close()
-        return self.checkpoints / LAST
+        return self.checkpoints / LAST_LINK
 
 
 class RecentLosses:

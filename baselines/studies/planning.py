@@ -10,9 +10,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from baselines.common.checkpoint import as_json
 from baselines.registry import policy_spec
 from manifeel_ms3.command_line import PACKAGE
+from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
 from .study import Grid, Kind, Study, StudyError

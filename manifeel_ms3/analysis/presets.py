@@ -2,12 +2,13 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 from manifeel_ms3 import plugins
 from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.nested_settings import as_json
 
 from .condition import ENCODER, Condition, Settings, settings_of
 
@@ -79,7 +80,7 @@ def has_presets_encoder(condition: Condition) -> bool:
 
 def _changes(condition: Condition, settings: Mapping[str, str], preset: Any) -> Settings:
     """What differs from a preset, given by the arguments of its training."""
-    expected = dict(settings_of(_as_json(_as_trained(preset, condition)), condition.obs_mode)) | PAPER_PRECISION
+    expected = dict(settings_of(as_json(_as_trained(preset, condition)), condition.obs_mode)) | PAPER_PRECISION
     expected.pop(ENCODER, None)
     if condition.encoder in TACTILE_IMAGE_SIZE:
         expected["tactile_image_size"] = json.dumps(TACTILE_IMAGE_SIZE[condition.encoder])
@@ -97,10 +98,6 @@ def _as_trained(args: Any, condition: Condition) -> Any:
     encoder = replace(args.policy.encoder, tacrgb=condition.encoder or args.policy.encoder.tacrgb)
     policy = replace(args.policy, encoder=encoder)
     return replace(args, lr=replace(args, obs_mode=condition.obs_mode, policy=policy).public_code_lr())
-
-
-def _as_json(args: Any) -> dict[str, Any]:
-    return json.loads(json.dumps(asdict(args), default=str))
 
 
 @cache

@@ -22,6 +22,7 @@ from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
 from manifeel_ms3.evaluation.result import ResultError, results_by_file, successes_by_the_paper
 from manifeel_ms3.files import read_json_lines, write_text
+from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.tasks.registry import all_tasks
 
 from .claims import claims_page, results_of_claims
@@ -204,9 +205,9 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
 
     runs: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
     for path in sorted(path for folder in folders for path in folder.rglob("log.jsonl")):
-        if not (path.parent / "checkpoints/last").exists():  # the run has no checkpoint yet
+        if not (last := path.parent / CHECKPOINTS / LAST_LINK).exists():  # the run has no checkpoint yet
             continue
-        config = checkpoint_config(path.parent / "checkpoints/last")
+        config = checkpoint_config(last)
         entries = [entry for entry in read_json_lines(path) if TRAINING_LOSS in entry]
         name = f"{config['policy_name']}, {config['obs_mode']}, seed {config['seed']}"
         runs.setdefault(config["env_id"], []).append((name, entries))

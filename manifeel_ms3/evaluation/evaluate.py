@@ -29,6 +29,7 @@ from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
 from manifeel_ms3.ownership import owned
+from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 from manifeel_ms3.tasks.checks import check_obs_mode
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
@@ -352,7 +353,7 @@ def _page_of(args: Args, made: Path) -> str:
     """Which command makes a page with a result: that of all results if the file is named by a gradient step."""
     if made.stem.isdigit():
         return f"`{shlex.join(['manifeel', 'results', '--results', str(made.parent)])}` sets it beside the paper's"
-    checkpoints = (made.parent / "checkpoints").resolve()
+    checkpoints = (made.parent / CHECKPOINTS).resolve()
     if args.checkpoint is not None and made.name == "evaluation.json" and args.checkpoint.resolve().parent == checkpoints:
         return f"`{shlex.join(['manifeel', 'report', '--run-dir', str(made.parent)])}` writes a page about the run"
     return "`manifeel results` reads files named by the step, as 00007000.json"
@@ -364,7 +365,7 @@ def _policy_flags(args: Args, made: Path) -> list[str]:
     flags = []
     if args.policy is not None:
         flags += ["--policy", redacted(args.policy)]
-    elif checkpoint is not None and checkpoint.resolve() != (made.parent / "checkpoints/last").resolve():
+    elif checkpoint is not None and checkpoint.resolve() != (made.parent / CHECKPOINTS / LAST_LINK).resolve():
         flags += ["--checkpoint", str(checkpoint)]
     if kwargs := json_object("--policy-kwargs", args.policy_kwargs):
         flags += ["--policy-kwargs", json.dumps(redacted(kwargs))]

@@ -17,7 +17,7 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import read_json_lines, write_text
-from manifeel_ms3.paths import CHECKPOINTS
+from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.tasks.registry import task_spec
 
 from .checkpoint_config import TRAINING_LOSS, CheckpointError, checkpoint_config
@@ -129,7 +129,7 @@ def evaluated_checkpoint(run_dir: Path, result: dict[str, Any]) -> Path:
     Raises:
         CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted.
     """
-    last, step = run_dir / CHECKPOINTS / "last", result["config"].get("step")
+    last, step = run_dir / CHECKPOINTS / LAST_LINK, result["config"].get("step")
     if checkpoint_config(last).get("step") == step:
         return last
     if not (found := last.with_name(str(step).zfill(8))).is_dir():

@@ -31,6 +31,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Policy, PolicySource
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.evaluation.video import act_again, replayed
+from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
@@ -198,7 +199,7 @@ def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:
     """The policy of a result."""
     if args.policy is not None:
         return PolicySource(policy=args.policy, kwargs=args.policy_kwargs).make()
-    checkpoint = args.checkpoint or path.parent / "checkpoints/last"
+    checkpoint = args.checkpoint or path.parent / CHECKPOINTS / LAST_LINK
     if not checkpoint.is_dir():
         raise InvalidArgumentError(
             f"{path} holds no actions, and there is no policy in {checkpoint} that could act again; give its "

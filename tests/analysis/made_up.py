@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from baselines.common.checkpoint import as_json
 from baselines.registry import policy_spec
 from manifeel_ms3.analysis import results_page
 from manifeel_ms3.evaluation.result import result_of
+from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import evaluation_seeds, full_id, task_spec
 from tests.outcomes import made_up
 

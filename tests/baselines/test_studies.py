@@ -16,7 +16,6 @@ import pytest
 import torch
 import tyro
 
-from baselines.common.checkpoint import as_json
 from baselines.common.dataset import SequenceDataset
 from baselines.common.observation import observation_spec
 from baselines.common.train_args import planned_steps
@@ -38,6 +37,7 @@ from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.errors import InvalidFileError, MachineError, UnknownNameError
 from manifeel_ms3.evaluation import evaluate as evaluation
 from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from tests.tiny_study import TINY
 

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import torch
 
-from baselines.common.checkpoint import as_json, save_checkpoint
+from baselines.common.checkpoint import save_checkpoint
 from baselines.common.encoders import EncoderConfig
 from baselines.common.observation import observation_spec
 from baselines.diffusion_policy.train import SPEC
+from manifeel_ms3.nested_settings import as_json
 
 
 def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = (), crop: int = 0) -> Path:
