@@ -14,7 +14,7 @@ from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoin
 from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicyRequest
 
 from .action_chunks import ActionChunks
-from .checkpoint import WEIGHTS, load_weights, read_tensors, require_fit
+from .checkpoint import WEIGHTS, read_tensors, require_fit
 from .observation import TAXEL_SHAPE, ObservationSpec, observation_spec
 from .policy import VisuotactilePolicy
 
@@ -104,7 +104,7 @@ class PolicyAgent(EpisodePolicy):
         require_fit(described, weights, checkpoint)
         self.device, self.seed, self.batch_size = torch.device(device or "cpu"), seed, batch_size or 1
         self.policy = build_policy(self.config, policy_class).to(self.device).eval()
-        load_weights(self.policy, weights, checkpoint)
+        self.policy.load_state_dict(weights)
         steps, least = inference_steps or self.config.get("inference_steps"), self.policy.config.least_inference_steps
         if not isinstance(steps, int) or steps < least:
             raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of at least {least}")

@@ -135,21 +135,6 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(f"{path} cannot be read ({error}); the checkpoint is broken, use another") from error
 
 
-def load_weights(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:
-    """Load weights whose names and shapes must be the module's.
-
-    Args:
-        module: The module.
-        weights: The weights by their names.
-        source: The checkpoint or file that they are from, for the error's message.
-
-    Raises:
-        CheckpointError: Names or shapes differ, so the weights belong to another architecture.
-    """
-    require_fit(module, weights, source)
-    module.load_state_dict(weights)
-
-
 def require_fit(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:
     """Check that weights have the names and shapes of a module's own.
 
@@ -235,7 +220,9 @@ def unpack(
     Raises:
         CheckpointError: The weights belong to another architecture, or something is missing or damaged.
     """
-    load_weights(model, {n.removeprefix("model."): t for n, t in packed.items() if n.startswith("model.")}, source)
+    weights = {name.removeprefix("model."): t for name, t in packed.items() if name.startswith("model.")}
+    require_fit(model, weights, source)
+    model.load_state_dict(weights)
     try:
         _restore_optimizer(packed, optimizer)
         torch.set_rng_state(packed[_of_rank("random", rank)])
