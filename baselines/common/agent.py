@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
-from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicyRequest
+from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest
 
 from .action_chunks import ActionChunks
 from .checkpoint import WEIGHTS, read_tensors, require_fit
@@ -66,7 +66,7 @@ def spec_of(config: dict[str, Any]) -> ObservationSpec:
     return observation_spec(config["obs_mode"], cameras, pads, *sizes, (rows, columns), config["pose"], view)
 
 
-class PolicyAgent(EpisodePolicy):
+class PolicyAgent(PolicyOfPart):
     """A trained policy: it answers several episodes at once, each from its last observations, or is the policy of one.
 
     An answer depends on its request only. The noise is drawn from the seed of the episode and the step. The network always
@@ -114,27 +114,6 @@ class PolicyAgent(EpisodePolicy):
         )
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False
-
-    # ------------------------------------------------------------ as the policy of one episode
-
-    @property
-    def looks(self) -> bool:
-        """Whether the next action needs the cameras' images."""
-        return self._part.looks
-
-    def reset(self) -> None:
-        """Begin an episode with the seed 0."""
-        self._part.reset()
-
-    def begin_episode(self, seed: int) -> None:
-        """Begin the episode of a seed."""
-        self._part.begin_episode(seed)
-
-    def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """The action (A,) for the observation of an environment with `num_envs=1`."""
-        return self._part.act(obs)
-
-    # ------------------------------------------------------------ as the policy of many
 
     def answer(self, requests: list[PolicyRequest]) -> list[np.ndarray]:
         """The actions (action_horizon, A) to execute next, for each request."""

@@ -67,6 +67,25 @@ class EpisodePolicy(ABC):
         """Action (A,) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
 
 
+class PolicyOfPart(EpisodePolicy):
+    """A policy whose episode is in the hands of a part of it, to which it passes all calls on."""
+
+    _part: EpisodePolicy
+
+    @property
+    def looks(self) -> bool:
+        return self._part.looks
+
+    def reset(self) -> None:
+        self._part.reset()
+
+    def begin_episode(self, seed: int) -> None:
+        self._part.begin_episode(seed)
+
+    def act(self, obs: dict[str, Any]) -> np.ndarray:
+        return self._part.act(obs)
+
+
 def with_defaults(policy: Policy) -> EpisodePolicy:
     """The policy itself if it is an `EpisodePolicy`; otherwise the policy with the defaults of the members that it lacks."""
     return policy if isinstance(policy, EpisodePolicy) else _WithDefaults(policy)

@@ -28,7 +28,7 @@ import torch
 from manifeel_ms3.errors import WorkFailedError
 from manifeel_ms3.workers import WorkerContext, end_with_parent, portable, without_ctrl_c
 
-from .policy import EpisodePolicy, Policy, PolicyRequest, PolicySource, PolicyUnavailableError, with_defaults
+from .policy import Policy, PolicyOfPart, PolicyRequest, PolicySource, PolicyUnavailableError, with_defaults
 from .rollout import PolicyFault
 
 FIRST_ANSWER = 120.0
@@ -241,7 +241,7 @@ def _send(connection: Connection, message: Any) -> None:
 # -------------------------------------------------------------------- in a simulating process
 
 
-class SharedPolicy(EpisodePolicy):
+class SharedPolicy(PolicyOfPart):
     """The policy of a `PolicyProcess`, as an episode in this process sees it.
 
     Args:
@@ -265,19 +265,9 @@ class SharedPolicy(EpisodePolicy):
         self._part = with_defaults(make() if part is None else pickle.loads(part)(self._ask))
         self.limits_itself = part is not None  # the `PolicyProcess` limits the time, in which others' requests do not count
 
-    @property
-    def looks(self) -> bool:
-        return self._part.looks
-
-    def reset(self) -> None:
-        self._part.reset()
-
-    def begin_episode(self, seed: int) -> None:
-        self._part.begin_episode(seed)
-
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         self.waited = 0.0
-        return self._part.act(obs)
+        return super().act(obs)
 
     def _ask(self, request: PolicyRequest) -> np.ndarray:
         """The policy's answer to a request.
