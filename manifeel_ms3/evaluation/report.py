@@ -69,8 +69,8 @@ class Args:
 def image_strip(frames: list[Frame]) -> tuple[list[str], bytes]:
     """The names of the sensors, and a PNG with one row of images for each; time runs to the right."""
     chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, min(STRIP_FRAMES, len(frames))).round().astype(int)]
-    names = list(chosen[0].images)
-    rows = [np.concatenate([_square(frame.images[name]) for frame in chosen], axis=1) for name in names]
+    names = list(chosen[0])
+    rows = [np.concatenate([_square(frame[name]) for frame in chosen], axis=1) for name in names]
     png = cv2.imencode(".png", np.concatenate(rows)[..., ::-1])[1].tobytes()
     return names, png
 

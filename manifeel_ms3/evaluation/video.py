@@ -3,7 +3,6 @@
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +29,8 @@ QUALITY = 7
 """Quality of the encoding on imageio's scale from 0 to 10, at which text and touch stay sharp."""
 
 
-@dataclass
-class Frame:
-    """All images of one step."""
-
-    images: dict[str, np.ndarray]
-    """RGB images (H, W, 3) uint8 by the names of their sensors."""
+Frame = dict[str, np.ndarray]
+"""All images of one step: RGB (H, W, 3) uint8 by the names of their sensors."""
 
 
 def act_again(
@@ -84,13 +79,12 @@ def film_env(
     return make_env(env_id, **dict(env_kwargs) | added | others)
 
 
-def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator[dict[str, Any]]:
-    """The observations of an episode with given actions (A,), from that of the reset to the last one."""
-    obs, _ = env.reset(seed=seed)
-    yield obs
+def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """The observations of an episode with given actions (A,), each with its `info`, from the reset to the last step."""
+    yield env.reset(seed=seed)
     for action in actions:
-        obs, *_ = env.step(action)
-        yield obs
+        obs, *_, info = env.step(action)
+        yield obs, info
 
 
 def record_episode(
@@ -111,7 +105,7 @@ def record_episode(
     outcome, actions = act_again(env_id, env_kwargs, policy, seed, step_timeout)
     with closing(film_env(env_id, env_kwargs, VIEWS)) as env:
         base: Any = env.unwrapped
-        return outcome, [Frame(observation_images(obs, base.touch_full_scales)) for obs in replayed(env, actions, seed)]
+        return outcome, [observation_images(obs, base.touch_full_scales) for obs, _ in replayed(env, actions, seed)]
 
 
 def encode_video(frames: list[Frame]) -> bytes:
@@ -120,7 +114,7 @@ def encode_video(frames: list[Frame]) -> bytes:
     Args:
         frames: Images of every step.
     """
-    tiled = (np.concatenate([_tile(image) for image in frame.images.values()], axis=1) for frame in frames)
+    tiled = (np.concatenate([_tile(image) for image in frame.values()], axis=1) for frame in frames)
     return encode_mp4(tiled, CONTROL_FREQ, BLOCK)
 
 

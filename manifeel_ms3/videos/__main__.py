@@ -14,7 +14,6 @@ result if no other is given.
 
 import logging
 import sys
-from collections import deque
 from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass
@@ -36,7 +35,7 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
 
-from .shots import Take, VideoWrapper, View, shown_steps, video_env
+from .shots import Shot, Take, View, shot_images, shown_steps, video_env
 
 log = logging.getLogger(__name__)
 SMALLEST = dict(max_frames=2, fps=1, width=64)
@@ -179,8 +178,12 @@ def _take(source: Source, args: Args) -> Take:
     with progress_bar() as bar:
         counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
         with closing(video_env(source.env_id, source.env_kwargs, view)) as env:
-            filmed = VideoWrapper(env, take, view, steps, lambda: bar.advance(counter))
-            deque(replayed(filmed, actions, source.seed), maxlen=0)  # the wrapper keeps what is shown
+            for step, (obs, info) in enumerate(replayed(env, actions, source.seed)):
+                take.forces.append(float(info["contact_force"]))
+                take.successes.append(bool(info["success"]))
+                if step in steps:
+                    take.shots.append(Shot(step, shot_images(env, obs, view)))
+                bar.advance(counter)
     if any(take.successes) != source.success:
         _name_difference(source, any(take.successes))
     return take

@@ -1,8 +1,8 @@
-"""Shots of a video: images, forces and success of an episode, taken while it runs."""
+"""Shots of a video: images, forces and success of an episode."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -52,45 +52,11 @@ class Take:
     """Whether the task has succeeded, for the start and every control step."""
 
 
-class VideoWrapper(gym.Wrapper):
-    """Wrapper that takes shots of an episode, at chosen steps, while the episode runs.
-
-    Args:
-        env: Environment of `video_env`.
-        take: Take to which the shots, forces and successes are added.
-        view: Camera and pad to show.
-        steps: Numbers of the control steps that are shown.
-        on_step: Function that is called after the reset and after every step.
-    """
-
-    def __init__(self, env: gym.Env, take: Take, view: View, steps: set[int], on_step: Callable[[], None]):
-        super().__init__(env)
-        self._take, self._view, self._steps, self._on_step = take, view, steps, on_step
-
-    def reset(self, **kwargs: Any):
-        obs, info = self.env.reset(**kwargs)
-        self._keep(obs, info)
-        return obs, info
-
-    def step(self, action: Any):
-        obs, reward, terminated, truncated, info = self.env.step(action)
-        self._keep(obs, info)
-        return obs, reward, terminated, truncated, info
-
-    def _keep(self, obs: dict[str, Any], info: dict[str, Any]) -> None:
-        take, step = self._take, len(self._take.forces)
-        take.forces.append(float(info["contact_force"]))
-        take.successes.append(bool(info["success"]))
-        if step in self._steps:
-            take.shots.append(Shot(step, self._images(obs)))
-        self._on_step()
-
-    def _images(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
-        base: Any = self.unwrapped
-        scene: Any = self.env.render()
-        shown = (self._view.camera, PAD + self._view.pad)
-        sensors = {name: data for name, data in obs["sensor_data"].items() if name in shown}
-        return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors), base.touch_full_scales)
+def shot_images(env: gym.Env, obs: dict[str, Any], view: View) -> dict[str, np.ndarray]:
+    """The images of a shot, of the moment of an observation of `video_env`."""
+    base, scene = cast(Any, env.unwrapped), cast(Any, env.render())
+    sensors = {name: data for name, data in obs["sensor_data"].items() if name in (view.camera, PAD + view.pad)}
+    return dict(scene=common.to_numpy(scene)[0]) | observation_images(dict(sensor_data=sensors), base.touch_full_scales)
 
 
 def video_env(env_id: str, env_kwargs: Mapping[str, Any], view: View) -> gym.Env:

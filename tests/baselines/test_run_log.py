@@ -14,7 +14,7 @@ from wandb.proto import wandb_internal_pb2
 
 from baselines.common.run_log import GLOBAL_STEP, RunLog, wandb_run_of
 from baselines.diffusion_policy.train import PRESETS
-from manifeel_ms3.evaluation.video import Frame, encode_video
+from manifeel_ms3.evaluation.video import encode_video
 from tests.tasks_and_marks import PEG
 
 ARGS = replace(
@@ -36,7 +36,7 @@ def run_dir(tmp_path_factory):
     """The folder of a run whose log was sent to Weights & Biases in its offline mode."""
     folder = tmp_path_factory.mktemp("run")
     video = folder / "video.mp4"
-    video.write_bytes(encode_video([Frame(dict(wrist=np.full((64, 64, 3), 40 * k, np.uint8))) for k in range(5)]))
+    video.write_bytes(encode_video([dict(wrist=np.full((64, 64, 3), 40 * k, np.uint8)) for k in range(5)]))
     args = replace(ARGS, eval_env_kwargs='{"fit": "tight"}', num_eval_envs=3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")

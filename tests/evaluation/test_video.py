@@ -25,8 +25,8 @@ def test_a_policy_is_filmed_on_its_own_observations(make_env, obs_mode):
     outcome, frames = record_episode(PEG, given, policies.FollowsAllItSees(), 3)
     assert (outcome.return_, outcome.peak_contact_force) == (evaluated.return_, evaluated.peak_contact_force)
     assert len(frames) == STEPS + 1
-    assert all(set(frame.images) == SHOWN for frame in frames)
-    assert not np.array_equal(frames[0].images["front"], frames[-1].images["front"])
+    assert all(set(frame) == SHOWN for frame in frames)
+    assert not np.array_equal(frames[0]["front"], frames[-1]["front"])
 
 
 def test_a_policy_that_hangs_is_not_waited_for():
