@@ -1,4 +1,4 @@
-"""Checks that a data set in a folder only reads files of that folder, wherever the folder came from."""
+"""Checks of data sets in folders: they only read files of their folder, wherever it came from, and are of the task."""
 
 import os
 from collections.abc import Iterator
@@ -49,15 +49,15 @@ def read_origin(path: Path, schema: dict[str, Any], what: str, advice: str) -> d
         raise DemonstrationError(f"{error}; {advice}") from error
 
 
-def require_task(folder: Path, origin: dict[str, Any], env_id: str | None) -> None:
-    """Check that a data set is of a task, if one is asked for and the data set names its own.
+def require_task(path: Path, origin: dict[str, Any], env_id: str | None) -> None:
+    """Check that a file or folder is of a task, if one is asked for and it names its own.
 
     Raises:
-        DemonstrationError: The data set is of another task.
+        DemonstrationError: It is of another task.
     """
     if env_id not in (None, found := origin.get("env_id", env_id)):
         raise DemonstrationError(
-            f"{folder} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
+            f"{path} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
         )
 
 

@@ -16,6 +16,7 @@ from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
+from .folder_checks import require_task
 from .h5_checks import check_trajectories
 
 COUNT = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
@@ -212,11 +213,7 @@ def read_trajectories(
     """
     path = Path(path)
     header = read_header(path)
-    found = task_of(header)
-    if env_id is not None and found != env_id:
-        raise DemonstrationError(
-            f"{path} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
-        )
+    require_task(path, dict(env_id=task_of(header)), env_id)
     count = len(header["episodes"]) if num is None else num
     if not 0 < count <= len(header["episodes"]):
         raise DemonstrationError(
