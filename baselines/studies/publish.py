@@ -50,7 +50,8 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         raise InvalidArgumentError(
             f"no evaluation with `half_precision: true` is done in {root}; run the study first, or give its --root"
         )
-    results = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]
+    files = [path for job in done for path in sorted(job.folder(root).glob("*.json")) if path.stem.isdigit()]
+    results = {path: read_result(path) for path in files}
     with owned(folder):
         restore_folder(folder)
         if folder.is_dir() and not (folder / ABOUT).is_file():
@@ -64,7 +65,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
     return len(hashes)
 
 
-def _check_places(results: list[Path], folder: Path) -> None:
+def _check_places(results: dict[Path, dict[str, Any]], folder: Path) -> None:
     """Check that no two results have the same place, and that an entry's folder has results of one condition only.
 
     Raises:
@@ -73,8 +74,7 @@ def _check_places(results: list[Path], folder: Path) -> None:
     """
     new: dict[Path, tuple[Path, Condition]] = {}
     places: set[Path] = set()
-    for path in results:
-        result = read_result(path)
+    for path, result in results.items():
         entry, place, condition = folder / entry_name(result), _run_folder(folder, result) / path.name, condition_of(result)
         other, known = new.setdefault(entry, (path, condition))
         if known != condition or place in places:
@@ -98,15 +98,23 @@ def _differing_settings(first: Condition, second: Condition) -> str:
     return f" (they differ in {', '.join(names)})" if names else ""
 
 
-def _publish_results(results: list[Path], folder: Path) -> dict[str, str]:
-    """Copy results in the place of earlier ones of the same runs, and return the hashes of their checkpoints."""
-    for run in {_run_folder(folder, read_result(path)) for path in results}:
+def _publish_results(results: dict[Path, dict[str, Any]], folder: Path) -> dict[str, str]:
+    """Copy results in the place of earlier ones of the same runs, and the checkpoints of those of the first training seed.
+
+    Returns:
+        The hash of the checkpoint of each result, by the path of the copy in the folder.
+    """
+    for run in {_run_folder(folder, result) for result in results.values()}:
         shutil.rmtree(run, ignore_errors=True)
     hashes = {}
-    for path in results:
+    for path, result in results.items():
         checkpoint = path.parent / CHECKPOINTS / path.stem
-        sha256 = published_hash(checkpoint)
-        hashes[_publish_result(path, checkpoint, folder).relative_to(folder).as_posix()] = sha256
+        run = _run_folder(folder, result)
+        run.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, run / path.name)
+        hashes[(run / path.name).relative_to(folder).as_posix()] = published_hash(checkpoint)
+        if result["training_seed"] == 0:
+            shutil.copytree(checkpoint, run / CHECKPOINTS / checkpoint.name)
     return hashes
 
 
@@ -122,16 +130,6 @@ def _copy_old(folder: Path, partial: Path) -> dict[str, Any]:
 def _run_folder(folder: Path, result: dict[str, Any]) -> Path:
     """Folder of the results of one training seed in a submission."""
     return folder / entry_name(result) / f"seed{result['training_seed']}"
-
-
-def _publish_result(path: Path, checkpoint: Path, folder: Path) -> Path:
-    """Copy a result, and its checkpoint if it is of the first training seed; return the copy of the result."""
-    result = read_result(path)
-    run = _run_folder(folder, result)
-    run.mkdir(parents=True, exist_ok=True)
-    if result["training_seed"] == 0:
-        shutil.copytree(checkpoint, run / CHECKPOINTS / checkpoint.name)
-    return Path(shutil.copyfile(path, run / path.name))
 
 
 def entry_name(result: dict[str, Any]) -> str:
