@@ -57,7 +57,7 @@ def for_cpu(
     )
 
 
-def in_epochs(small: Args, epochs: int = 30, pose_noise: float = 0.03) -> Args:
+def in_epochs(small: Args, epochs: int = 30) -> Args:
     """Settings for small networks that learn long tasks for longer, with less noise on the pose.
 
     docs/training.md has the trials in which the nut is learned far more often with them.
@@ -65,8 +65,7 @@ def in_epochs(small: Args, epochs: int = 30, pose_noise: float = 0.03) -> Args:
     Args:
         small: Settings that `for_cpu` has made, whose number of gradient steps becomes the smallest.
         epochs: Number of epochs.
-        pose_noise: Standard deviation of the noise on the tool's pose, which has the range [-1, 1].
     """
     assert small.steps is not None
-    policy = replace(small.policy, pose_noise=pose_noise)
+    policy = replace(small.policy, pose_noise=0.03)  # standard deviation, where the pose has the range [-1, 1]
     return replace(small, policy=policy, steps=None, epochs=epochs, min_steps=small.steps)

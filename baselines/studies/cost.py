@@ -21,7 +21,6 @@ from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
 from manifeel_ms3.provenance import machine
-from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.tasks.registry import all_tasks, make_env, task_spec
 
 from .command_lines import device_arguments, train_flags, training_args
@@ -314,8 +313,7 @@ def _made_up(policy: str, flags: tuple[str, ...]) -> tuple[Any, Any, dict[str, t
     lay_out_channels_last(network)  # as in training
     shapes = {key: (batch, horizon, spec.size_of(key), spec.size_of(key), 3) for key in spec.images}
     obs = {key: torch.randint(255, shape, dtype=torch.uint8, device=args.device) for key, shape in shapes.items()}
-    field = (*TactileSensorConfig.taxel_shape, 3)
-    obs |= {key: torch.rand(batch, horizon, *field, device=args.device) for key in spec.force_fields}
+    obs |= {key: torch.rand(batch, horizon, *spec.taxel_shape, 3, device=args.device) for key in spec.force_fields}
     obs[POSE] = torch.rand(batch, horizon, spec.pose_features, device=args.device)
     return network, args, obs, torch.rand(batch, args.policy.pred_horizon, ACTION_SIZE, device=args.device)
 

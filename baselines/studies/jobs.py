@@ -65,21 +65,23 @@ def status_of(job: Job, root: Path) -> Status:
     return "running" if is_alive else "waiting"
 
 
-def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *needed: None) -> None:
-    """Do what `perform` does in a working folder, to which relative paths in the study's file belong."""
+def perform_in(working_folder: Path, job: Job, root: Path, needs: Resources, *_needed: None) -> None:
+    """Do what `perform` does in a working folder, to which relative paths in the study's file belong.
+
+    Ray waits for `_needed`, the return values of the jobs that this one needs.
+    """
     if working_folder.is_dir():  # a machine of a cluster may lack it
         os.chdir(working_folder)
-    perform(job, root, needs, *needed)
+    perform(job, root, needs)
 
 
-def perform(job: Job, root: Path, needs: Resources, *_needed: None) -> None:
+def perform(job: Job, root: Path, needs: Resources) -> None:
     """Run a job unless it is done, and write down what it cost.
 
     Args:
         job: The job.
         root: Folder of all jobs.
         needs: What the study gives the job.
-        _needed: Return values of the jobs that this one needs; Ray waits for them.
 
     Raises:
         InUseError: Another process, perhaps of another study, does the job at present.

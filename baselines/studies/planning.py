@@ -72,7 +72,7 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         if encoder and "tacrgb" not in mode.split("+"):
             continue
         camera = task_spec(task).policy_camera if camera == "policy" else camera
-        record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, _env_kwargs(grid))
+        record = _recording(task, grid.demos or task_spec(task).paper_demos, camera, json.dumps(grid.task_args, sort_keys=True))
         train = _training(grid, record, policy, mode, encoder, num_demos, seed)
         settings = dict(env_id=task, episodes=grid.episodes, checkpoints=grid.checkpoints, stop_at_success=grid.stop_at_success)
         settings["half_precision"] = grid.half_precision
@@ -122,7 +122,3 @@ def _hash_of_preset(policy: str, preset: str) -> str:
         raise StudyError(f"the policy {policy} has no preset {preset!r}; choose from {list(presets)}")
     settings = {name: value for name, value in as_json(presets[preset].args).items() if name not in OF_THE_MACHINE}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
-
-
-def _env_kwargs(grid: Grid) -> str:
-    return json.dumps(grid.task_args, sort_keys=True)

@@ -21,7 +21,7 @@ from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
-KINDS: tuple[Kind, ...] = ("record", "pretrain", "train", "evaluate")
+KINDS: tuple[Kind, ...] = get_args(Kind)
 """Kinds of jobs, in the order in which they need each other."""
 SIMULATING: tuple[Kind, ...] = ("record", "evaluate")
 """Kinds of jobs that simulate, in several processes at once."""
