@@ -3,13 +3,12 @@
 They show the first episodes of data/sample. With names of tasks as arguments, only the videos of these are made.
 """
 
-import hashlib
 import json
 import sys
 from pathlib import Path
 
 from docs.make_task_cards import VIDEOS, own_tasks
-from manifeel_ms3.files import write_json
+from manifeel_ms3.files import file_hash, write_json
 from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.videos.__main__ import Args
@@ -51,7 +50,7 @@ def sample_of(task: str) -> Path:
 
 def hashes_of(tasks: tuple[str, ...]) -> dict[str, str]:
     """SHA-256 of the recordings of some tasks."""
-    return {task: hashlib.sha256(sample_of(task).read_bytes()).hexdigest() for task in tasks}
+    return {task: file_hash(sample_of(task)) for task in tasks}
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ class Finding:
     """What to do about it; empty if nothing is wrong."""
 
 
-def examine(on_check: Callable[[str], None] | None = None) -> list[Finding]:
+def examine(on_check: Callable[[str], None]) -> list[Finding]:
     """The findings of all checks.
 
     Args:
@@ -63,8 +63,7 @@ def examine(on_check: Callable[[str], None] | None = None) -> list[Finding]:
     """
     findings = []
     for what, check in _checks().items():
-        if on_check is not None:
-            on_check(what)
+        on_check(what)
         found = check()
         findings += found if isinstance(found, list) else [found]
     return findings

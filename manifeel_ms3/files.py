@@ -301,11 +301,8 @@ def visible_files(folder: Path, pattern: str) -> list[Path]:
 
     A process that is killed while it writes leaves a hidden folder.
     """
-    return [path for path in sorted(folder.rglob(pattern)) if not any(map(_is_hidden, path.relative_to(folder).parts))]
-
-
-def _is_hidden(name: str) -> bool:
-    return name.startswith(".")
+    found = sorted(folder.rglob(pattern))
+    return [path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
 
 
 def move(source: Path, target: Path) -> None:

@@ -340,9 +340,9 @@ def main(args: Args) -> list[ProbeResult]:
         for probe, env_id, path in bar.track(asked, description="asking"):
             results += run_probe(probe, env_id, path, args.camera)
     write_json(args.out / "audit.json", [asdict(result) for result in results])
-    write_text(args.out / "audit.md", audit_table(results))
+    write_text(args.out / "audit.md", table := audit_table(results))
     draw_figure(results, args.out / "audit.png")
-    log.info("%s", audit_table(results))
+    log.info("%s", table)
     return results
 
 

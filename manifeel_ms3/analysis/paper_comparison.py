@@ -84,7 +84,7 @@ def similarity_table(files: Sequence[Path]) -> str:
     Raises:
         InvalidFileError: A file was not written by `manifeel similarity`.
     """
-    measured = [_similarity(path) for path in files]
+    measured = [read_json(path, SIMILARITY_FORM, "a file of `manifeel similarity --object`") for path in files]
     rows = []
     for modality, objects in SIMILARITY.items():
         for name, (fid, kid) in objects.items():
@@ -95,10 +95,6 @@ def similarity_table(files: Sequence[Path]) -> str:
             ]
     names = ("modality", "object", "paper, FID", "paper, KID", "here, FID", "here, KID", "features here")
     return f"{SIMILARITY_TEXT}\n{markdown_table(names, rows)}"
-
-
-def _similarity(path: Path) -> dict[str, Any]:
-    return read_json(path, SIMILARITY_FORM, "a file of `manifeel similarity --object`")
 
 
 def _interval(estimate: dict[str, float]) -> str:

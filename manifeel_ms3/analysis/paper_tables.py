@@ -200,7 +200,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
     for k, mode in enumerate(MODES):
-        _draw_bars(ax, [tasks.index(task) for task in tasks], (k - 1) * BAR, [drawn.get((task, mode)) for task in tasks], mode)
+        _draw_bars(ax, (k - 1) * BAR, [drawn.get((task, mode)) for task in tasks], mode)
     for place, task in enumerate(tasks):
         for k, rate in enumerate(TABLE_I[task]):
             label = "the paper" if place == k == 0 else None
@@ -213,8 +213,8 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     return True
 
 
-def _draw_bars(ax: Any, places: list[int], shift: float, estimates: list[Estimate | None], mode: str) -> None:
-    known = [(place + shift, one) for place, one in zip(places, estimates, strict=True) if one is not None]
+def _draw_bars(ax: Any, shift: float, estimates: list[Estimate | None], mode: str) -> None:
+    known = [(place + shift, one) for place, one in enumerate(estimates) if one is not None]
     heights = [one.value for _, one in known]
     errors = [[one.value - one.low for _, one in known], [one.high - one.value for _, one in known]]
     centres = [place for place, _ in known]
