@@ -2,6 +2,8 @@
 
 import gc
 import os
+import sys
+from pathlib import Path
 
 if "OMP_WAIT_POLICY" not in os.environ:
     # torch's threads wait for each other in a loop before they sleep: by default so long that a training step takes hundreds of
@@ -13,6 +15,11 @@ gc.disable()  # imports make many objects and no garbage: to search them again a
 try:
     from . import agents as agents
     from . import tasks as tasks
+except KeyboardInterrupt:
+    if Path(sys.argv[0]).stem != "manifeel":
+        raise
+    sys.stderr.write("stopped\n")  # these imports are the first seconds of a command; `command_line.run` says the same later
+    sys.exit(130)
 finally:
     if _collects:
         if not gc.get_freeze_count():

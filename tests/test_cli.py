@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -250,6 +251,18 @@ def test_answers_that_count_what_is_wrong_are_exit_codes():
         raise KeyboardInterrupt
 
     assert run(interrupted, None) == 130
+
+
+@pytest.mark.parametrize(
+    ("program", "code", "said"), [("manifeel", 130, "stopped\n"), ("my_program.py", -signal.SIGINT, "KeyboardInterrupt\n")]
+)
+def test_a_command_that_is_interrupted_while_it_starts_says_so_in_one_line(program, code, said, tmp_path):
+    (tmp_path / "torch.py").write_text("raise KeyboardInterrupt")
+    start = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); sys.argv = [{program!r}]; from manifeel_ms3.cli import main"
+    ran = subprocess.run([sys.executable, "-c", start], capture_output=True, text=True, check=False)
+    assert ran.returncode == code
+    assert ran.stderr.endswith(said)
+    assert ("Traceback" in ran.stderr) == (program != "manifeel")
 
 
 def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):

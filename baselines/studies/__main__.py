@@ -170,6 +170,10 @@ def _start_ray(address: str | None) -> None:
             configure_logging=False,
             **settings,
         )
+    except Exception as error:  # Ray raises a bare one if it has not started within 30 s
+        what = "Ray, which runs the jobs, does not start" if settings else f"the Ray cluster {address} cannot be reached"
+        mend = "give the same command again when the machine is less busy" if settings else "start it, or correct --address"
+        raise MachineError(f"{what} ({' '.join(str(error).split())}); {mend}") from error
     finally:
         os.chdir(here)
 

@@ -95,8 +95,9 @@ def perform(job: Job, root: Path, needs: Resources) -> None:
 
 def _perform(job: Job, root: Path, needs: Resources) -> None:
     folder = job.folder(root)
-    attempts = read_status(folder / STARTED).get("attempts", 0) + 1
-    started = dict(pid=os.getpid(), host=socket.gethostname(), attempts=attempts, title=job.title, settings=job.settings)
+    before, spent = read_status(folder / STARTED), _seconds_spent(folder)
+    attempt = dict(attempts=before.get("attempts", 0) + 1, seconds_before=round(spent, 1))
+    started = dict(pid=os.getpid(), host=socket.gethostname(), title=job.title, settings=job.settings) | attempt
     write_json(folder / STARTED, started)
     (folder / FAILED).unlink(missing_ok=True)
     begin = time.time()
@@ -107,8 +108,24 @@ def _perform(job: Job, root: Path, needs: Resources) -> None:
             write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
     parallel = needs.workers if job.kind in SIMULATING else 1
-    cost = dict(seconds=round(time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
+    cost = dict(seconds=round(spent + time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
     write_json(folder / DONE, started | cost)
+
+
+def _seconds_spent(folder: Path) -> float:
+    """Time that earlier attempts at a job took, each until it wrote its last file: the work in these files is not done again.
+
+    Args:
+        folder: Folder of the job. Its hidden files, which name the process that holds it, are of the present attempt.
+    """
+    if not (started := folder / STARTED).is_file():
+        return 0.0
+    begin = last = started.stat().st_mtime
+    for path in folder.rglob("*"):
+        if not path.name.startswith("."):
+            with suppress(OSError):  # a process of the earlier attempt may still be about to end
+                last = max(last, path.lstat().st_mtime)
+    return read_status(started).get("seconds_before", 0.0) + last - begin
 
 
 def restore_child_signals() -> None:

@@ -122,7 +122,7 @@ def _stacked(
         if sorted(outcomes) != seeds:
             raise ResultError(
                 f"the results of {condition} are of different initial states; evaluate all of them with the same "
-                "--num-eval-episodes"
+                "--num-eval-episodes or --seeds"
             )
     episodes = [outcomes[seed] for run in evaluated for outcomes in run for seed in seeds]
     success = np.array([episode["success_once"] for episode in episodes], float)

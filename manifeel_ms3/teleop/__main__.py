@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import gymnasium as gym
 import tyro
 
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
@@ -56,7 +57,7 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: The task is not registered.
-        InvalidArgumentError: The control mode cannot be steered, or an argument is not allowed.
+        InvalidArgumentError: The control mode cannot be steered, the observations have no images, or an argument is not allowed.
         DemonstrationError: The file was recorded with other arguments.
         DeviceError: The device cannot be used.
         MissingExtraError: viser, which serves the page, is not installed.
@@ -71,6 +72,7 @@ def main(args: Args) -> Path:
         kwargs["cameras"] = list(args.cameras)
     kwargs |= json_object("--env-kwargs", args.env_kwargs)
     env = make_env(args.env_id, **kwargs)
+    _require_images(env, kwargs["obs_mode"])
     base: Any = env.unwrapped
     operator = Operator(steerable_axes(base.control_mode))
     if args.device:
@@ -94,6 +96,20 @@ def main(args: Args) -> Path:
         page.stop()
         env.close()
     return out
+
+
+def _require_images(env: gym.Env, obs_mode: str) -> None:
+    """Check that the observations hold something for the page to show, without which nobody can steer.
+
+    Raises:
+        InvalidArgumentError: They hold neither images nor force fields.
+    """
+    space: Any = env.observation_space
+    sensors = space.get("sensor_data", {}) if isinstance(space, gym.spaces.Dict) else {}
+    if not any({"rgb", "force_field"} & data.keys() for data in sensors.values()):
+        raise InvalidArgumentError(
+            f"the page has nothing to show with --obs-mode {obs_mode} and these cameras and pads; add rgb, tacrgb or tacff"
+        )
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Means and intervals of the protocol, against cases whose answer is known."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -136,6 +136,9 @@ def test_results_of_different_initial_states_are_not_mixed(tmp_path, rng):
         collect(results_in(tmp_path))
     with pytest.raises(ResultError, match="different initial states"):
         difference(runs(rng, 0.5, episodes=10), runs(rng, 0.5, episodes=12))
+    private = replace(runs(rng, 0.5, episodes=10), episode_seeds=[200_000 + k for k in range(10)])
+    with pytest.raises(ResultError, match="10 and 10 of them; evaluate both with the same --seeds, or both without"):
+        difference(runs(rng, 0.5, episodes=10), private)
 
 
 def test_one_checkpoint_has_wilsons_interval():

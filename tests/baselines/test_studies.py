@@ -403,6 +403,23 @@ def test_what_a_machine_does_not_have_is_said(study, tmp_path):
     assert ended.returncode == 3  # Ray does not hide exit codes
 
 
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        (None, "Ray, which runs the jobs, does not start (timed out during startup); give the same command again when"),
+        ("10.1.2.3:6379", "the Ray cluster 10.1.2.3:6379 cannot be reached (timed out during startup); start it, or correct"),
+    ],
+)
+def test_a_ray_that_does_not_start_is_one_line(study, tmp_path, monkeypatch, address, said):
+    def init(*_, **__):
+        raise Exception("timed out\nduring startup")  # a bare one, as of Ray
+
+    monkeypatch.setattr(study_command.ray, "init", init)
+    with pytest.raises(MachineError, match=re.escape(said)):
+        study_command.main(study_command.Args(study, tmp_path / "root", address=address))
+    assert not (tmp_path / "root/record").exists()
+
+
 # -------------------------------------------------------------------- running
 
 

@@ -1,6 +1,8 @@
 """The cost of a study's jobs, from trials."""
 
 import json
+import os
+import time
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +15,7 @@ from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost, jobs
 from baselines.studies.planning import jobs_of
-from baselines.studies.study import read_study
+from baselines.studies.study import Resources, read_study
 from manifeel_ms3.provenance import machine
 from tests.tiny_study import TINY
 
@@ -108,3 +110,27 @@ def test_a_table_of_progress_reads_each_job_once(num_seeds, tmp_path, monkeypatc
     assert calls["read_status"] <= 2 * len(planned)
     assert calls["_work"] <= len(planned) + 6
     assert calls["_units"] <= len(planned)
+
+
+def test_a_job_that_was_interrupted_costs_what_all_its_attempts_took(tmp_path, monkeypatch):
+    """The last attempt of a long job may do a small part of its work."""
+    path = tmp_path / "study.yaml"
+    path.write_text(TINY)
+    record = jobs_of(read_study(path))[0]
+    folder, now = record.folder(tmp_path), time.time()
+
+    def die(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(jobs.WORK, "record", die)
+    for attempt, (started, written) in enumerate(((900, 300), (200, 160)), start=1):  # s ago
+        with pytest.raises(KeyboardInterrupt):
+            jobs.perform(record, tmp_path, Resources())
+        assert jobs.read_status(folder / jobs.STARTED)["attempts"] == attempt
+        (folder / f"{attempt}.h5").write_text("")
+        for name, seconds in ((jobs.STARTED, started), (f"{attempt}.h5", written)):
+            os.utime(folder / name, (now - seconds, now - seconds))
+    monkeypatch.setitem(jobs.WORK, "record", lambda *_: 4)
+    jobs.perform(record, tmp_path, Resources())
+    assert jobs.read_status(folder / jobs.DONE)["seconds"] == pytest.approx(600 + 40, abs=10)
+    assert cost.estimate(record, tmp_path, 1).seconds == pytest.approx(640 / 4, abs=3)

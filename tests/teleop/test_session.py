@@ -8,10 +8,12 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import tyro
 
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.teleop import __main__ as teleop
 from manifeel_ms3.teleop import session as module
 from manifeel_ms3.teleop.operator import HOLD, EpisodeCommand, Mode, Operator, steerable_axes
 from manifeel_ms3.teleop.session import Session
@@ -222,3 +224,11 @@ def test_seeds_that_are_not_for_demonstrations_are_refused(seed, make_env, tmp_p
     with pytest.raises(InvalidArgumentError, match=f"--seed {seed}: demonstrations have the seeds 0 to 99999"):
         Session(env, PEG, KWARGS, tmp_path / "trajectory.h5", seed, operator)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("flags", [["--obs-mode", "none"], ["--obs-mode", "state"], ["--obs-mode", "tacff", "--tactile-sensors"]])
+def test_a_session_without_images_is_refused_before_the_page_opens(flags, tmp_path):
+    given = [PEG, "--out", str(tmp_path / "x.h5"), "--env-kwargs", '{"render_backend": "none"}', *flags]
+    with pytest.raises(InvalidArgumentError, match=f"nothing to show with --obs-mode {flags[1]} .*; add rgb, tacrgb or tacff"):
+        teleop.main(tyro.cli(teleop.Args, args=given))
+    assert list(tmp_path.iterdir()) == []
