@@ -34,6 +34,10 @@ class Handler(BaseHTTPRequestHandler):
     policies = OrderedDict()  # noqa: RUF012  (by the name of the episode in the header X-Episode, the latest last)
     lock = Lock()  # one policy is asked at a time
 
+    def handle(self):
+        with suppress(ConnectionError):  # the client has gone, such as an evaluation that was interrupted
+            super().handle()
+
     def do_POST(self):
         try:
             length = int(self.headers["Content-Length"])

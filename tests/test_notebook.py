@@ -39,6 +39,19 @@ def test_its_pages_are_there_and_its_code_is_python():
     exec(first, {})  # imports everything
 
 
+@needs_renderer
+def test_its_environment_is_made_and_drawn(monkeypatch):
+    """The cells before the demonstrations, which take seconds."""
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    code = cells("code")
+    (recording,) = [k for k, cell in enumerate(code) if "record.main(" in cell]
+    names: dict = {}
+    exec("\n".join(code[:recording]), names)
+    names["plt"].close("all")
+    assert len(names["forces"]) == 15
+    assert list(names["shown"]) == ["wrist camera", "TacRGB", "TacFF"]
+
+
 @pytest.mark.slow
 @needs_renderer
 def test_it_runs_from_top_to_bottom(tmp_path):

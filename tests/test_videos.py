@@ -115,6 +115,15 @@ def test_a_file_that_is_not_there(tmp_path, capsys):
     assert "x.h5 does not exist" in capsys.readouterr().err
 
 
+def test_an_export_is_not_taken_for_the_recording_beside_it(tmp_path, capsys):
+    for suffix in (".h5", ".json"):
+        shutil.copy(FILE.with_suffix(suffix), tmp_path / f"peg{suffix}")
+    (tmp_path / "peg.zarr").mkdir()
+    assert cli.main(["film", str(tmp_path / "peg.zarr"), "--episode", "7"]) == 1
+    assert "peg.zarr is a folder; give a trajectory file" in capsys.readouterr().err
+    assert read_source(tmp_path / "peg.json", 0).path == tmp_path / "peg.h5"
+
+
 def test_a_result_without_its_policy_says_what_to_give(tmp_path, capsys):
     shutil.copy("tests/trust/result.json", tmp_path / "evaluation.json")
     assert cli.main(["film", str(tmp_path / "evaluation.json")]) == 1

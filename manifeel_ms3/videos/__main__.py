@@ -153,14 +153,16 @@ def read_source(path: Path, episode: int) -> Source:
         ResultError: The result is missing or broken.
         InvalidArgumentError: There is no such episode.
     """
-    is_result = path.suffix == ".json" and not path.with_suffix(".h5").is_file()
-    content: dict[str, Any] = read_result(path) if is_result else read_header(path.with_suffix(".h5"))
+    recording = path.with_suffix(".h5") if path.suffix == ".json" else path
+    is_result = path.suffix == ".json" and not recording.is_file()
+    content: dict[str, Any] = read_result(path) if is_result else read_header(recording)
     about = content if is_result else content["env_info"]
     count = len(content["episodes"])
     if not 0 <= episode < count:
         raise InvalidArgumentError(f"--episode {episode}: {path} has the episodes 0 to {count - 1}")
     env_id = task_spec(about["env_id"]).env_id
-    return Source(path, env_id, dict(about["env_kwargs"]), content["episodes"][episode], content if is_result else None)
+    entry = content["episodes"][episode]
+    return Source(path if is_result else recording, env_id, dict(about["env_kwargs"]), entry, content if is_result else None)
 
 
 def _take(source: Source, args: Args) -> Take:
@@ -194,7 +196,7 @@ def _actions(source: Source, args: Args) -> Iterable[np.ndarray]:
     if source.result is not None:
         policy = _policy(source.path, source.result, args)
         return act_again(source.env_id, source.env_kwargs, policy, source.seed)[1]
-    with open_trajectories(source.path.with_suffix(".h5")) as file:
+    with open_trajectories(source.path) as file:
         return group_of(file, source.entry)["actions"][()]
 
 

@@ -5,6 +5,7 @@ import json
 import os
 import runpy
 import socket
+import struct
 import subprocess
 import sys
 import threading
@@ -130,6 +131,32 @@ def test_a08_a_server_that_does_not_know_episodes_is_refused(tmp_path):
     with served(Old) as address, pytest.raises(PolicyUnavailableError, match="does not repeat the header X-Episode"):
         main(args_of(address, tmp_path / "evaluation.json"))
     assert not list(tmp_path.glob("evaluation*"))
+
+
+def test_the_example_says_nothing_about_a_client_that_has_gone(capfd):
+    asked, gone = threading.Event(), threading.Event()
+    threads = []
+
+    class Slow:
+        def act(self, obs):
+            threads.append(threading.current_thread())
+            asked.set()
+            assert gone.wait(60)
+            return np.zeros(6)
+
+    with served(example(MyPolicy=Slow).Handler) as address:
+        policy = RemotePolicy(address)
+        policy.reset()
+        body = io.BytesIO()
+        np.savez(body, state=np.zeros(6))
+        head = f"POST /act HTTP/1.1\r\nX-Episode: {policy._episode}\r\nContent-Length: {body.tell()}\r\n\r\n"
+        with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as client:
+            client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # what it closes is reset at once
+            client.sendall(head.encode() + body.getvalue())
+            assert asked.wait(60)
+        gone.set()
+        threads[0].join(60)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 # ------------------------------------------------------------------------------- absence
