@@ -9,11 +9,11 @@ import numpy as np
 import sapien
 from mani_skill.sensors.base_sensor import BaseSensorConfig
 
-from manifeel_ms3.arguments import one_of
+from manifeel_ms3.arguments import is_number, one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.paths import data_dir
 
-from .config_fields import check_bounds, positive, within
+from .config_fields import check_bounds, counts, positive, within
 from .draws import uniform_draws
 from .imperfection_config import FULL_SCALE_FORCE, ImperfectionConfig
 
@@ -91,7 +91,7 @@ class Light:
     """A small lamp, or a point of a bar of lamps, that lights the gel from behind.
 
     Raises:
-        InvalidArgumentError: The lamp is not behind the face.
+        InvalidArgumentError: The lamp is not behind the face, or its colour is not three numbers, none of them negative.
     """
 
     position: tuple[float, float, float]
@@ -102,10 +102,14 @@ class Light:
     def __post_init__(self):
         for name in ("position", "colour"):
             object.__setattr__(self, name, tuple(getattr(self, name)))  # a list would not do as a key of the cached colours
-        if len(self.position) != 3 or not self.position[2] < 0:
+        if len(self.position) != 3 or not all(map(is_number, self.position)) or self.position[2] >= 0:
             raise InvalidArgumentError(
                 f"position={self.position} of a lamp must be three coordinates in the pad frame, in m, the last one negative: "
                 "lamps are behind the face, whose z is 0"
+            )
+        if len(self.colour) != 3 or not all(is_number(level) and level >= 0 for level in self.colour):
+            raise InvalidArgumentError(
+                f"colour={self.colour} of a lamp must be three numbers, its brightness in red, green and blue, none of them negative"
             )
 
 
@@ -196,11 +200,11 @@ class TactileSensorConfig(BaseSensorConfig):
     """Pose of the pad frame in the link's frame, m."""
     gel: GelConfig = field(default_factory=GelConfig)
     """Mechanical properties of the elastomer."""
-    image_shape: tuple[int, int] = positive((240, 320))
+    image_shape: tuple[int, int] = counts((240, 320))
     """Rows and columns of the TacRGB image, pixels (the paper's 320 x 240 image, laid on its side)."""
     pixel_size: float = positive(8.77e-5)
     """Size of a pixel on the gel's face, m (Taxim's calibration of the R1.5: 0.0877 mm)."""
-    taxel_shape: tuple[int, int] = positive((10, 14))
+    taxel_shape: tuple[int, int] = counts((10, 14))
     """Rows and columns of the force field (the paper's)."""
     taxel_pitch: float = positive(1.634e-3)
     """Distance of neighbouring taxels, m (TacSL's grid on the R1.5)."""

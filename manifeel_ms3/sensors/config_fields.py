@@ -4,6 +4,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 from types import UnionType
 from typing import Any, cast
@@ -18,17 +19,27 @@ class Bounds:
 
     low: float = 0.0
     high: float = math.inf
+    whole: bool = False
+    """Whether the numbers are whole, of a type of whole numbers."""
 
     def __contains__(self, number: float) -> bool:
-        return is_number(number) and (self.low < number if math.isinf(self.high) else self.low <= number <= self.high)
+        if not is_number(number) or (self.whole and not isinstance(number, Integral)):
+            return False
+        return self.low < number if math.isinf(self.high) else self.low <= number <= self.high
 
     def __str__(self) -> str:
-        return "positive" if math.isinf(self.high) else f"in [{self.low:g}, {self.high:g}]"
+        span = "positive" if math.isinf(self.high) else f"in [{self.low:g}, {self.high:g}]"
+        return f"{span} and whole" if self.whole else span
 
 
 def positive(default: Any) -> Any:
     """Dataclass field for positive numbers."""
     return field(default=default, metadata={"bounds": Bounds()})
+
+
+def counts(default: tuple[int, ...]) -> Any:
+    """Dataclass field for positive whole numbers."""
+    return field(default=default, metadata={"bounds": Bounds(whole=True)})
 
 
 def within(default: Any, low: float, high: float) -> Any:
@@ -50,7 +61,8 @@ def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
         prefix: Start of the fields' names in messages.
 
     Raises:
-        InvalidArgumentError: A number is out of its bounds, or a pair is not in rising order; the message names the field.
+        InvalidArgumentError: A number is out of its bounds, a tuple has another length than it should have, or a pair is not in
+            rising order; the message names the field.
     """
     for entry in dataclasses.fields(config):
         name, value = prefix + entry.name, getattr(config, entry.name)
@@ -60,6 +72,8 @@ def check_bounds(config: Any, uid: str, prefix: str = "") -> None:
         numbers: Sequence[Any] = value if isinstance(value, Sequence) else (value,)
         if bounds and any(number not in bounds for number in numbers):
             raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be {bounds}")
+        if bounds and isinstance(entry.default, tuple) and len(numbers) != len(entry.default):
+            raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be {len(entry.default)} numbers")
         if entry.metadata.get("amount") and (len(numbers) != 2 or numbers[0] > numbers[1]):
             raise InvalidArgumentError(f"{name}={value!r} of tactile sensor {uid!r} must be a number, or a pair (least, most)")
 

@@ -31,6 +31,10 @@ from manifeel_ms3.sensors.registry import task_sensor
         (dict(gel=GelConfig(poisson_ratio=0.5)), "gel.poisson_ratio"),
         (dict(pixel_size=float("nan")), "pixel_size"),
         (dict(taxel_shape=(0, 14)), "taxel_shape"),
+        (dict(taxel_shape=(10, 14, 2)), r"taxel_shape=\(10, 14, 2\).*must be 2 numbers"),
+        (dict(image_shape=(240.0, 320.0)), r"image_shape=\(240\.0, 320\.0\).*positive and whole"),
+        (dict(image_shape=240), "image_shape=240 .*must be 2 numbers"),
+        (dict(gel=GelConfig(size=(0.02,))), r"gel\.size=\(0\.02,\).*must be 2 numbers"),  # pyright: ignore[reportArgumentType]
         (dict(taxel_pitch=5e-3), "taxel_shape x taxel_pitch"),
         (dict(image_shape=(480, 640)), "image_shape x pixel_size"),
         (dict(backend="magic"), "raycast"),
@@ -93,6 +97,11 @@ def test_lamps_light_the_gel_from_behind():
         Light((0.02, 0.0, 0.017), (1.0, 1.0, 1.0))
     with pytest.raises(InvalidArgumentError, match="three coordinates"):
         Light((0.02, -0.017), (1.0, 1.0, 1.0))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidArgumentError, match="three coordinates"):
+        Light((float("nan"), 0.0, -0.017), (1.0, 1.0, 1.0))
+    for colour in ((1.0, 0.0), (-1.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)):
+        with pytest.raises(InvalidArgumentError, match="colour=.*three numbers.*none of them negative"):
+            Light((0.02, 0.0, -0.017), colour)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InvalidArgumentError, match="at least one Light"):
         LightsConfig(())
     listed = LightsConfig([Light(np.array([0.02, 0.0, -0.017]), [1.0, 1.0, 1.0])])  # pyright: ignore[reportArgumentType]

@@ -92,6 +92,23 @@ def test_an_image_may_be_a_single_pixel():
     assert single.shade(single.surface(torch.zeros(1, 1, 1))).shape == (1, 1, 1, 3)
 
 
+def test_dots_need_an_image_that_shows_how_the_skin_moves():
+    with pytest.raises(InvalidArgumentError, match=r"optics\.markers.*more than 4 pixels.*image_shape=\(4, 320\)"):
+        make_optics(**{"image_shape": (4, 320), "optics.markers": True})
+    small = make_optics(**{"image_shape": (5, 320), "optics.markers": True})
+    still = torch.zeros(1, len(GRID.x), 2, dtype=torch.float64)
+    assert small.shade(small.surface(torch.zeros(1, 5, 320)), still).shape == (1, 5, 320, 3)
+
+
+def test_a_very_thin_gel_has_dots_too():
+    still, surface = torch.zeros(1, len(GRID.x), 2, dtype=torch.float64), torch.zeros(1, 240, 320)
+    images = [
+        optics.shade(optics.surface(surface), still)
+        for optics in (make_optics(**{"gel.thickness": thickness, "optics.markers": True}) for thickness in (1e-5, 4e-3))
+    ]
+    assert torch.equal(*images)
+
+
 def test_noise_is_seeded():
     optics = make_optics(2, **{"optics.noise": 3.0})
     surface = torch.zeros(2, 240, 320)

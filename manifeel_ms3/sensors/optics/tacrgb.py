@@ -181,11 +181,19 @@ class Optics:
         grid: Cells of `TouchModel`, whose deflections move the markers.
         num_pads: Number N of pads.
         device: Device on which everything is computed.
+
+    Raises:
+        InvalidArgumentError: The image is too small for dots on the skin.
     """
 
     def __init__(self, config: TactileSensorConfig, grid: ContactGrid, num_pads: int, device: torch.device):
         self.config, self.device = config, device
         optics, shape = config.optics, config.image_shape
+        if optics.markers and min(shape) <= COARSE:  # the skin's motion needs two coarse cells along each side
+            raise InvalidArgumentError(
+                f"optics.markers of tactile sensor {config.uid!r} needs an image of more than {COARSE} pixels along each side, "
+                f"and image_shape={tuple(shape)}"
+            )
         coarse, cell = tuple(-(-pixels // COARSE) for pixels in shape), COARSE * config.pixel_size
         calibration = Path(optics.calibration)
         file = (calibration, calibration.stat().st_mtime_ns if calibration.is_file() else 0)
@@ -364,5 +372,7 @@ def _cell_centres(pixels: int, pixel_size: float) -> np.ndarray:
 
 def _spread(points: np.ndarray, centres: np.ndarray, sigma: float, device: torch.device) -> torch.Tensor:
     """Weights (centres, points) of a Gaussian average over points around centres, all in m."""
-    weights = np.exp(-0.5 * ((centres[:, None] - points[None]) / sigma) ** 2)
+    away = (centres[:, None] - points[None]) ** 2
+    nearest = away.min(1, keepdims=True)  # subtracted, so that the weight of the nearest point is not rounded to zero
+    weights = np.exp(-0.5 * (away - nearest) / sigma**2)
     return torch.as_tensor(weights / weights.sum(1, keepdims=True), dtype=torch.float32, device=device)
