@@ -328,6 +328,7 @@ def test_an_encoder_without_its_weights_is_not_the_papers(tmp_path):
     [
         (True, (0.02, 0.2), "holds"),
         (True, (-0.02, 0.2), "undecided"),
+        (True, (-0.001, 0.2), "undecided"),
         (True, (-0.2, -0.02), "does not hold"),
         (False, (-0.1, 0.04), "holds"),
         (False, (-0.1, 0.1), "undecided"),
@@ -342,6 +343,19 @@ def test_verdicts(gain, interval, verdict):
 def test_conditions_that_hardly_succeed_do_not_show_that_there_is_no_gain():
     comparison = next(c for c in comparisons() if not c.gain)
     assert claims._verdict(comparison, Estimate(-0.02, -0.05, 0.02), best=0.04) == "undecided"
+
+
+def test_that_touch_takes_success_away_shows_no_gain_and_the_page_tells_the_reach_of_the_tests():
+    """One of the two conditions succeeds, which is enough: both would have to fail for nothing to be decided."""
+    comparison = next(c for c in comparisons() if not c.gain)
+    success = np.random.default_rng(0).random((3, 10, 50)) < 0.5
+    sides = {comparison.first: np.zeros((3, 10, 50)), comparison.second: success.astype(float)}
+    found = {condition: ConditionResults(rates, list(range(50))) for condition, rates in sides.items()}
+    outcomes = claims.results_of_claims(found)
+    (outcome,) = outcomes[comparison]
+    assert outcome.verdict == "holds"
+    reach = f"Half the width of their intervals is {50 * (outcome.difference.high - outcome.difference.low):.0f} points"
+    assert reach in " ".join(claims.claims_page(found, outcomes).split())
 
 
 def test_every_claim_of_the_paper_is_asked_with_equal_demonstrations():

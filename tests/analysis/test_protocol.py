@@ -58,6 +58,11 @@ def test_runs_are_collected_by_condition_and_the_last_checkpoints_count(tmp_path
     assert collected[condition].episode_seeds == [100, 101, 102]
     assert collected[condition].success.tolist() == [[[0, 1, 0], [1, 1, 0]], [[0, 1, 1], [1, 1, 1]]]
     assert mean_success(collected[condition]).value == pytest.approx(8 / 12)
+    (tmp_path / "1/00000010.json").unlink()  # of a run that began to save later
+    assert collect(results_in(tmp_path))[condition].success.tolist() == collected[condition].success.tolist()
+    assert collected[condition].trained_steps == 30
+    (tmp_path / "1/00000030.json").unlink()  # of a run that ended sooner than the other
+    assert collect(results_in(tmp_path))[condition].trained_steps == 20
 
 
 def test_the_endings_of_the_last_checkpoints_are_counted(tmp_path):
@@ -68,7 +73,8 @@ def test_the_endings_of_the_last_checkpoints_are_counted(tmp_path):
             result = json.loads(path.read_text())
             for episode, ending in zip(result["episodes"], ["success", "lost", "beside or above the hole"], strict=True):
                 episode["ending"] = ending
-            result["episodes"][2]["peak_contact_force"] = 1000.0
+            for k in (0, 2):  # the first one succeeds in the last checkpoints
+                result["episodes"][k]["peak_contact_force"] = 1000.0
             path.write_text(json.dumps(result))
     results = results_in(tmp_path)
     *_, row = census_table(results, list(collect(results))).splitlines()
@@ -91,6 +97,7 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     assert rendered == plain
     assert plain.variant == ""
     assert changed.variant == '{"fit": "tight"}'
+    assert condition_of(result_of(PEG, dict(cameras=["wrist"]), config, [made_up(1, True)])) == plain  # it sees touch alone
     sensed = [dict(tactile_sensors=["left"]), dict(sensor_configs=dict(width=128)), dict(tactile=dict(units="tacsl"))]
     results = (result_of(PEG, env_kwargs, config, [made_up(1, True)]) for env_kwargs in sensed)
     assert len({plain.key, changed.key, *(condition_of(result).key for result in results)}) == 5
@@ -228,12 +235,27 @@ def test_two_single_runs_are_compared_by_mcnemars_exact_test():
     assert p == pytest.approx(20 / 512)
 
 
+def test_single_runs_of_several_checkpoints_are_compared_by_their_means(rng):
+    """An episode that half of the checkpoints solve is no outcome that McNemar's test could count."""
+    pair = runs(rng, 0.6, seeds=1), runs(rng, 0.4, seeds=1)
+    assert difference(*pair) == mean_difference([pair])
+
+
 def test_few_seeds_have_as_much_spread_as_their_deviation_says():
     """Three seeds without any variation over starts: the resampled means deviate by the standard error, s / sqrt(3)."""
     rates = np.array([0.2, 0.3, 0.7])
     weights = _weights(np.random.default_rng(0), 3)
     assert weights.sum(1) == pytest.approx(1.0)
     assert (weights @ rates).std() == pytest.approx(rates.std(ddof=1) / np.sqrt(3), rel=0.05)
+
+
+def test_an_interval_ends_where_a_rate_ends():
+    """Of three runs two always succeed: the corrected spread of so few would reach beyond 100 %, or below 0 % of failures."""
+    success = np.ones((3, 1, 50))
+    success[0, 0, :5] = 0.0
+    won, lost = (mean_success(ConditionResults(rates, list(range(50)))) for rates in (success, 1 - success))
+    assert won.low < won.value < won.high == 1.0
+    assert 0.0 == lost.low < lost.value < lost.high
 
 
 def test_success_at_the_end_is_not_known_of_episodes_that_end_at_success():

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from manifeel_ms3.analysis.paper import MODES, paper_condition
+from manifeel_ms3.analysis.paper import MODES, TABLE_II, paper_condition
 from manifeel_ms3.analysis.protocol import ConditionResults
 from manifeel_ms3.analysis.rank_agreement import Ranked, agreement_of, mean_tau, rank_violation
 
@@ -42,6 +42,8 @@ def test_groups_are_compared_within_themselves():
     assert mean_tau(PAPER, ours, [[0, 1], [2, 3]]) == 1.0
     assert rank_violation(PAPER, ours, [[0, 1], [2, 3]]) == 0.0
     assert mean_tau(PAPER, np.full(4, 0.5), ALL) == 0.0  # nothing is ranked
+    equal = rank_violation(PAPER, np.full(4, 0.5), ALL)  # each is not below those that are above it in the paper
+    assert equal == pytest.approx((0.7 + 0.6 + 0.4 + 0.0) / 4)
 
 
 def test_intervals_hold_the_value_and_shrink_with_what_is_certain():
@@ -80,3 +82,5 @@ def test_tables_whose_conditions_do_not_differ_in_what_they_compare_are_not_rank
         policy: [re.sub(r"[\[\]]", "", cell).split("%")[0].split(" / ")[0] for cell in cells[:3]] for _, policy, *cells in rows
     }
     assert shown == dict(diffusion_policy=["20", "30", "60"], flow_matching=["40", "not run", "not run"])
+    papers = {policy: [cell.split(" / ")[1] for cell in cells[:3]] for _, policy, *cells in rows}
+    assert papers == {policy: list(map(str, TABLE_II["GearAssembly"][policy])) for policy in shown}

@@ -3,14 +3,18 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from urllib.parse import unquote
 
+import numpy as np
 import pytest
+from matplotlib.container import ErrorbarContainer
 
-from manifeel_ms3.analysis import claims, results_page
-from manifeel_ms3.analysis.paper import MODES, TACFF, VISION
+from manifeel_ms3.analysis import claims, paper_tables, results_page
+from manifeel_ms3.analysis.estimates import mean_success
+from manifeel_ms3.analysis.paper import MODES, TACFF, VISION, paper_condition
 from manifeel_ms3.analysis.paper_tables import overview_of_table_one
-from manifeel_ms3.analysis.protocol import collect
+from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.result import result_of, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
@@ -70,3 +74,31 @@ def test_the_overview_of_table_one_has_the_fullest_training_of_which_every_sensi
         "PegInsertion": ("cpu_long", list(MODES)),
         "USBInsertion": ("cpu", [VISION]),
     }
+
+
+def made_up_success(rate: float) -> ConditionResults:
+    won = np.random.default_rng(round(100 * rate)).random((3, 1, 50)) < rate
+    return ConditionResults(won.astype(float), list(range(50)))
+
+
+def test_the_bars_of_the_figure_have_the_intervals_of_the_rates(tmp_path, monkeypatch):
+    """Of two set-ups, the figure shows the one that has more of the conditions."""
+    conditions = [paper_condition(task, mode) for task in ("PegInsertion", "ObjectSearch") for mode in MODES]
+    shown = {condition: made_up_success(0.1 + 0.15 * k) for k, condition in enumerate(conditions)}
+    other = replace(conditions[0], settings=(("lr", "0.5"),))
+    figures = []
+    monkeypatch.setattr(paper_tables, "save_figure", lambda figure, *_: figures.append(figure))
+    for found in ({other: made_up_success(0.9)} | shown, shown | {other: made_up_success(0.9)}):
+        assert paper_tables.draw_sensing_by_task(found, tmp_path / "figure.png")
+        (ax,) = figures.pop().axes
+        lines = [line for bars in ax.containers if isinstance(bars, ErrorbarContainer) for line in bars.lines[2]]
+        drawn = {tuple(segment[:, 1].round(6)) for line in lines for segment in line.get_segments()}
+        rates = [mean_success(results) for results in shown.values()]
+        assert drawn == {(round(rate.low, 6), round(rate.high, 6)) for rate in rates}
+
+
+def test_the_rate_of_a_training_seed_is_that_of_all_its_checkpoints():
+    success = np.zeros((2, 2, 50))
+    success[0, 1] = 1.0
+    shown = paper_tables.success_with_links(ConditionResults(success, list(range(50))), ["first.json", "second.json"])
+    assert shown.endswith("([50%](first.json), [0%](second.json))")

@@ -36,6 +36,8 @@ def test_encoder_sees_every_modality(name):
     for key in obs:
         changed = encoder(obs | {key: obs[key].flip(2)})
         assert not torch.allclose(changed, features)
+    drawn_back = encoder(obs | {spec.force_fields[0]: -obs[spec.force_fields[0]]})
+    assert not torch.allclose(drawn_back, features)
     alone = encoder({key: values[1:] for key, values in obs.items()})
     torch.testing.assert_close(features[1:], alone, rtol=1e-4, atol=1e-5)
     first, second = features.view(2, 2, -1).unbind(1)  # the steps of a window, in their order
@@ -54,6 +56,13 @@ def test_crops_are_random_in_training_and_central_in_evaluation():
     assert not torch.equal(crops, central)
     windows = images[0, 0].unfold(0, 48, 1).unfold(1, 48, 1).permute(0, 1, 3, 4, 2).reshape(-1, 48, 48, 3)
     assert (windows == crops[0, 0]).flatten(1).all(1).any()
+
+
+def test_random_crops_reach_all_borders_along_each_axis_by_itself():
+    images = torch.arange(36, dtype=torch.uint8).view(1, 1, 6, 6, 1).expand(300, 1, 6, 6, 3)
+    torch.manual_seed(0)
+    corners = cropped(images, 4, at_random=True)[:, 0, 0, 0, 0]
+    assert sorted(set(corners.tolist())) == [0, 1, 2, 6, 7, 8, 12, 13, 14]
 
 
 def test_an_encoder_crops_at_random_in_training_and_in_the_centre_in_evaluation():

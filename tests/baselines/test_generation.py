@@ -100,6 +100,23 @@ def test_a_prediction_is_asked_for_with_the_last_observations_the_seed_and_the_s
     assert (requests[-1].seed, requests[-1].step) == (0, 0)
 
 
+def test_a_policy_looks_at_the_observations_that_a_prediction_needs_and_at_no_others():
+    """A prediction at the second or third step has the observations so far, the first of them repeated before its time."""
+    for executed, looks in ((1, [True] * 6), (4, [True, False, True, True, True, False])):
+        windows = []
+
+        def ask(request: PolicyRequest, windows=windows, executed=executed) -> np.ndarray:
+            windows.append(request.observation[POSE][:, 0].tolist())
+            return np.zeros((executed, 1))
+
+        episode, looked = ActionChunks(SPEC, 3, ask), []
+        for step in range(6):
+            looked.append(episode.looks)
+            episode.act(dict(extra=dict(tcp_pose=pose_at(step)[None])))
+        assert looked == looks
+        assert windows == [[max(step - back, 0) for back in (2, 1, 0)] for step in range(0, 6, executed)]
+
+
 @pytest.mark.parametrize(("lowest", "highest"), [(-3.0, -2.0), (0.5, 1.0)])
 def test_actions_have_the_range_of_the_demonstrations_which_goes_beyond_1_for_joint_angles(tmp_path, lowest, highest):
     checkpoint = save_tiny_checkpoint(tmp_path / "checkpoint")
@@ -233,7 +250,9 @@ class KnowsVelocity(torch.nn.Module):
 
 
 @pytest.mark.parametrize(
-    "settings", [dict(), dict(public_code=True), dict(consistency=True), dict(prediction="sample")], ids=str
+    "settings",
+    [dict(), dict(public_code=True), dict(consistency=True), dict(consistency=True, segments=2), dict(prediction="sample")],
+    ids=str,
 )
 def test_flow_matching_learns_the_straight_path_to_the_demonstrated_actions(settings):
     policy = FlowMatchingPolicy(FlowConfig(**settings, down_dims=(8,)), SPEC, 6).eval()
@@ -258,3 +277,59 @@ def test_flow_matching_integrates_over_the_times_at_the_beginnings_of_its_steps(
 class TellsTime(torch.nn.Module):
     def forward(self, x, time, condition):
         return (time / 100).view(-1, 1, 1).expand_as(x)
+
+
+class Says(torch.nn.Module):
+    """A network that always has the same answer, and keeps the times or steps that it was asked for."""
+
+    def __init__(self, value: float):
+        super().__init__()
+        self.value, self.asked = torch.nn.Parameter(torch.tensor(value)), []
+
+    def forward(self, x, time, condition):
+        self.asked.append(time)
+        return self.value.expand_as(x)
+
+
+@pytest.mark.parametrize("settings", [dict(), dict(sampler="ddim"), dict(prediction="sample")], ids=str)
+@pytest.mark.parametrize("policy", ["diffusion", "flow"])
+def test_generated_actions_stay_within_the_range_of_the_demonstrations(policy, settings):
+    if policy == "diffusion":
+        made: Any = DiffusionPolicy(DiffusionConfig(diffusion_steps=20, down_dims=(8,), **settings), SPEC, 6).eval()
+    else:
+        made = FlowMatchingPolicy(FlowConfig(down_dims=(8,), prediction=settings.get("prediction", "velocity")), SPEC, 6).eval()
+    made.action_network = Says(5.0)
+    with torch.no_grad():
+        found = made.generate(torch.zeros(3, 4), 20, generators(3))
+    assert found.abs().max() <= 1 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("make", "config", "most"), [(DiffusionPolicy, DiffusionConfig, 99), (FlowMatchingPolicy, FlowConfig, 100)]
+)
+def test_each_row_of_a_batch_learns_at_a_step_of_its_own(make, config, most):
+    policy = make(config(down_dims=(8,)), SPEC, 6)
+    policy.action_network = Says(0.0)
+    policy.generation_loss(CLEAN.expand(500, -1, -1), torch.zeros(500, 4))
+    (times,) = policy.action_network.asked
+    assert times.unique().numel() > 90
+    assert 0 <= times.min() < 0.05 * most < 0.95 * most < times.max() <= most
+
+
+@pytest.mark.parametrize("segments", [1, 2, 4])
+def test_the_end_to_which_a_consistent_velocity_leads_is_that_of_its_segment(segments):
+    """If all of a segment must agree with its end, no velocity at all misses it by the time that is left: 1 / (3 segments^2)."""
+    policy = FlowMatchingPolicy(FlowConfig(consistency=True, segments=segments, interval=1.0, down_dims=(8,)), SPEC, 6)
+    policy.action_network = Says(0.0)
+    torch.manual_seed(0)
+    loss = policy.generation_loss(torch.zeros(4000, 16, 6), torch.zeros(4000, 4))
+    assert float(loss) == pytest.approx(1 / (3 * segments**2), rel=0.1)
+
+
+def test_the_later_of_two_points_is_what_the_earlier_one_learns_from():
+    """The gradient goes through the velocity at the earlier point alone: -2 dt E[clean - noise] E[time left] = -dt."""
+    policy = FlowMatchingPolicy(FlowConfig(consistency=True, interval=0.01, down_dims=(8,)), SPEC, 6)
+    policy.action_network = Says(0.0)
+    torch.manual_seed(0)
+    policy.generation_loss(torch.ones(2000, 16, 6), torch.zeros(2000, 4)).backward()
+    assert float(policy.action_network.value.grad) == pytest.approx(-0.01, rel=0.1)

@@ -16,6 +16,15 @@ def test_normalizer_maps_the_datas_range_and_back():
     assert normalizer.normalize(data)[:, 2].abs().max() == 0  # what never moved stays small
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "limit"), [(-1.0, 1.0, 1.0), (-0.2, 0.5, 1.0), (-3.0, 0.5, torch.inf), (0.0, 1.5, torch.inf)]
+)
+def test_actions_are_limited_to_1_unless_demonstrations_go_beyond_on_either_side(low, high, limit):
+    normalizer = ActionNormalizer(2)
+    normalizer.fit(torch.tensor([[low, 0.0], [high, 0.1]]))
+    assert normalizer.limit == limit
+
+
 @pytest.mark.parametrize("pairs", [[], [(0, 1), (3, 4)]])
 def test_small_actions_have_more_room_on_the_root_scale(pairs):
     actions = torch.cat([torch.rand(100, 6) * 2 - 1, torch.eye(6), -torch.eye(6), torch.zeros(1, 6)])
@@ -51,6 +60,13 @@ def test_force_fields_are_normalised_taxel_by_taxel():
     assert 0.1 < seen[:, 1, 0].abs().max() < 0.3  # less than a twentieth is not magnified as far
     assert (seen[:, 1, 1] == 0).all()
     assert torch.allclose(normalizer.restore(seen), fields, atol=1e-6)
+
+
+def test_shear_that_is_small_beside_the_normal_force_fills_the_range_too():
+    fields = torch.tensor([10.0, 0.1, 0.1]) * torch.rand(50, 3, 4, 3, generator=torch.Generator().manual_seed(0))  # N
+    normalizer = Normalizer.of_taxels((3, 4))
+    normalizer.fit(fields)
+    assert normalizer.normalize(fields).abs().amax((0, 1, 2)).tolist() == pytest.approx([1.0] * 3)
 
 
 def test_touch_in_the_papers_units_fills_the_range_too():

@@ -19,9 +19,12 @@ def test_the_papers_pose_has_one_sign_for_each_rotation():
 
 def test_quaternions_do_not_jump_where_the_wrist_can_turn():
     yaw = np.deg2rad(np.arange(45 - 166, 45 + 167))  # the range of the wrist joint
-    down = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_quat([1, 0, 0, 0])
-    pose = quaternion_pose(np.c_[np.zeros((len(yaw), 3)), down.as_quat()[:, [3, 0, 1, 2]]])
-    assert np.abs(np.diff(pose, axis=0)).max() < 0.01
+    for lean in (0.0, 0.1, -0.1):  # rad
+        down = (
+            Rotation.from_euler("z", yaw[:, None]) * Rotation.from_rotvec([0.0, lean, 0.0]) * Rotation.from_quat([1, 0, 0, 0])
+        )
+        pose = quaternion_pose(np.c_[np.zeros((len(yaw), 3)), down.as_quat()[:, [3, 0, 1, 2]]])
+        assert np.abs(np.diff(pose, axis=0)).max() < 0.01
 
 
 @pytest.mark.parametrize("task", ["ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1"])
@@ -47,6 +50,12 @@ def test_images_are_resized_alike_for_training_and_evaluation():
     prepared = prepare(spec.images[0], images, spec)
     assert prepared.shape == (3, 64, 64, 3)
     assert np.array_equal(prepare(spec.images[0], images[1:2], spec)[0], prepared[1])
+
+
+def test_a_pixel_of_a_smaller_image_is_the_mean_of_the_pixels_that_it_stands_for():
+    images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8)
+    means = images.reshape(2, 32, 2, 32, 2, 3).mean((2, 4))
+    assert np.abs(prepare("sensor_data/wrist/rgb", images, observation_spec("rgb", ("wrist",), (), 32)) - means).max() <= 0.5
 
 
 @pytest.mark.parametrize("camera", ["wrist", "front", "side"])

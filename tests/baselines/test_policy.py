@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from baselines.common.policy import PolicyConfig, make_action_network
-from baselines.common.unet import ConditionalUnet1D
+from baselines.common.unet import ConditionalUnet1D, ResidualBlock
 from manifeel_ms3.errors import InvalidArgumentError
 
 HORIZONS = dict(obs_horizon=2, pred_horizon=16, action_horizon=8)
@@ -77,3 +77,20 @@ def test_action_networks_map_actions_to_noise_and_use_step_and_condition(kind):
 def test_papers_unet_has_the_published_channels():
     net = ConditionalUnet1D(6, 146)
     assert [block[0].second[0].out_channels for block in net.down] == [512, 1024, 2048]
+
+
+def test_a_residual_block_adds_what_it_computes_to_what_it_is_given():
+    block = ResidualBlock(8, 8, condition_dim=3, kernel_size=5, n_groups=4)
+    torch.nn.init.zeros_(block.second[0].weight)
+    torch.nn.init.zeros_(block.second[0].bias)
+    x = torch.randn(2, 8, 16)
+    torch.testing.assert_close(block(x, torch.randn(2, 3)), x)
+
+
+def test_what_the_unet_computes_on_its_way_down_bypasses_its_middle():
+    torch.manual_seed(0)
+    net = ConditionalUnet1D(6, 10, (16, 32), diffusion_step_embed_dim=8).eval()
+    net.middle[-1].register_forward_hook(lambda _block, _inputs, out: torch.zeros_like(out))
+    actions, step, condition = torch.randn(2, 16, 6), torch.tensor([3, 3]), torch.randn(1, 10).expand(2, -1)
+    first, second = net(actions, step, condition)
+    assert not torch.allclose(first, second, atol=1e-3)

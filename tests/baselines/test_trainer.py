@@ -238,6 +238,7 @@ def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(tr
     assert config_file.parent.name == "00000003"
     config = json.loads(config_file.read_text())
     assert config.pop("num_processes") == 1
+    config["training_seconds"] = 1000.0
     config_file.write_text(json.dumps(config))  # as versions wrote it that did not record the number of processes
     second = Trainer(dataclasses.replace(trainer_args, resume=True), diffusion.DiffusionPolicy, Processes("cpu"))
     assert second.step == 3
@@ -247,6 +248,8 @@ def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(tr
     assert all(torch.equal(own, other) for own, other in pairs)
     assert second.optimizer.param_groups[0]["lr"] == first.optimizer.param_groups[0]["lr"]
     assert torch.equal(second.order.take(4), first.order.take(4))
+    second.step += 1
+    assert 1000 < json.loads((second.save() / "config.json").read_text())["training_seconds"] < 2000
 
 
 class TiedPolicy(diffusion.DiffusionPolicy):

@@ -81,6 +81,22 @@ def test_requests_of_all_episodes_are_answered_in_batches_each_with_its_own_answ
     assert max(answer[2] for answer in answers) <= Moody.batch_size
 
 
+def test_the_time_that_a_request_waits_for_others_is_told_apart_from_that_of_its_answer(process):
+    """An answer takes 0.2 s, during which the requests that come later wait."""
+
+    def ask(seed: int) -> tuple[float, float]:
+        policy = SharedPolicy(process.address, nothing)
+        policy.begin_episode(seed)
+        begin = time.monotonic()
+        policy.act({})
+        return policy.waited, time.monotonic() - begin
+
+    with ThreadPoolExecutor(6) as threads:
+        times = list(threads.map(ask, range(FINE, FINE + 6)))
+    assert max(waited for waited, _ in times) > 0.1
+    assert all(took - waited > 0.19 for waited, took in times)
+
+
 @pytest.mark.parametrize(
     ("bad", "reason"),
     [

@@ -1,8 +1,10 @@
 """Evaluation: its metrics, seeds, limits and intervals, and outcomes that repeat."""
 
+import json
 import sys
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
-from manifeel_ms3.evaluation import evaluate_episode
+from manifeel_ms3.evaluation import evaluate_episode, rollout
 from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.gentle import success_under_force
@@ -149,22 +151,99 @@ def test_every_task_says_what_a_policy_that_stands_still_lacks(spec):
     assert sum(bool(holds) for holds in missing.values()) >= 1  # else an episode would end in a mere time-out
 
 
+BESIDE, HIGH, ASKEW = (
+    "beside or above the hole",
+    "in the hole, not pressed home",
+    "pressed home, not upright or not for long enough",
+)
+
+
 @pytest.mark.parametrize(
-    ("task", "changed", "lacks"),
+    ("task", "endings"),
     [
-        (PEG, dict(gap=0.03), "beside or above the hole"),
-        (PEG, dict(gap=0.005), "in the hole, not pressed home"),
-        (PEG, dict(tilt=0.3), "pressed home, not upright or not for long enough"),
-        ("ManiFeel-GearAssembly-v1", dict(neighbours_off=0.1), "a neighbouring gear pushed off its shaft"),
+        ("PegInsertion", {BESIDE: dict(gap=0.03), HIGH: dict(gap=0.005), ASKEW: dict(tilt=0.3)}),
+        ("GearAssembly", {"a neighbouring gear pushed off its shaft": dict(neighbours_off=0.1)}),
+        ("PegReorientation", {"peg not turned in the hand": dict(in_hand=0.3, gap=0.03), BESIDE: dict(gap=0.03)}),
+        ("ObjectSearch", {"battery not gripped": dict(height=0.01), "battery gripped, not lifted": dict(height=0.05)}),
+        (
+            "BallSorting",
+            {
+                "wrong ball taken": dict(tennis_away=0.05, golf_height=0.05),
+                "golf ball taken, not lifted": dict(golf_height=0.05),
+                "no ball taken": {},
+            },
+        ),
+        ("NutBoltAssembly", {"threads not engaged": dict(descent=-1e-3), "engaged, not tight": dict(descent=1e-3)}),
     ],
 )
-def test_an_insertion_that_fails_is_said_to_lack_what_it_lacks(make_env, task, changed, lacks):
-    env = make_env(task, obs_mode="none", render_backend="none")
+def test_an_episode_that_fails_is_said_to_lack_what_it_lacks(make_env, task, endings):
+    env = make_env(f"ManiFeel-{task}-v1", obs_mode="none", render_backend="none")
     env.reset(seed=0)
-    measures = {name: torch.zeros_like(values) for name, values in env.unwrapped.measure().items()}
-    measures |= {name: torch.full_like(measures[name], value) for name, value in changed.items()}
-    missing = env.unwrapped.shortcomings(measures)
-    assert next(name for name, holds in missing.items() if holds) == lacks
+    nothing = {name: torch.zeros_like(values) for name, values in env.unwrapped.measure().items()}
+    for lacks, changed in endings.items():
+        measures = nothing | {name: torch.full_like(nothing[name], value) for name, value in changed.items()}
+        missing = env.unwrapped.shortcomings(measures)
+        assert next(name for name, holds in missing.items() if holds) == lacks
+
+
+class Scripted:
+    """An environment whose steps have known forces (N), rewards, successes and failures; the last step is the time limit."""
+
+    single_action_space = gym.spaces.Box(-1.0, 1.0, (6,))
+
+    def __init__(self, *steps: tuple[float, float, bool, bool]):
+        self.unwrapped, self.steps = self, steps
+
+    def reset(self, seed):
+        self.left = list(self.steps)
+        return {}, {}
+
+    def step(self, action):
+        force, reward, success, fail = self.left.pop(0)
+        info = dict(contact_force=torch.tensor([force]), success=success, fail=fail, success_paper=success)
+        return {}, reward, success or fail, not self.left, info
+
+
+@pytest.mark.parametrize("broken", [(np.nan, 1.0), (np.inf, 1.0), (1.0, np.nan), (1.0, -np.inf)], ids=str)
+def test_an_episode_whose_simulation_diverges_has_failed_whatever_it_reached_before(broken):
+    outcome = evaluate_episode(
+        Scripted((7.0, 0.5, True, False), (*broken, True, False), (1.0, 1.0, True, False)), StandStill(), 1
+    )
+    assert outcome.error.startswith("step 2: the simulation has diverged")
+    assert (outcome.success_once, outcome.success_at_end, outcome.success_paper) == (False, False, False)
+    assert (outcome.first_success, outcome.force_until_success, outcome.ending) == (None, None, "error")
+    assert (outcome.return_, outcome.peak_contact_force) == (0.5, 7.0)
+
+
+def test_a_failure_is_remembered_and_the_end_is_that_of_the_last_step():
+    steps = (3.0, 0.1, False, True), (9.0, 0.2, False, False), (5.0, 0.3, False, False)
+    outcome = evaluate_episode(Scripted(*steps), StandStill(), 1)
+    assert (outcome.fail_once, outcome.fail_at_end, outcome.ending) == (True, False, "lost")
+    assert (outcome.episode_len, outcome.return_, outcome.reward) == (3, 0.6, 0.2)
+    won, hard = (1.0, 1.0, True, False), (9.0, 1.0, False, False)
+    outcome = evaluate_episode(Scripted((8.0, 0.0, False, False), won, hard, won), StandStill(), 1)
+    assert (outcome.first_success, outcome.force_until_success, outcome.peak_contact_force) == (2, 8.0, 9.0)
+
+
+def test_the_time_of_a_policy_is_in_milliseconds_and_without_its_waiting(monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr(rollout.time, "perf_counter", lambda: clock[0])
+
+    class Thinks(StandStill):
+        waited = 0.02
+
+        def act(self, obs):
+            clock[0] += 0.05
+            return super().act(obs)
+
+    assert evaluate_episode(Scripted(*[(1.0, 0.0, False, False)] * 4), Thinks(), 1).inference_ms == 30.0
+
+
+def test_a_checkpoint_acts_again_with_the_device_the_batches_and_the_steps_of_its_result():
+    result = dict(config=dict(inference_steps=8, lr=0.1), inference=dict(device="cpu", batch_size=3))
+    for given, steps in (({}, 8), (dict(inference_steps=2), 2)):
+        source = PolicySource(Path("checkpoint"), kwargs=json.dumps(given), batch_size=1).as_in(result)
+        assert (source.device, source.batch_size, json.loads(source.kwargs)) == ("cpu", 3, dict(inference_steps=steps))
 
 
 def test_same_policy_and_seed_give_the_same_outcome(make_env):

@@ -8,7 +8,7 @@ import pytest
 
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import published_hash
-from manifeel_ms3.evaluation.entries import find_entry
+from manifeel_ms3.evaluation.entries import Entry, find_entry
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.rerun import checkpoint_sources, checkpoints_in, run_again
@@ -95,6 +95,20 @@ def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp
     submission = read_submission(tmp_path / "leaderboard/tiny")
     rerun = run_again(submission, checkpoint_sources(submission, [checkpoint], "{}"), seed=0)
     assert [len(file.episodes) for file in rerun.files.values()] == [2]  # an outcome that differs would be an error
+
+
+def test_an_entry_that_was_stopped_at_success_is_stopped_there_again(monkeypatch, tmp_path):
+    result = find_entry(ENTRY).result
+    for stops in (False, True):
+        entry = Entry(ENTRY, result | dict(stop_at_success=stops), tmp_path)
+        monkeypatch.setattr(evaluate, "find_entry", lambda _name, entry=entry: entry)
+        asked = []
+        monkeypatch.setattr(evaluate, "evaluation_from_args", lambda args, asked=asked: asked.append(args) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            evaluate.main(evaluate.Args(entry=ENTRY))
+        assert asked[0].stop_at_success is stops
+        assert dict(device=asked[0].device, batch_size=asked[0].batch_size) == result["inference"]
+        assert asked[0].inference_steps == result["config"]["inference_steps"]
 
 
 def test_an_entry_brings_its_own_checkpoint(tmp_path):

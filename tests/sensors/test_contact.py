@@ -68,6 +68,15 @@ def test_moment_tilts_a_flat_object():
     assert (field * GRID.y).sum().item() / 10.0 == pytest.approx(1e-3, abs=1e-5)
 
 
+@pytest.mark.parametrize(("about", "arm"), [(3, 0.0144), (4, 0.0108)])
+def test_a_face_tilts_by_five_degrees_at_most_and_still_carries_the_force(about, arm):
+    """A load so near the gel's edge that a plate would have to tilt by half a radian: its moment comes from elsewhere."""
+    flat, load = torch.zeros(1, len(GRID.x)), wrench(10.0)
+    load[0, about] = 10.0 * arm
+    assert indent(flat, load)[0, 1:].abs().amax().item() <= 0.087 + 1e-9
+    assert pressure(flat, load).sum().item() == pytest.approx(10.0, rel=1e-6)
+
+
 def test_untouched_pad_has_no_pressure():
     assert pressure(sphere(0.01, gap=1e-3), wrench(0.0)).abs().max() == 0
     assert pressure(sphere(0.01, gap=4e-3), wrench(5.0)).abs().max() == 0  # a force from elsewhere is not put on the gel

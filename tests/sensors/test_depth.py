@@ -202,6 +202,16 @@ def test_a_static_body_is_felt_where_an_episode_puts_it():
     env.close()
 
 
+@pytest.mark.parametrize("turn", [0, 30, 90])
+def test_a_small_body_is_seen_anywhere_on_the_face_however_its_own_frame_is_turned(turn):
+    cube = trimesh.creation.box([2e-3] * 3)
+    body = Rotation.from_euler("z", turn, degrees=True).as_quat()
+    rays = MeshRays([[cube]], (0.024, 0.032), torch.device("cpu"))
+    for x, y in ((0.0, 0.0), (0.0, 0.0145), (0.0, -0.0145), (0.0105, 0.0), (-0.0105, -0.0145)):
+        rays.move(torch.tensor([[[x, y, 1e-3 - 3e-4, *body]]]).float(), torch.tensor([[0.0, 0, 0, 0, 0, 0, 1]]))
+        assert rays.heights(torch.tensor([[x, y]])).item() == pytest.approx(3e-4, abs=1e-6)
+
+
 def test_velocity_is_along_the_surface_of_a_body_that_turns():
     """A plate aslant: v + w x p at the point that a ray meets, without its part along the normal of the plate; pad frame."""
     x = np.array([[0.0, 0.0], [4e-3, 0.0], [0.0, -6e-3], [-3e-3, 5e-3]])

@@ -6,7 +6,7 @@ import torch
 import trimesh
 from scipy.integrate import trapezoid
 
-from manifeel_ms3.sensors import ImperfectionConfig, sensor_config
+from manifeel_ms3.sensors import ImperfectionConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.draws import uniform_draws
 from manifeel_ms3.sensors.imperfections import Imperfections
@@ -197,6 +197,24 @@ def test_reset_forgets_in_the_reset_pads_alone():
     assert pads.field(2.0)[..., 0].sum((1, 2)) == pytest.approx([4.0, 2.0], rel=1e-4)
 
 
+def test_drift_counts_the_steps_of_each_pads_own_episode():
+    pads = Pad(seeds=(0, 1), drift=0.2)
+    for _ in range(10):
+        pads.field(0.0)
+    pads.model.reset(torch.tensor([0]), np.array([0]))
+    first, second = np.abs(pads.field(0.0)).max((1, 2, 3))
+    assert first == 0.0
+    assert second > 0.0
+
+
+def test_the_noise_of_the_camera_and_that_of_the_imperfections_add_up_as_independent_ones_do():
+    config = with_options(gelsight_r15("a", "b"), {"optics.noise": 3.0, "imperfections.noise": 0.02})
+    noisy, clean = (TouchModel(one, 1, CPU, ("rgb",)) for one in (config, gelsight_r15("a", "b")))
+    nothing = MeshRays([[None]], config.gel.size, CPU), torch.zeros(1, 6, dtype=torch.float64)
+    difference = noisy.observe(*nothing)["rgb"].float() - clean.observe(*nothing)["rgb"].float()
+    assert difference.std().item() == pytest.approx(np.hypot(3.0, 0.02 * 255), rel=0.03)
+
+
 EVERYTHING = dict(hysteresis=0.3, delay=(0, 3), noise=0.02, drift=0.2, crosstalk=0.1, gain=0.1, dead_taxels=0.1)
 
 
@@ -228,6 +246,8 @@ def test_info_says_what_an_episode_drew(make_env):
     _, info = env.reset(seed=3)
     drawn = info["imperfections"]["tactile_right"]
     assert drawn["dead_taxels"].sum().item() == 14
+    own = ImperfectionConfig(**options["imperfections"]).draw(np.array([3]), TAXELS)  # of the right pad, from the seed itself
+    assert np.array_equal(drawn["gain"].numpy(), own["gain"])
     obs, _, _, _, later = env.step(np.zeros(6))
     assert torch.equal(later["imperfections"]["tactile_right"]["gain"], drawn["gain"])
     assert (obs["sensor_data"]["tactile_right"]["force_field"][0][drawn["dead_taxels"][0]] == 0).all()

@@ -6,7 +6,7 @@ import sapien
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.checks import checked_reset
+from manifeel_ms3.tasks.checks import check_seed, checked_reset
 from manifeel_ms3.tasks.states import is_part_of
 
 
@@ -54,6 +54,13 @@ def test_what_is_no_list_of_environments_is_refused(make_env, env_idx):
 def test_a_list_without_a_seed_is_refused(make_env):
     with pytest.raises(InvalidArgumentError, match=r"seed=\[\]"):
         make_env(obs_mode="state", render_backend="none").reset(seed=[])
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 0.5, "0", [0, -1], [2**32], np.array([0.5])], ids=str)
+def test_what_is_no_seed_is_refused(seed):
+    with pytest.raises(InvalidArgumentError, match=r"seed=.*from 0 to 2\*\*32 - 1"):
+        check_seed(seed)
+    check_seed([0, 2**32 - 1])
 
 
 def test_seeds_that_are_not_one_for_each_of_several_environments_are_refused():
@@ -199,4 +206,5 @@ def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):
     base._steps_at_goal[:] = 5
     base.set_state_dict(gripped)
     assert pressing(base.get_obs()) == pytest.approx(force, rel=0.01)
+    assert base.evaluate()["contact_force"].item() == pytest.approx(9.81 * base.plug.mass.item(), rel=0.5)  # the peg's weight
     assert not base.evaluate()["success"]  # the peg is in the hand

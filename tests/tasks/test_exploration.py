@@ -7,7 +7,7 @@ from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.experts.skills import Skills
 from manifeel_ms3.geometry.balls import BALL_RADIUS, DIMPLE_DEPTH, SEAT_HEIGHT, golf_ball_mesh
-from manifeel_ms3.geometry.containers import BOWL_FLOOR, BOWL_HEIGHT
+from manifeel_ms3.geometry.containers import BATTERY_SIZE, BOWL_FLOOR, BOWL_HEIGHT, CONTAINER_OUTER, CONTAINER_WALL
 from manifeel_ms3.tasks.exploration.ball_sorting import BOWLS
 from manifeel_ms3.tasks.placement import POINTING_DOWN, WORKSPACE_XY
 from manifeel_ms3.tasks.registry import task_spec
@@ -32,6 +32,18 @@ def test_only_the_golf_ball_lifted_alone_counts(make_env, golf, tennis, goal):
     lift(base.golf, golf)
     lift(base.tennis, tennis)
     assert bool(base.goal_reached(base.measure())) is goal
+
+
+def test_a_table_tennis_ball_that_was_pushed_aside_has_left_its_seat(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    lift(base.golf, 0.11)
+    seated = base.tennis.pose.p.clone()
+    for aside, goal in ((0.009, True), (0.011, False)):
+        for direction in ([aside, 0.0, 0.0], [0.0, -aside, 0.0]):
+            base.tennis.set_pose(Pose.create_from_pq(seated + torch.tensor([direction])))
+            assert bool(base.goal_reached(base.measure())) is goal
 
 
 def test_a_ball_fails_when_it_lies_on_the_table(make_env):
@@ -128,6 +140,31 @@ def test_battery_must_be_lifted(make_env, height, goal):
     assert bool(base.goal_reached(base.measure())) is goal
 
 
+def test_a_battery_in_a_corner_of_the_container_has_not_failed(make_env):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    corner = (np.array(CONTAINER_OUTER) - BATTERY_SIZE) / 2 - CONTAINER_WALL
+    place = torch.tensor([[WORKSPACE_XY[0] + corner[0], WORKSPACE_XY[1] + corner[1], float(base.battery.pose.p[0, 2])]])
+    base.battery.set_pose(Pose.create_from_pq(place.float()))
+    assert not base.failed(base.measure())
+
+
+def test_the_time_at_the_goal_counts_on_in_a_state_that_is_at_the_goal(make_env):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    below = base.get_state_dict()
+    lift(base.battery, 0.11)
+    base._steps_at_goal[:] = 5
+    state = base.get_state_dict()
+    lift(base.battery, -0.01)
+    base.set_state_dict(state)
+    assert base.evaluate()["success"]
+    base.set_state_dict(below)
+    assert not base.evaluate()["success"]
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(
     ("aside", "height", "fails"), [(0.168, 0.0, False), (0.172, 0.0, True), (-0.172, 0.0, True), (0.172, 0.021, False)]
@@ -168,6 +205,31 @@ def test_front_camera_cannot_see_into_the_container_unless_its_front_is_left_out
             base.battery.set_pose(Pose.create_from_pq(torch.tensor([[x, 0.0, 0.0165]])))
             pictures.append(base.get_obs()["sensor_data"]["front"]["rgb"].int())
         assert bool((pictures[0] != pictures[1]).any()) is not occlusion
+
+
+def test_lifting_the_battery_is_worth_as_much_as_reaching_it(make_env):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    for height, share in ((-0.01, 0.0), (0.05, 0.5), (0.15, 1.0)):
+        env.reset(seed=0)
+        lift(env.unwrapped.battery, height)
+        require_reward(env.unwrapped, env.unwrapped.battery, share)
+
+
+def test_lifting_the_golf_ball_and_leaving_the_other_are_worth_the_same(make_env):
+    env = make_env(SORTING, obs_mode="none", render_backend="none")
+    for golf, tennis, worth in ((-0.01, 0.0, 1.0), (0.05, 0.0, 1.5), (0.15, 0.0, 2.0), (0.05, 0.011, 0.5)):
+        env.reset(seed=0)
+        lift(env.unwrapped.golf, golf)
+        lift(env.unwrapped.tennis, tennis)
+        require_reward(env.unwrapped, env.unwrapped.golf, worth)
+
+
+def require_reward(base, reached, worth: float) -> None:
+    """Check that the dense reward is what the distance of the tool from an object, other things and success are worth."""
+    away = float(torch.linalg.norm(base.agent.tcp.pose.p - reached.pose.p))
+    for success in (False, True):
+        reward = base.compute_dense_reward(None, None, base.measure() | dict(success=torch.tensor([success])))
+        assert float(reward) == pytest.approx(1 - np.tanh(8 * away) + worth + success, abs=5e-3)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,10 @@ from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit
 from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X
 from manifeel_ms3.geometry.part import Cylinder, Hulls
 from manifeel_ms3.geometry.plugs import PEG_SOCKETS
-from manifeel_ms3.tasks.exploration.peg_reorientation import PegReorientationEnv
+from manifeel_ms3.tasks.checks import checked_randomization
+from manifeel_ms3.tasks.exploration.peg_reorientation import BOX_HEIGHT, PegReorientationEnv
 from manifeel_ms3.tasks.insertion.base import InsertionEnv
+from manifeel_ms3.tasks.placement import POINTING_DOWN
 from tests.tasks_and_marks import PEG
 
 FITS = {
@@ -123,6 +125,7 @@ def test_the_papers_success_is_the_mean_distance_of_four_key_points(make_env):
     assert float(measures["keypoint_distance"]) == pytest.approx(expected, rel=1e-4)
     assert not base.evaluate()["success_paper"].any()
     base._success_paper[:] = True
+    assert not base.paper_goal_reached(measures_with_plug_at(env, (0, 0, 0.05))[0]).any()  # pulled out again
     *_, info = env.step(np.zeros(6))
     assert info["success_paper"].all()
     *_, info = env.reset(seed=0)
@@ -160,6 +163,17 @@ def test_randomisation_covers_its_ranges_and_no_more(env):
         assert spread.max() >= 0.6 * limit
 
 
+def test_the_lowest_start_is_a_centimetre_over_what_is_below(env):
+    """An upright plug, straight over the socket, in the hand at the end of the largest range of heights."""
+    env.reset(seed=0)
+    base = env.unwrapped
+    lowest = 0.15 + base.lift - base._largest_ranges()["start_z"][0]
+    tool = Pose.create_from_pq(torch.tensor([[0.5, 0.0, lowest]]), torch.tensor([POINTING_DOWN]))
+    base.plug.set_pose(tool * base._grip)
+    obstacle = BOX_HEIGHT if isinstance(base, PegReorientationEnv) else base.fit.rim
+    assert float(base.measure()["gap"]) + base.fit.floor >= obstacle + 0.01 - 1e-6
+
+
 def test_default_ranges_are_the_papers():
     insertion, reorientation = InsertionEnv.Randomization(), PegReorientationEnv.Randomization()
     assert (insertion.socket_xy, insertion.start_xy, insertion.start_z, insertion.start_rotation) == (0.05, 0.10, 0.05, 0.1)
@@ -172,6 +186,13 @@ def test_randomization_argument_narrows(make_env):
         narrow.reset(seed=seed)
         assert narrow.unwrapped.socket.pose.p[0].tolist() == pytest.approx([0.5, 0, 0], abs=1e-6)
         assert narrow.unwrapped.agent.tcp_pose_at_base.p[0].tolist() == pytest.approx([0.5, 0, 0.15], abs=1e-3)
+
+
+def test_a_range_may_be_as_large_as_its_limit_and_no_larger():
+    limits = dict(socket_xy=(0.19, "it is out of reach"))
+    assert checked_randomization("Task", InsertionEnv.Randomization, dict(socket_xy=0.19), limits).socket_xy == 0.19
+    with pytest.raises(ValueError, match="at most 0.19: it is out of reach"):
+        checked_randomization("Task", InsertionEnv.Randomization, dict(socket_xy=0.1900001), limits)
 
 
 def convex_bodies(piece, pose: sapien.Pose = sapien.Pose()) -> list[ConvexHull]:  # noqa: B008  (a constant)
@@ -288,3 +309,14 @@ def test_dense_reward_rises_towards_the_goal(env):
         rewards.append(float(env.unwrapped.compute_dense_reward(None, None, info)))
     assert rewards == sorted(rewards)
     assert 0 <= rewards[0] < rewards[-1] <= 3.0
+
+
+def test_being_upright_or_deep_is_rewarded_at_the_hole_alone(env):
+    env.reset(seed=0)
+
+    def reward(*offset: float) -> float:
+        measures, _ = measures_with_plug_at(env, offset)
+        return float(env.unwrapped.compute_dense_reward(None, None, measures | dict(success=torch.tensor([False]))))
+
+    assert 0 <= reward(0.4, 0.0, 0.1) < 0.01  # upright, but far away
+    assert reward(0.04, 0.0, 0.0) == pytest.approx(reward(0.04, 0.0, env.unwrapped.fit.depth), abs=1e-5)  # beside the hole

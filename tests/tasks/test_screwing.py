@@ -76,6 +76,7 @@ def test_nut_dropped_on_the_bolt_does_not_reach_the_goal(make_env):
         (0.0, 0.15, 0.0, True),
         (0.0, 0.05, 0.0, False),
         (0.0, 0.0, 0.0, False),
+        (0.0, -0.15, 0.0, False),  # turned off
         (0.0006, 0.15, 0.0, False),
         (0.02, 0.15, 0.0, False),
         (0.00045, 0.105, 0.0019, True),
@@ -101,6 +102,27 @@ def test_a_part_fails_when_it_is_out_of_the_hand_and_off_the_axis(make_env, from
     base.agent.reset_tool(Pose.create_from_pq(over, torch.tensor([POINTING_DOWN])))
     assert torch.linalg.norm(base.agent.tcp.pose.p - over) < 1e-4
     assert bool(base.failed(base.measure())) is fails
+
+
+@pytest.mark.parametrize("task", [NUT, BULB])
+def test_dense_reward_rises_towards_the_goal(make_env, task):
+    """Depth counts on the axis alone, and no further than to the goal."""
+    env = make_env(task, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    at_goal = base.screw.engaged - base.screw.seated
+
+    def reward(descent: float, offset: float = 0.0, tilt: float = 0.0) -> float:
+        measures = dict(descent=torch.tensor([descent]), offset=torch.tensor([offset]), tilt=torch.tensor([tilt]))
+        return float(base.compute_dense_reward(None, None, measures | dict(success=torch.tensor([False]))))
+
+    path = [(-0.2, 0.2, 0.0), (-0.05, 0.0, 0.2), (0.0, 0.0, 0.2), (0.0,), (at_goal / 2,), (at_goal,)]
+    rewards = [reward(*place) for place in path]
+    assert rewards == sorted(set(rewards))
+    assert rewards[0] == pytest.approx(0.0, abs=0.01)
+    assert rewards[3:] == pytest.approx([2.0, 2.5, 3.0])
+    assert reward(2 * at_goal) == pytest.approx(3.0)
+    assert reward(at_goal, offset=0.05) == pytest.approx(reward(0.0, offset=0.05))
 
 
 @pytest.mark.parametrize("task", [NUT, BULB])
