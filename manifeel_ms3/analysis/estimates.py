@@ -175,8 +175,8 @@ def _paired_rates(first: ConditionResults, second: ConditionResults) -> list[np.
         numbers = len(first.episode_seeds), len(second.episode_seeds)
         flag = "--seeds, or both without" if numbers[0] == numbers[1] else "--num-eval-episodes"
         raise ResultError(
-            f"{first.name} and {second.name} were evaluated on different initial states, {numbers[0]} and {numbers[1]} of them; "
-            f"evaluate both with the same {flag}"
+            f"{first.name} and {second.name} were evaluated on different initial states, {numbers[0]} and {numbers[1]} of "
+            f"them; evaluate both with the same {flag}"
         )
     checkpoints = min(first.success.shape[1], second.success.shape[1])
     return [_rates(side, checkpoints) for side in (first, second)]

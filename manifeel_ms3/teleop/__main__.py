@@ -57,7 +57,8 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: The task is not registered.
-        InvalidArgumentError: The control mode cannot be steered, the observations have no images, or an argument is not allowed.
+        InvalidArgumentError: The control mode cannot be steered, the observations have no images, or an argument is not
+            allowed.
         DemonstrationError: The file was recorded with other arguments.
         DeviceError: The device cannot be used.
         MissingExtraError: viser, which serves the page, is not installed.

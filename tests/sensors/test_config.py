@@ -100,7 +100,7 @@ def test_lamps_light_the_gel_from_behind():
     with pytest.raises(InvalidArgumentError, match="three coordinates"):
         Light((float("nan"), 0.0, -0.017), (1.0, 1.0, 1.0))
     for colour in ((1.0, 0.0), (-1.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)):
-        with pytest.raises(InvalidArgumentError, match="colour=.*three numbers.*none of them negative"):
+        with pytest.raises(InvalidArgumentError, match=r"colour=.*three numbers.*none of them negative"):
             Light((0.02, 0.0, -0.017), colour)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InvalidArgumentError, match="at least one Light"):
         LightsConfig(())

@@ -191,7 +191,7 @@ def test_randomization_argument_narrows(make_env):
 def test_a_range_may_be_as_large_as_its_limit_and_no_larger():
     limits = dict(socket_xy=(0.19, "it is out of reach"))
     assert checked_randomization("Task", InsertionEnv.Randomization, dict(socket_xy=0.19), limits).socket_xy == 0.19
-    with pytest.raises(ValueError, match="at most 0.19: it is out of reach"):
+    with pytest.raises(ValueError, match=r"at most 0\.19: it is out of reach"):
         checked_randomization("Task", InsertionEnv.Randomization, dict(socket_xy=0.1900001), limits)
 
 
