@@ -27,17 +27,22 @@ Args = reduce(or_, map(_form, all_policies().values()))
 
 
 def check_arguments(arguments: list[str]) -> None:
-    """Check that the name of a policy is followed by that of a preset; tyro would list the flags of all presets instead.
+    """Check that the command begins with the names of a policy and a preset; tyro would list the flags of all presets instead.
 
     Args:
         arguments: The command line after `manifeel train`.
 
     Raises:
-        InvalidArgumentError: The name of the preset is missing.
+        InvalidArgumentError: The name of the policy or of the preset is missing.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
-    spec = all_policies().get(policy)
-    if spec is None or preset in spec.presets or {"-h", "--help"} & set(arguments):
+    if {"-h", "--help"} & set(arguments) or policy.startswith("__tyro"):
+        return
+    if (spec := all_policies().get(policy)) is None:
+        raise InvalidArgumentError(
+            f"`manifeel train` needs the name of a policy before that of a preset; choose from {list(all_policies())}"
+        )
+    if preset in spec.presets:
         return
     choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
     raise InvalidArgumentError(f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}")

@@ -20,8 +20,14 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """Formulas as MathML, which browsers draw without a script."""
-    return FORMULA.sub(lambda found: convert(unescape(found[2]), display="inline" if found[1] == "span" else "block"), html)
+    """Formulas as MathML, which browsers draw without a script; those that are wider than the page can be scrolled."""
+    return FORMULA.sub(_mathml, html)
+
+
+def _mathml(found: re.Match[str]) -> str:
+    is_block = found[1] == "div"
+    formula = convert(unescape(found[2]), display="block" if is_block else "inline")
+    return f'<div class="formula">{formula}</div>' if is_block else formula
 
 
 def on_post_build(config: Any) -> None:

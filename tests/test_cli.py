@@ -138,6 +138,13 @@ def test_training_without_a_preset_says_which_there_are(capsys):
     assert "paper (" in said
 
 
+@pytest.mark.parametrize("arguments", [[], ["cpu", "--demos", "peg.h5"], ["--demos", "peg.h5"], ["difusion_policy", "cpu"]])
+def test_training_without_a_policy_says_which_there_are(arguments, capsys):
+    assert cli.main(["train", *arguments]) == 1
+    said = capsys.readouterr().err.splitlines()[0]
+    assert "needs the name of a policy before that of a preset; choose from ['diffusion_policy', 'equivariant_" in said
+
+
 def test_an_unknown_observation_is_refused_before_a_process_is_started(tmp_path, capsys):
     out = tmp_path / "new" / "peg.h5"
     assert cli.main(["record", PEG, "-n", "1", "--obs-mode", "rgb+foo", "--out", str(out)]) == 1

@@ -118,6 +118,8 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert "TactileSensor" in page
     formulas = [(tmp_path / f"site/{name}/index.html").read_text() for name in ("sensor", "evaluation")]
     assert all("<math" in html and "arithmatex" not in html for html in formulas)
+    assert all('<div class="formula"><math' in html for html in formulas)  # it can be scrolled where it is wider than the page
+    assert ".formula { overflow-x: auto; }" in (tmp_path / "site/site.css").read_text()
     assert not dead_links(tmp_path / "site")
 
 

@@ -88,6 +88,8 @@ def test_what_cannot_be_verified_is_named(tmp_path):
         main(Args(report=tmp_path))
     with pytest.raises(InvalidArgumentError, match="folds"):
         main(Args("digit", tactile='{"gel.curvature": [80.0, 80.0]}'))
+    with pytest.raises(InvalidArgumentError, match="units='tacsl' holds no forces"):
+        main(Args(tactile='{"units": "tacsl"}', report=tmp_path / "sensor.html"))
 
 
 def test_value_that_is_no_number_breaks_a_bound():

@@ -172,11 +172,11 @@ def _rates(results: ConditionResults, checkpoints: int | None = None) -> np.ndar
 def _paired_rates(first: ConditionResults, second: ConditionResults) -> list[np.ndarray]:
     """Success (training seeds, episodes) of two conditions over equally many checkpoints of the same episodes."""
     if first.episode_seeds != second.episode_seeds:
-        numbers = len(first.episode_seeds), len(second.episode_seeds)
-        flag = "--seeds, or both without" if numbers[0] == numbers[1] else "--num-eval-episodes"
+        one, other = len(first.episode_seeds), len(second.episode_seeds)
+        flag = "--seeds, or both without" if one == other else "--num-eval-episodes"
         raise ResultError(
-            f"{first.name} and {second.name} were evaluated on different initial states, {numbers[0]} and {numbers[1]} of "
-            f"them; evaluate both with the same {flag}"
+            f"{first.name} and {second.name} were evaluated on different initial states, {one} and {other} of them; evaluate "
+            f"both with the same {flag}"
         )
     checkpoints = min(first.success.shape[1], second.success.shape[1])
     return [_rates(side, checkpoints) for side in (first, second)]

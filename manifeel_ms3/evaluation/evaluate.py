@@ -43,7 +43,7 @@ from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
 from .seed_list import read_seeds
-from .variant import SENSING
+from .variant import BACKENDS, SENSING, default_arguments
 
 log = logging.getLogger(__name__)
 BACKEND = dict(sim_backend="physx_cpu")
@@ -284,7 +284,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
             f'--env-kwargs \'{{"sensor": "{args.sensor}"}}\' if another sensor is meant'
         )
     check_obs_mode("--env-kwargs", given, config["obs_mode"])
-    _name_differences(trained | sensing, given)
+    _name_differences(env_id, trained | sensing, given)
     device = checked_device(args.device)
     if args.batch_size is not None and args.batch_size < 1:
         raise InvalidArgumentError(f"--batch-size {args.batch_size} is less than 1; leave it out, or give 1 or more")
@@ -310,11 +310,13 @@ def _require_own(args: Args, config: dict[str, Any]) -> None:
             )
 
 
-def _name_differences(trained: dict[str, Any], given: dict[str, Any]) -> None:
+def _name_differences(env_id: str, trained: dict[str, Any], given: dict[str, Any]) -> None:
     """Warn of arguments of the task that differ from those of the demonstrations that a policy was trained on."""
+    defaults = {name: value for name, value in default_arguments(env_id).items() if name not in BACKENDS}
+    learnt = defaults | trained
     for name, value in given.items():
-        if name in trained and json.dumps(trained[name]) != json.dumps(value):
-            log.warning("--env-kwargs: %s is %r here, but %r in the demonstrations of the policy", name, value, trained[name])
+        if name in learnt and json.dumps(learnt[name], default=str) != json.dumps(value):
+            log.warning("--env-kwargs: %s is %r here, but %r in the demonstrations of the policy", name, value, learnt[name])
 
 
 def _flags(names: list[str]) -> str:

@@ -22,7 +22,7 @@ def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
         env_id: Id of the task.
         env_kwargs: Arguments of `gym.make`.
     """
-    defaults = _default_arguments(env_id)
+    defaults = default_arguments(env_id)
     other = {
         name: value
         for name, value in env_kwargs.items()
@@ -32,7 +32,7 @@ def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
 
 
 @cache
-def _default_arguments(env_id: str) -> dict[str, Any]:
+def default_arguments(env_id: str) -> dict[str, Any]:
     """The defaults of a task's own arguments; {} for a task that is not registered here."""
     try:
         classes = task_spec(env_id).env_class.__mro__

@@ -109,8 +109,7 @@ class Light:
             )
         if len(self.colour) != 3 or not all(is_number(level) and level >= 0 for level in self.colour):
             raise InvalidArgumentError(
-                f"colour={self.colour} of a lamp must be three numbers, its brightness in red, green and blue, none of them "
-                "negative"
+                f"colour={self.colour} of a lamp must be three numbers, none of them negative: its red, green and blue"
             )
 
 

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from manifeel_ms3.command_line import run
 
-from .registry import PREFIX, SUFFIX, all_tasks, description_of, task_spec
+from .registry import DESCRIPTION, PREFIX, SUFFIX, TaskSpec, all_tasks, description_of, task_spec
 
 
 @dataclass
@@ -33,16 +33,17 @@ def main(args: Args) -> None:
         table = Table("task", "category", "steps", "camera", "description", title=f'gym.make("{PREFIX}<task>{SUFFIX}")')
         for spec in all_tasks().values():
             steps = str(spec.max_episode_steps)
-            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _summary(spec.env_class))
+            table.add_row(spec.name, spec.category, steps, spec.policy_camera, _summary(spec))
         Console().print(table)
         return
     spec = task_spec(args.task)
     Console().print(Markdown(f"# {spec.env_id}\n\n{description_of(spec.env_class)}"))
 
 
-def _summary(env_class: type) -> str:
-    """First line of the docstring of a task's class."""
-    return (inspect.getdoc(env_class) or "").partition("\n")[0]
+def _summary(spec: TaskSpec) -> str:
+    """First line of the docstring of a task's class; the task's instruction if that line is only a heading."""
+    first = (inspect.getdoc(spec.env_class) or "").partition("\n")[0]
+    return spec.instruction if first == DESCRIPTION else first
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ class Args:
     """Arguments of the command."""
 
     env_id: tyro.conf.Positional[str]
-    """Id of the task, such as ManiFeel-USBInsertion-v1."""
+    """Id of the task, such as ManiFeel-USBInsertion-v1, or its short name, such as USBInsertion."""
     out: Path | None = None
     """Path of the trajectory file, to which episodes are added; data/demos/<task>/human.h5 if not given."""
     obs_mode: str = "rgb+tacrgb+tacff"
@@ -57,8 +57,7 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: The task is not registered.
-        InvalidArgumentError: The control mode cannot be steered, the observations have no images, or an argument is not
-            allowed.
+        InvalidArgumentError: The control mode cannot be steered, there is nothing to show, or an argument is not allowed.
         DemonstrationError: The file was recorded with other arguments.
         DeviceError: The device cannot be used.
         MissingExtraError: viser, which serves the page, is not installed.
@@ -106,7 +105,7 @@ def _require_images(env: gym.Env, obs_mode: str) -> None:
         InvalidArgumentError: They hold neither images nor force fields.
     """
     space: Any = env.observation_space
-    sensors = space.get("sensor_data", {}) if isinstance(space, gym.spaces.Dict) else {}
+    sensors: Any = space.get("sensor_data", {}) if isinstance(space, gym.spaces.Dict) else {}
     if not any({"rgb", "force_field"} & data.keys() for data in sensors.values()):
         raise InvalidArgumentError(
             f"the page has nothing to show with --obs-mode {obs_mode} and these cameras and pads; add rgb, tacrgb or tacff"

@@ -70,7 +70,7 @@ def main(args: Args) -> int:
 
     Raises:
         UnknownNameError: The sensor, a field or an imperfection is unknown.
-        InvalidArgumentError: A value is not allowed.
+        InvalidArgumentError: A value is not allowed, or the force field holds no forces.
         MissingExtraError: The extra `report` is not installed.
         FileWriteError: The page cannot be written.
     """
@@ -81,6 +81,11 @@ def main(args: Args) -> int:
         raise InvalidArgumentError(f"--loads {args.loads} must be positive forces in N, such as 1 10")
     require_file("--report", args.report, "sensor.html")
     config = task_sensor(args.sensor, "tactile_right", "gel_right", tactile, imperfections)
+    if config.units != "newton":
+        raise InvalidArgumentError(
+            f"--tactile {args.tactile}: a force field with units={config.units!r} holds no forces, and cannot be compared with "
+            "loads; leave the units out: the first figure shows that field, too"
+        )
     with progress_bar() as bar:
         task = bar.add_task("pressing", total=len(SHAPES))
 

@@ -227,6 +227,18 @@ def test_each_row_of_a_batch_has_its_own_answer(policy):
     assert not torch.allclose(conditions[0], conditions[1], rtol=0.01)
 
 
+def test_vectors_whose_axes_share_a_scale_stay_within_the_range_of_the_networks():
+    """Generation cuts what lies beyond."""
+    spec = observation_spec("none", (), (), 16, pose="rotation_6d")
+    config = EquivariantConfig(encoder=EncoderConfig("small_cnn"), hidden=8, down_dims=(8,), diffusion_step_embed_dim=8)
+    policy = EquivariantDiffusionPolicy(config, spec, action_dim=6)
+    poses, actions = torch.as_tensor(rotation_6d_pose(poses_of(40))), torch.rand(40, 6) * torch.arange(1, 7) / 6 - 0.1
+    policy.fit_normalizers({POSE: poses}, actions)
+    for normalised in (policy.obs_normalizer(POSE).normalize(poses), policy.action_normalizer.normalize(actions)):
+        assert normalised.abs().max() <= 1 + 1e-6
+        assert normalised.abs().amax(0).min() > 0.1
+
+
 def test_actions_of_an_unknown_size_are_refused(policy):
     with pytest.raises(ValueError, match="ACTION_PAIRS"):
         EquivariantDiffusionPolicy(policy.config, SPEC, action_dim=4)

@@ -318,7 +318,7 @@ def test_each_row_of_a_batch_learns_at_a_step_of_its_own(make, config, most):
 
 @pytest.mark.parametrize("segments", [1, 2, 4])
 def test_the_end_to_which_a_consistent_velocity_leads_is_that_of_its_segment(segments):
-    """If a whole segment must agree with its end, no velocity at all misses it by the time that is left: 1 / (3 segments^2)."""
+    """If a whole segment must agree with its end, no velocity at all misses it by the time left: 1 / (3 segments^2)."""
     policy = FlowMatchingPolicy(FlowConfig(consistency=True, segments=segments, interval=1.0, down_dims=(8,)), SPEC, 6)
     policy.action_network = Says(0.0)
     torch.manual_seed(0)

@@ -322,6 +322,15 @@ def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_oth
     assert caplog.messages == ["--env-kwargs: fit is 'paper' here, but 'tight' in the demonstrations of the policy"]
 
 
+def test_an_argument_that_the_demonstrations_left_at_its_default_is_compared_with_it(checkpoint, tmp_path, caplog):
+    folder = config_with(checkpoint, tmp_path, env_kwargs={})
+    with caplog.at_level(logging.WARNING):
+        evaluation_from_args(Args(folder, env_kwargs='{"fit": "paper", "render_backend": "none", "max_episode_steps": 9}'))
+        assert not caplog.messages
+        evaluation_from_args(Args(folder, env_kwargs='{"fit": "tight"}'))
+    assert caplog.messages == ["--env-kwargs: fit is 'tight' here, but 'paper' in the demonstrations of the policy"]
+
+
 @pytest.mark.slow
 def test_ctrl_c_ends_an_evaluation_and_the_policys_process_at_once(checkpoint, tmp_path, figure):
     out, journal = tmp_path / "evaluation.json", tmp_path / "evaluation.episodes.jsonl"

@@ -46,6 +46,7 @@ from manifeel_ms3.sensors.registry import task_sensor
         (dict(randomization=TouchRandomization(stiffness=1.0)), "randomization.stiffness"),
         (dict(gel=GelConfig(curvature=(60.0, 60.0)), housing=HousingConfig(protrusion=0.02)), "folds"),
         (dict(gel=GelConfig(curvature=(30.0, 30.0))), "housing.protrusion"),
+        (dict(gel=GelConfig(curvature=(16.0, 16.0))), "housing.protrusion"),  # 3.2 mm under the top, of which 3 mm stand out
         (dict(gel=GelConfig(curvature=(-1.0, 0.0))), "gel.curvature"),
         (dict(imperfections=ImperfectionConfig(hysteresis=1.0)), "imperfections.hysteresis"),
         (dict(imperfections=ImperfectionConfig(noise=-0.1)), "imperfections.noise"),
@@ -100,7 +101,7 @@ def test_lamps_light_the_gel_from_behind():
     with pytest.raises(InvalidArgumentError, match="three coordinates"):
         Light((float("nan"), 0.0, -0.017), (1.0, 1.0, 1.0))
     for colour in ((1.0, 0.0), (-1.0, 0.0, 0.0), (float("nan"), 0.0, 0.0)):
-        with pytest.raises(InvalidArgumentError, match=r"colour=.*three numbers.*none of them negative"):
+        with pytest.raises(InvalidArgumentError, match=r"colour=.*three numbers, none of them negative"):
             Light((0.02, 0.0, -0.017), colour)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InvalidArgumentError, match="at least one Light"):
         LightsConfig(())

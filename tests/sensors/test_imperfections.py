@@ -8,7 +8,7 @@ from scipy.integrate import trapezoid
 
 from manifeel_ms3.sensors import ImperfectionConfig, gelsight_r15, sensor_config, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
-from manifeel_ms3.sensors.draws import uniform_draws
+from manifeel_ms3.sensors.draws import pad_seeds, uniform_draws
 from manifeel_ms3.sensors.imperfections import Imperfections
 from manifeel_ms3.sensors.touch_model import OUTPUTS, TouchModel
 
@@ -185,6 +185,13 @@ def test_streams_and_seeds_of_draws_are_independent():
     draws = np.stack([uniform_draws(np.arange(2000), stream, 1)[:, 0] for stream in (0, 1, 16)])
     assert np.abs(np.corrcoef(draws) - np.eye(3)).max() < 0.1
     assert np.abs(np.corrcoef(draws[:, 1:], draws[:, :-1]) - np.eye(6)).max() < 0.1
+
+
+def test_no_two_episodes_of_any_seed_and_pad_draw_alike():
+    seeds, episodes = (grid.ravel() for grid in np.meshgrid(np.arange(100), np.arange(50)))
+    drawn = [pad_seeds(seeds, episodes, pad) for pad in ("tactile_right", "tactile_left")]
+    assert len(np.unique(drawn)) == 2 * len(seeds)
+    assert np.array_equal(pad_seeds(np.arange(100), np.zeros(100, int), "tactile_right"), np.arange(100))
 
 
 def test_reset_forgets_in_the_reset_pads_alone():

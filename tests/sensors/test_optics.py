@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
-from manifeel_ms3.sensors import Light, LightsConfig, sensor_config
+from manifeel_ms3.sensors import Light, LightsConfig, TouchRandomization, sensor_config
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
 from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
 from manifeel_ms3.sensors.optics.lights import lamp_shader
@@ -145,6 +145,13 @@ def test_episodes_differ_in_light_as_far_as_asked():
     image = optics.shade(optics.surface(press))
     assert (image[0] == image[1]).all()
     assert (optics.shade(torch.zeros(2, 240, 320)) == background(optics)).all()
+
+
+def test_each_channel_draws_its_own_gain_and_the_lights_their_own_turn():
+    gain, turn = TouchRandomization(gain=0.2, light_phase=0.5).draw_lights(np.arange(1000))
+    draws = np.c_[(gain - 1) / 0.2, turn / 0.5]
+    assert np.abs(np.corrcoef(draws.T) - np.eye(4)).max() < 0.1
+    assert ((np.abs(draws).max(0) > 0.99) & (np.abs(draws).max(0) <= 1)).all()
 
 
 def test_shadow_darkens_behind_the_bump_and_nowhere_else(optics):

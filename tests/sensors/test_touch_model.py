@@ -126,6 +126,15 @@ def test_a_penetration_is_cut_at_its_limit_and_the_force_is_not():
     assert not torch.equal(seen["rgb"][0][middle], levels[middle])
 
 
+def test_the_picture_is_that_of_depth_at_every_pixel():
+    """Depth is measured near the contact alone; edges and corners that lie between the cells are no exception."""
+    shapes = [mesh and mesh.copy().apply_translation([1.3e-4, 2.1e-4, 0.0]) for mesh in meshes()]
+    near, everywhere = pressed(shapes), pressed(shapes)
+    everywhere.heights = lambda grid, window=None: MeshRays.heights(everywhere, grid)
+    pictures = [TouchModel(CONFIG, 4, CPU, ("rgb",)).observe(depth, LOADS)["rgb"] for depth in (near, everywhere)]
+    assert torch.equal(*pictures)
+
+
 def test_only_what_is_asked_for_is_computed():
     depth = pressed(meshes()[:1])
     looked, heights = [], depth.heights

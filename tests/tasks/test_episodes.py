@@ -34,6 +34,19 @@ def test_episode_is_a_function_of_its_seed_bit_for_bit(make_env):
             assert torch.equal(first[key], third[key])
 
 
+def test_setting_the_present_state_again_changes_nothing_bit_for_bit(make_env):
+    env = make_env(obs_mode="tacff", render_backend="none")
+    ends = []
+    for sets in (False, True):
+        env.reset(seed=3)
+        for action in np.random.default_rng(3).uniform(-1, 1, (4, 6)):
+            if sets:
+                env.unwrapped.set_state_dict(env.unwrapped.get_state_dict())
+            obs, *_ = env.step(action)
+        ends.append((obs["sensor_data"]["tactile_right"]["force_field"], env.unwrapped.get_state()))
+    assert all(map(torch.equal, *ends))
+
+
 def test_environments_to_reset_can_be_listed(make_env):
     env = make_env(obs_mode="state", render_backend="none")
     first = env.reset(seed=1)[0]

@@ -226,11 +226,10 @@ def test_seeds_that_are_not_for_demonstrations_are_refused(seed, make_env, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    "flags", [["--obs-mode", "none"], ["--obs-mode", "state"], ["--obs-mode", "tacff", "--tactile-sensors"]]
-)
+@pytest.mark.parametrize("flags", [["none"], ["state"], ["tacff", "--tactile-sensors"]], ids=" ".join)
 def test_a_session_without_images_is_refused_before_the_page_opens(flags, tmp_path):
-    given = [PEG, "--out", str(tmp_path / "x.h5"), "--env-kwargs", '{"render_backend": "none"}', *flags]
-    with pytest.raises(InvalidArgumentError, match=f"nothing to show with --obs-mode {flags[1]} .*; add rgb, tacrgb or tacff"):
+    pytest.importorskip("viser")
+    given = [PEG, "--out", str(tmp_path / "x.h5"), "--env-kwargs", '{"render_backend": "none"}', "--obs-mode", *flags]
+    with pytest.raises(InvalidArgumentError, match=f"nothing to show with --obs-mode {flags[0]} .*; add rgb, tacrgb or tacff"):
         teleop.main(tyro.cli(teleop.Args, args=given))
     assert list(tmp_path.iterdir()) == []
