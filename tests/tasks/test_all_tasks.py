@@ -1,19 +1,15 @@
 """What holds for every task."""
 
-import itertools
 import re
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from mani_skill.utils.structs import Pose
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 import manifeel_ms3.experts  # noqa: F401
-from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.placement import POINTING_DOWN, WORKSPACE_XY
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, all_tasks, evaluation_seeds
 
 TASKS = sorted(name for name in gym.registry if name.startswith("ManiFeel-"))
@@ -101,34 +97,17 @@ def test_task_says_what_it_is(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_ranges_as_large_as_allowed_give_sound_starts(make_env, task, monkeypatch):
+def test_ranges_as_large_as_allowed_give_sound_starts(make_env, task):
     """At the limits nothing lies in anything else, and the hand is where it is to start."""
     cls = gym.make(task, obs_mode="none", render_backend="none").unwrapped
     limits = {name: 0.999 * limit for name, (limit, _) in cls._largest_ranges().items()}
     assert set(limits) == set(cls.Randomization.__dataclass_fields__)
     env = make_env(task, obs_mode="none", render_backend="none", randomization=limits)
-    starts, reset_tool = [], PandaGelSight.reset_tool
-    monkeypatch.setattr(
-        PandaGelSight, "reset_tool", lambda self, *args, **how: (starts.append(args[0]), reset_tool(self, *args, **how))
-    )
     for seed in range(6):
         env.reset(seed=seed)
-        assert env.unwrapped.agent.tcp_pose_at_base.p == pytest.approx(starts[-1].p, abs=2e-3), seed
         *_, info = env.step(np.zeros(env.action_space.shape))
         assert not info["fail"].any(), seed
         assert float(info["contact_force"]) < 8.0, seed
-
-
-@pytest.mark.parametrize("name", ["PegInsertion", "NutBoltAssembly", "BallSorting", "ObjectSearch"])
-def test_the_hand_reaches_all_places_that_ranges_allow(make_env, name):
-    env = make_env(f"ManiFeel-{name}-v1", obs_mode="none", render_backend="none")
-    env.reset(seed=0)
-    agent, limits = env.unwrapped.agent, env.unwrapped._largest_ranges()
-    for limit in {limit for field, (limit, _) in limits.items() if field.endswith("_xy")}:
-        for x, y in itertools.product((-limit, limit), repeat=2):
-            place = torch.tensor([[WORKSPACE_XY[0] + x, WORKSPACE_XY[1] + y, 0.2]])
-            agent.reset_tool(Pose.create_from_pq(place, torch.tensor([POINTING_DOWN])))
-            assert agent.tcp_pose_at_base.p == pytest.approx(place, abs=1e-3)
 
 
 @pytest.mark.parametrize("task", TASKS)
