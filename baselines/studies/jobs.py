@@ -96,8 +96,8 @@ def perform(job: Job, root: Path, needs: Resources) -> None:
 def _perform(job: Job, root: Path, needs: Resources) -> None:
     folder = job.folder(root)
     before, spent = read_status(folder / STARTED), _seconds_spent(folder)
-    attempt = dict(attempts=before.get("attempts", 0) + 1, seconds_before=round(spent, 1))
-    started = dict(pid=os.getpid(), host=socket.gethostname(), title=job.title, settings=job.settings) | attempt
+    started = dict(pid=os.getpid(), host=socket.gethostname(), title=job.title, settings=job.settings)
+    started |= dict(attempts=before.get("attempts", 0) + 1, seconds_before=round(spent, 1))
     write_json(folder / STARTED, started)
     (folder / FAILED).unlink(missing_ok=True)
     begin = time.time()

@@ -193,8 +193,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         return False
     with missing_extras_named():
         from matplotlib.figure import Figure
-    conditions = {(task, mode): condition for task, (_, by_mode) in overview.items() for mode, condition in by_mode.items()}
-    drawn = {place: mean_success(found[condition]) for place, condition in conditions.items()}
+    drawn = {(task, mode): mean_success(found[one]) for task, (_, by_mode) in overview.items() for mode, one in by_mode.items()}
     tasks = list(TABLE_I)
     names = [f"{task}\n({overview[task][0].preset})" if task in overview else task for task in tasks]
     fig = Figure(figsize=PANEL, layout="constrained")

@@ -41,10 +41,9 @@ class TrainingSettings:
     """Settings that differ from the preset's, or all of them where there is no preset."""
 
     @property
-    def fullness(self) -> tuple[int, int, str]:
-        """Key that puts the fullest training first (`FULLEST`), and settings with fewer changes before those with more."""
-        place = FULLEST.index(self.preset) if self.preset in FULLEST else len(FULLEST)
-        return place, len(self.changes), str(self)
+    def fullness(self) -> tuple[int, tuple[bool, int, str]]:
+        """Key that puts the fullest training first (`FULLEST`), and settings of one preset in the order of `sort_key`."""
+        return FULLEST.index(self.preset) if self.preset in FULLEST else len(FULLEST), self.sort_key
 
     @property
     def sort_key(self) -> tuple[bool, int, str]:
