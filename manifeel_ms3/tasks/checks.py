@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from decimal import ROUND_DOWN, Context
 from typing import Any
 
 import numpy as np
@@ -42,8 +43,13 @@ def checked_randomization(
             raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} must be a finite number >= 0")
         limit, reason = limits.get(name, (np.inf, ""))
         if value > limit:
-            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {limit:.3g}: {reason}")
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {_rounded_down(limit)}: {reason}")
     return kind(**overrides)
+
+
+def _rounded_down(limit: float) -> str:
+    """A limit with three digits, for a message that says what is allowed; rounded up, it would be refused itself."""
+    return str(Context(prec=3, rounding=ROUND_DOWN).create_decimal(str(limit)))
 
 
 def check_argument_names(task: type, given: Collection[str]) -> None:

@@ -9,6 +9,7 @@ import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 import manifeel_ms3.experts  # noqa: F401
+from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, all_tasks, evaluation_seeds
 
@@ -97,14 +98,18 @@ def test_task_says_what_it_is(task):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_ranges_as_large_as_allowed_give_sound_starts(make_env, task):
+def test_ranges_as_large_as_allowed_give_sound_starts(make_env, monkeypatch, task):
     """At the limits nothing lies in anything else, and the hand is where it is to start."""
+    starts, reset_tool = [], PandaGelSight.reset_tool
+    monkeypatch.setattr(PandaGelSight, "reset_tool", lambda *args, **kw: (starts.append(args[1]), reset_tool(*args, **kw)))
     cls = gym.make(task, obs_mode="none", render_backend="none").unwrapped
     limits = {name: 0.999 * limit for name, (limit, _) in cls._largest_ranges().items()}
     assert set(limits) == set(cls.Randomization.__dataclass_fields__)
     env = make_env(task, obs_mode="none", render_backend="none", randomization=limits)
     for seed in range(6):
         env.reset(seed=seed)
+        moved = env.unwrapped.agent.tcp_pose_at_base.p - starts[-1].p
+        assert moved.norm() < 0.001, seed  # the arm sags by up to 0.9 mm under what the hand holds
         *_, info = env.step(np.zeros(env.action_space.shape))
         assert not info["fail"].any(), seed
         assert float(info["contact_force"]) < 8.0, seed
@@ -117,3 +122,5 @@ def test_ranges_that_cannot_be_played_are_refused_at_construction(make_env, task
         with pytest.raises(ValueError, match=name) as error:
             make_env(task, obs_mode="none", render_backend="none", randomization={name: 1.01 * limit})
         assert reason in str(error.value)
+        shown = float(re.search(r"at most (\S+):", str(error.value))[1])
+        assert 0.99 * limit < shown <= limit, "the value that the message gives is refused itself"

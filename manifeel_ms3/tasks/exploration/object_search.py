@@ -18,8 +18,9 @@ PLACES_X = (-0.075, 0.075)
 """Places of the battery along x, in m from the container's middle."""
 START_XYZ = (*WORKSPACE_XY, 0.07)
 """Position of the tool at the start, in m (public code of the paper): in the container, between the two places."""
-HAND = 0.08
-"""Half of the hand's width, in m."""
+HAND = 0.105
+"""Half of the hand's width along y, its wider side, in m: 104 mm, and some clearance. At the start, the container's
+walls are beside it."""
 LOWEST = 0.055
 """Smallest height of the tool over the table at the start, in m: the fingertips are clear of the battery."""
 BUILT_HEIGHT = 0.05
@@ -101,7 +102,7 @@ class ObjectSearchEnv(VisuotactileEnv):
 
     def _largest_ranges(self):
         to_wall = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - PLACES_X[1] - BATTERY_SIZE / 2
-        to_hand = CONTAINER_OUTER[0] / 2 - CONTAINER_WALL - HAND
+        to_hand = CONTAINER_OUTER[1] / 2 - CONTAINER_WALL - HAND  # along y, where the room is less than along x
         return dict(
             place_xy=(to_wall, "the battery would start in the container's wall"),
             start_xy=(to_hand, "the hand would start in the container's wall"),
