@@ -47,6 +47,14 @@ def test_a_frame_shows_each_image_at_its_place_and_the_force_so_far():
     assert succeeded == [False, False, True]
 
 
+def test_the_time_in_the_title_is_that_of_the_control_rate():
+    slow, fast = a_take(), a_take()
+    slow.control_freq, fast.control_freq, fast.successes = 10, 20, [False] * 5
+    at_step = [list(layout.video_frames(take)) for take in (slow, fast)]
+    titles = [np.asarray(frame)[: layout.BAR] for frame in (at_step[0][1], at_step[1][2])]
+    np.testing.assert_array_equal(*titles)  # step 2 at 10 Hz and step 4 at 20 Hz are both at 0.2 s
+
+
 @pytest.mark.parametrize("suffix", ["webp", "gif"])
 def test_an_animation_has_every_frame_and_stops_at_the_end(tmp_path, suffix):
     frames = list(layout.video_frames(a_take()))

@@ -12,7 +12,7 @@ Observations have the keys that LeRobot's `preprocess_observation` knows, and be
 """
 
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -23,7 +23,6 @@ from mani_skill.utils.wrappers import CPUGymWrapper
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.obs_modes import PAD
-from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 GYM_ID = "manifeel_ms3/LeRobot-v0"
 """Id under which gymnasium makes a `LeRobotEnv`."""
@@ -42,7 +41,6 @@ class LeRobotEnv(gym.Env):
         env_kwargs: Further arguments of the task.
     """
 
-    metadata: ClassVar[dict[str, Any]] = dict(render_modes=["rgb_array"], render_fps=CONTROL_FREQ)
     render_mode: str | None = "rgb_array"
 
     def __init__(self, env_id: str, obs_mode: str = "rgb", env_kwargs: dict[str, Any] | None = None):
@@ -55,6 +53,7 @@ class LeRobotEnv(gym.Env):
             self.render_mode = None
         kwargs = dict(obs_mode=obs_mode, sim_backend="physx_cpu", render_mode=self.render_mode) | given
         self._env: Any = CPUGymWrapper(registry.make_env(env_id, **kwargs))
+        self.metadata = dict(render_modes=["rgb_array"], render_fps=self._env.unwrapped.control_freq)
         spec = registry.task_spec(env_id)
         self.task = spec.name
         (self.task_description,) = self._env.unwrapped.get_language_instruction()

@@ -180,6 +180,8 @@ def _take(source: Source, args: Args) -> Take:
     with progress_bar() as bar:
         counter = bar.add_task(f"filming {spec.name}", total=source.length + 1)
         with closing(video_env(source.env_id, source.env_kwargs, view)) as env:
+            base: Any = env.unwrapped
+            take.control_freq = base.control_freq
             for step, (obs, info) in enumerate(replayed(env, actions, source.seed)):
                 take.forces.append(float(info["contact_force"]))
                 take.successes.append(bool(info["success"]))

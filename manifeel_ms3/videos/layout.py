@@ -8,8 +8,6 @@ from collections.abc import Iterator
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
-
 from .shots import SCENE_SIZE, Shot, Take
 
 BAR = 36
@@ -71,7 +69,7 @@ def video_frame(take: Take, shot: Shot) -> Image.Image:
 def _draw_title(draw: ImageDraw.ImageDraw, take: Take, step: int) -> None:
     middle = BAR // 2
     draw.text((TITLE_INSET, middle), take.title, INK, _font(TITLE_SIZE), anchor="lm")
-    time = f"{step / CONTROL_FREQ:.1f} s"
+    time = f"{step / take.control_freq:.1f} s"
     draw.text((SIZE[0] - TITLE_INSET, middle), time, FAINT, _font(TIME_SIZE), anchor="rm")
     if take.successes[step]:
         draw.text((SIZE[0] - SUCCESS_INSET, middle), "success", SUCCESS, _font(TITLE_SIZE), anchor="rm")

@@ -11,6 +11,7 @@ from mani_skill.utils import common
 from manifeel_ms3.evaluation.video import film_env
 from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.obs_modes import PAD
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 SCENE_SIZE = 480
 """Width and height of the image of the scene, in pixels; chosen by eye."""
@@ -50,6 +51,8 @@ class Take:
     """Contact force at the start, where it is 0, and of every control step, in N."""
     successes: list[bool] = field(default_factory=list)
     """Whether the task has succeeded, for the start and every control step."""
+    control_freq: int = CONTROL_FREQ
+    """Control steps per second."""
 
 
 def shot_images(env: gym.Env, obs: dict[str, Any], view: View) -> dict[str, np.ndarray]:

@@ -44,7 +44,8 @@ def test_an_episode_depends_on_its_seed_and_ends_at_the_time_limit(env):
     other, _ = env.reset(seed=100_001)
     assert np.array_equal(first["agent_pos"], again["agent_pos"])
     assert not np.array_equal(first["agent_pos"], other["agent_pos"])
-    short = LeRobotEnv(PEG, "tacff", dict(render_backend="none", max_episode_steps=2))
+    short = LeRobotEnv(PEG, "tacff", dict(render_backend="none", max_episode_steps=2, sim_config=dict(control_freq=20)))
+    assert short.metadata["render_fps"] == 20
     assert short._max_episode_steps == 2
     short.reset(seed=1)
     still = np.zeros(short.action_space.shape, np.float32)
