@@ -33,7 +33,7 @@ class Args:
     """Path of a trajectory file with observations."""
     to: Format
     """Format to write: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each
-    episode."""
+    episode, with the arrays `actions` and, for example, `sensor_data.wrist.rgb`; `manifeel train` does not read it."""
     out: Path
     """Folder to write; it must not exist yet."""
     videos: bool = False
