@@ -1,10 +1,9 @@
 """The page docs/perturbation.md, made anew: `python -m docs.make_perturbation` in the repository's root.
 
-It compares results of one checkpoint of the leaderboard under changed appearances, in docs/perturbation, with its result under
-the usual one, `none.json`. `COMMAND` makes such a result. A test fails where the page is not what this makes.
+It compares results of checkpoints of the leaderboard under changed appearances, in docs/perturbation/<task>/<observations>, with
+their results under the usual one, `none.json`. `COMMAND` makes such a result. A test fails where the page is not what this makes.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -17,47 +16,50 @@ from manifeel_ms3.files import write_text
 
 PAGE = Path(__file__).with_name("perturbation.md")
 FOLDER = Path(__file__).with_name("perturbation")
-ENTRY = "cpu/PegInsertion/rgb+tacff"
-"""The entry of the leaderboard whose checkpoint was evaluated."""
-USUAL = FOLDER / "none.json"
-"""The checkpoint's result under the usual appearance, on the processor of the others."""
-COMMAND = """manifeel eval --checkpoint leaderboard/{entry}/seed0/checkpoints/00007000 --num-eval-episodes 50 \\
-    --env-kwargs '{{"visual_randomization": {changed}}}' --out docs/perturbation/NAME.json"""
+USUAL = "none.json"
+"""File of a checkpoint's result under the usual appearance, on the processor of the others."""
+SENSING = {"rgb": "vision alone", "rgb+tacrgb": "vision and TacRGB", "rgb+tacff": "vision and TacFF"}
+"""What a policy observes, in words, in the order of the page."""
+COMMAND = """manifeel eval --checkpoint leaderboard/cpu/PegInsertion/rgb+tacff/seed0/checkpoints/00007000 --num-eval-episodes 50 \\
+    --env-kwargs '{"visual_randomization": {"table_texture": 5}}' --out docs/perturbation/PegInsertion/rgb+tacff/NAME.json"""
 HEAD = """# Robustness to appearance
 
-How much success does a policy lose when the scene looks different from what it was trained on? The small policy of the
-leaderboard entry `{entry}` was trained under the usual appearance and evaluated on the same {episodes} initial states under
-changes of the [appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. It observes the
-wrist camera and TacFF; touch itself is not changed. All rows were evaluated on the same processor. Each difference, in
-percentage points, has a 95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm"
-is corrected for all rows (Holm 1979). One policy was tested: nothing here tells how other training seeds, observations or
-tasks behave. The study `configs/perturbation.yaml` trains and evaluates policies of three tasks, with vision alone, TacRGB
-and TacFF.
-
+How much success does a policy lose when the scene looks different from what it was trained on? Small policies of the leaderboard,
+each that of training seed 0, were trained under the usual appearance and evaluated on the same 50 initial states under changes of the
+[appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. Touch itself is not changed. All rows of
+a policy were evaluated on the same processor. Each difference, in percentage points, has a 95 % interval from a bootstrap over
+initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows of the policy (Holm 1979). One policy of
+each kind was tested: nothing here tells how other training seeds or tasks behave. The study `configs/perturbation.yaml` trains and
+evaluates policies of three tasks, with vision alone, TacRGB and TacFF.
 """
 
 
 def page() -> str:
     """The Markdown page."""
-    usual = _of(read_result(USUAL))
+    policies = [folder for task in sorted(FOLDER.iterdir()) for folder in map(task.joinpath, SENSING) if folder.is_dir()]
+    tables = [f"## {folder.parent.name}, {SENSING[folder.name]}\n\n{_table(folder)}" for folder in policies]
+    return "\n".join([HEAD, *tables, f"A row is made by\n\n```bash\n{COMMAND}\n```\n"])
+
+
+def _table(folder: Path) -> str:
+    """The table of one policy, whose results lie in a folder."""
+    usual = _of(read_result(folder / USUAL))
     rows: list[tuple[str, ...]] = []
     p_values: list[float] = []
-    changed: dict[str, float] = {}
-    for path in sorted(set(FOLDER.glob("*.json")) - {USUAL}):
+    for path in sorted(set(folder.glob("*.json")) - {folder / USUAL}):
         result = read_result(path)
-        changed, here = result["env_kwargs"]["visual_randomization"], _of(result)
-        change, p_value = difference(here, usual)
-        ranges = ", ".join(f"`{name}` {value:g}" for name, value in changed.items())
-        success = linked(mean_success(here), f"{FOLDER.name}/{path.name}")
-        rows.append((path.stem.replace("_", " "), ranges, success, change.signed))
+        change, p_value = difference(here := _of(result), usual)
+        ranges = ", ".join(f"`{name}` {value:g}" for name, value in result["env_kwargs"]["visual_randomization"].items())
+        rows.append((path.stem.replace("_", " "), ranges, _linked_success(here, path), change.signed))
         p_values.append(p_value)
-    command = COMMAND.format(entry=ENTRY, changed=json.dumps(changed))
     tested = [(*row, p_text(p), p_text(p_holm)) for row, p, p_holm in zip(rows, p_values, holm(p_values), strict=True)]
-    unchanged = ("none", None, linked(mean_success(usual), f"{FOLDER.name}/{USUAL.name}"), None, None, None)
+    unchanged = ("none", None, _linked_success(usual, folder / USUAL), None, None, None)
     names = ("change", "half ranges", "success", "against the usual appearance", "p", "p, Holm")
-    table = markdown_table(names, [unchanged, *tested])
-    head = HEAD.format(entry=ENTRY, episodes=len(usual.episode_seeds))
-    return f"{head}{table}\nA row is made by\n\n```bash\n{command}\n```\n"
+    return markdown_table(names, [unchanged, *tested])
+
+
+def _linked_success(results: ConditionResults, path: Path) -> str:
+    return linked(mean_success(results), str(path.relative_to(PAGE.parent)))
 
 
 def _of(result: dict[str, Any]) -> ConditionResults:
