@@ -1,7 +1,8 @@
 """The page docs/perturbation.md, made anew: `python -m docs.make_perturbation` in the repository's root.
 
-It compares results of checkpoints of the leaderboard under changed appearances, in docs/perturbation/<task>/<observations>, with
-their results under the usual one, `none.json`. `COMMAND` makes such a result. A test fails where the page is not what this makes.
+It compares results of checkpoints of the leaderboard under changed appearances, in docs/perturbation/<task>/<observations>,
+with their results under the usual one, `none.json`. `COMMAND` makes such a result. A test fails where the page is not what this
+makes.
 """
 
 from pathlib import Path
@@ -20,17 +21,18 @@ USUAL = "none.json"
 """File of a checkpoint's result under the usual appearance, on the processor of the others."""
 SENSING = {"rgb": "vision alone", "rgb+tacrgb": "vision and TacRGB", "rgb+tacff": "vision and TacFF"}
 """What a policy observes, in words, in the order of the page."""
-COMMAND = """manifeel eval --checkpoint leaderboard/cpu/PegInsertion/rgb+tacff/seed0/checkpoints/00007000 --num-eval-episodes 50 \\
-    --env-kwargs '{"visual_randomization": {"table_texture": 5}}' --out docs/perturbation/PegInsertion/rgb+tacff/NAME.json"""
+COMMAND = """manifeel eval --checkpoint leaderboard/cpu/PegInsertion/rgb+tacff/seed0/checkpoints/00007000 \\
+    --num-eval-episodes 50 --env-kwargs '{"visual_randomization": {"table_texture": 5}}' \\
+    --out docs/perturbation/PegInsertion/rgb+tacff/NAME.json"""
 HEAD = """# Robustness to appearance
 
-How much success does a policy lose when the scene looks different from what it was trained on? Small policies of the leaderboard,
-each that of training seed 0, were trained under the usual appearance and evaluated on the same 50 initial states under changes of the
-[appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. Touch itself is not changed. All rows of
-a policy were evaluated on the same processor. Each difference, in percentage points, has a 95 % interval from a bootstrap over
-initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows of the policy (Holm 1979). One policy of
-each kind was tested: nothing here tells how other training seeds or tasks behave. The study `configs/perturbation.yaml` trains and
-evaluates policies of three tasks, with vision alone, TacRGB and TacFF.
+How much success does a policy lose when the scene looks different from what it was trained on? Small policies of the
+leaderboard, each that of training seed 0, were trained under the usual appearance and evaluated on the same 50 initial states
+under changes of the [appearance](rendering.md#visual-randomization), which are drawn anew for each initial state. Touch
+itself is not changed. All rows of a policy were evaluated on the same processor. Each difference, in percentage points, has a
+95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows
+of the policy (Holm 1979). One policy of each kind was tested: nothing here tells how other training seeds or tasks behave.
+The study `configs/perturbation.yaml` trains and evaluates policies of three tasks, with vision alone, TacRGB and TacFF.
 """
 
 
