@@ -16,7 +16,7 @@ from manifeel_ms3.arguments import several_of
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.tasks.checks import check_argument_names
-from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.obs_modes import in_usual_order, split_obs_mode
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS
 
@@ -164,7 +164,7 @@ def _content(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise StudyError(f"{path} is not a study: it must be a mapping with the key `grids`; see configs/ for examples")
     _require_known(content, {"grids", "include", "resources"}, f"{path}")
-    for name, expected in (("grids", list[Any]), ("include", list[str]), ("resources", dict[str, Any])):
+    for name, expected in (("grids", list), ("include", list[str]), ("resources", dict)):
         if name in content and not _is_of(content[name], expected):
             raise StudyError(f"{path}: `{name}` has the wrong type: {_shown(content[name])}; see configs/ for examples")
     return content
@@ -216,7 +216,14 @@ def _grid(entry: Any, place: str) -> Grid:
         raise StudyError(f"{place}: pretrain {sorted(unknown)} cannot be pretrained; choose from {get_args(Representation)}")
     if too_many := [count for count in grid.num_demos if count and count > max(recorded, default=0)]:
         raise StudyError(f"{place}: num_demos {too_many} are more than the {max(recorded)} recorded; raise `demos`")
-    return replace(grid, train=train, encoder_flags=of_encoders)
+    return replace(  # with one spelling of everything, so that the same run is the same job however it is written
+        grid,
+        tasks=tuple(task_spec(task).env_id for task in grid.tasks),
+        obs_modes=tuple(map(in_usual_order, grid.obs_modes)),
+        pretrain={encoder: task_spec(task).env_id for encoder, task in grid.pretrain.items()},
+        train=train,
+        encoder_flags=of_encoders,
+    )
 
 
 def _check_sensing(grid: Grid) -> None:
@@ -285,8 +292,12 @@ def _is_of(value: Any, annotation: Any) -> bool:
         return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
     if get_origin(annotation) is dict:
         return isinstance(value, dict) and all(isinstance(key, str) and _is_of(item, inner[1]) for key, item in value.items())
+    if annotation is Any and isinstance(value, list | dict):
+        return _is_of(value, list[Any] if isinstance(value, list) else dict[str, Any])
     if isinstance(value, bool):  # which is an int, too
         return annotation in (Any, bool)
+    if annotation is Any and not isinstance(value, int | float | str | None):  # yaml also knows dates, bytes and sets
+        return False
     return annotation is Any or isinstance(value, int | float if annotation is float else annotation)
 
 

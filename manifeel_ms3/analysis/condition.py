@@ -12,6 +12,7 @@ from typing import Any
 
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED
 from manifeel_ms3.evaluation.variant import SENSING, variant_of
+from manifeel_ms3.tasks.obs_modes import in_usual_order
 from manifeel_ms3.tasks.registry import short_name
 
 NO_SETTINGS = frozenset(
@@ -108,7 +109,7 @@ def condition_of(result: dict[str, Any]) -> Condition:
 
     Entries of the policy's configuration that are of another type than the baselines' count as absent.
     """
-    config, obs_mode = result["config"], result["obs_mode"]
+    config, obs_mode = result["config"], in_usual_order(result["obs_mode"])
     modes = obs_mode.split("+")
     settings = settings_of(config, obs_mode)
     variant = variant_of(result["env_id"], result["env_kwargs"])

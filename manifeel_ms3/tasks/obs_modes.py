@@ -19,6 +19,12 @@ def has_images(own_mode: str) -> bool:
     return own_mode not in ("none", *STATE_TOKENS)
 
 
+def in_usual_order(obs_mode: str) -> str:
+    """The same mode with its tactile tokens last, as the paper's conditions have them: "rgb+tacff" for "tacff+rgb"."""
+    touch = list(TACTILE_TOKENS)
+    return "+".join(sorted(obs_mode.split("+"), key=lambda token: touch.index(token) if token in touch else -1))
+
+
 def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     """Split `obs_mode` into ManiSkill's own part ("none" if nothing is left) and the tactile outputs asked for.
 

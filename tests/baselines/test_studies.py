@@ -104,6 +104,18 @@ def test_a_run_is_the_same_job_however_its_flags_are_written(study):
         assert [job.key for job in jobs_of(read_study(study))] == keys
 
 
+def test_a_run_is_the_same_job_however_its_task_and_observations_are_written(study):
+    content = "grids: [{tasks: [TASK], obs_modes: [MODE], seeds: [0], pretrain: {unit: OTHER}, encoders: [unit]}]"
+    usual = content.replace("TASK", "ManiFeel-PegInsertion-v1").replace("MODE", "rgb+tacrgb+tacff")
+    study.write_text(usual.replace("OTHER", "ManiFeel-NutBoltAssembly-v1"))
+    keys = [job.key for job in jobs_of(read_study(study))]
+    assert len(keys) == 5  # two recordings, a pretraining, a training and its evaluation
+    for task in ("PegInsertion", "manifeel_ms3:ManiFeel-PegInsertion-v1"):
+        written = content.replace("TASK", task).replace("MODE", "tacff+rgb+tacrgb")
+        study.write_text(written.replace("OTHER", "NutBoltAssembly"))
+        assert [job.key for job in jobs_of(read_study(study))] == keys
+
+
 def test_flags_that_are_on_or_off_reach_the_training(study):
     on_and_off = "policy.encoder.freeze-tacrgb: true, policy.public-code: false, compile: true"
     study.write_text(
@@ -339,6 +351,10 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ),
         ("grids: [{tasks: table I, task_args: {fitt: paper}}]", r"grids/0: .* has no arguments \['fitt'\]; choose from"),
         ("grids: [{tasks: table I, evaluation_args: [{}, {imperfection: {delay: 2}}]}]", r"no arguments \['imperfection'\]"),
+        (
+            "grids: [{tasks: table I, task_args: {sensor_configs: {width: 2026-01-02}}}]",
+            "`task_args` has the wrong type: {'sensor_configs': {'width': datetime.date",
+        ),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1]}]\nresources: {training: {}}", "'training'.* are not known"),
         (
             "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {seed: 5}}]",
