@@ -1,6 +1,8 @@
 """Train any registered policy: `manifeel train diffusion_policy cpu --demo-path peg.h5`."""
 
 import sys
+from collections.abc import Iterable
+from difflib import get_close_matches
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -33,7 +35,7 @@ def check_arguments(arguments: list[str]) -> None:
         arguments: The command line after `manifeel train`.
 
     Raises:
-        InvalidArgumentError: The name of the policy or of the preset is missing.
+        InvalidArgumentError: The name of the policy or of the preset is missing or misspelt.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
     if {"-h", "--help"} & set(arguments) or policy.startswith("__tyro"):
@@ -41,11 +43,21 @@ def check_arguments(arguments: list[str]) -> None:
     if (spec := all_policies().get(policy)) is None:
         raise InvalidArgumentError(
             f"`manifeel train` needs the name of a policy before that of a preset; choose from {list(all_policies())}"
+            f"{_meant(policy, all_policies())}"
         )
     if preset in spec.presets:
         return
     choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
-    raise InvalidArgumentError(f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}")
+    raise InvalidArgumentError(
+        f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}"
+        f"{_meant(preset, spec.presets)}"
+    )
+
+
+def _meant(given: str, names: Iterable[str]) -> str:
+    """A question that names the choice nearest to what was given; "" if none is near."""
+    near = get_close_matches(given, list(names), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def main(args: TrainArgs) -> Path:

@@ -145,6 +145,19 @@ def test_training_without_a_policy_says_which_there_are(arguments, capsys):
     assert "needs the name of a policy before that of a preset; choose from ['diffusion_policy', 'equivariant_" in said
 
 
+@pytest.mark.parametrize(
+    ("given", "meant"),
+    [
+        (["diffusion_policy", "cpuu"], "cpu"),
+        (["flow_matching", "papre"], "paper"),
+        (["difusion_policy", "cpu"], "diffusion_policy"),
+    ],
+)
+def test_training_with_a_misspelt_name_says_which_is_near(given, meant, capsys):
+    assert cli.main(["train", *given, "--demos", "peg.h5"]) == 1
+    assert capsys.readouterr().err.splitlines()[0].endswith(f"; did you mean {meant!r}?")
+
+
 def test_an_unknown_observation_is_refused_before_a_process_is_started(tmp_path, capsys):
     out = tmp_path / "new" / "peg.h5"
     assert cli.main(["record", PEG, "-n", "1", "--obs-mode", "rgb+foo", "--out", str(out)]) == 1

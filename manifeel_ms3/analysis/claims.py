@@ -21,7 +21,7 @@ import tyro
 
 from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import run
-from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.evaluation.result import results_by_file
 from manifeel_ms3.files import write_text
 
 from .condition import Condition
@@ -42,7 +42,7 @@ NEAR_NO_SUCCESS = 0.1
 """Success below which two conditions decide nothing about a claim that there is no gain: both hardly learn the task."""
 MANY_TESTS = """Differences are in percentage points; "the paper" has its own. Interval, p and verdict are each of one
 comparison alone. A pair of which a condition has fewer than {seeds} training seeds has no verdict ("too few seeds"), since two
-runs that differ in their seed alone often differ as much; its interval is of these runs only. The table tests {count} pairs of
+runs that differ in their seed alone often differ as much; its interval is of these runs only. The table tests {pairs} of
 conditions, some of them for several claims, and of many tests, 5 % find a difference where there is none. The column "p, Holm"
 is corrected for all of them (Holm 1979): {remaining} of the {count} differences have a corrected p below 0.05.{reach}
 """
@@ -135,7 +135,8 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
     remaining = sum(p_holm < SIGNIFICANT for p_holm, _ in tested.values())
     halves = [50 * (change.high - change.low) for _, change in tested.values()]
     reach = REACH.format(points=median(halves)) if halves else ""
-    note = MANY_TESTS.format(seeds=FEWEST_SEEDS, count=len(tested), remaining=remaining, reach=reach)
+    pairs = "1 pair" if len(tested) == 1 else f"{len(tested)} pairs"
+    note = MANY_TESTS.format(seeds=FEWEST_SEEDS, pairs=pairs, count=len(tested), remaining=remaining, reach=reach)
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
 
 
@@ -187,7 +188,8 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
     """
     if args.out:
         require_file("--out", args.out, "claims.md")
-    collected = collect(results_in(*args.results))
+    by_file = results_by_file(*args.results)
+    collected = collect(by_file.values(), files=by_file)
     found = of_the_protocol(collected)
     for condition in set(collected) - set(found):
         log.warning("%s is left out: %s", condition, collected[condition].why_left_out)

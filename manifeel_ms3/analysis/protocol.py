@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import chain, repeat
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -70,26 +72,33 @@ class ConditionResults:
         return float(rates.std(ddof=1)) if len(rates) > 1 else None
 
 
-def collect(results: Iterable[dict[str, Any]], last: int = LAST) -> dict[Condition, ConditionResults]:
+def collect(
+    results: Iterable[dict[str, Any]], last: int = LAST, files: Iterable[Path] = ()
+) -> dict[Condition, ConditionResults]:
     """The results of each condition.
 
     Args:
         results: Contents of result files, one for each checkpoint.
         last: Largest number of checkpoints at the end of training that count.
+        files: Paths of the results in the same order, which the error about two results of one checkpoint then names.
 
     Raises:
         ResultError: The results of a condition are of different episodes, or two of them are of the same checkpoint.
     """
     found: dict[Condition, dict[int | None, dict[int, Outcomes]]] = {}
+    known: dict[tuple[Condition, int | None, int], Path | None] = {}
     planned: dict[Condition, int] = {}
     limits: dict[Condition, float] = {}
-    for result in results:
+    for result, file in zip(results, chain(files, repeat(None)), strict=False):
         outcomes = {episode["seed"]: episode for episode in result["episodes"]}
         condition, seed, step = condition_of(result), result["training_seed"], result["config"].get("step", 0)
         steps = found.setdefault(condition, {}).setdefault(seed, {})
         if step in steps:
-            raise ResultError(f"two results of {condition} are of training seed {seed} and step {step}; leave one of them out")
-        steps[step] = outcomes
+            both = f": {known[condition, seed, step]} and {file}" if file else ""
+            raise ResultError(
+                f"two results of {condition} are of training seed {seed} and step {step}{both}; leave one of them out"
+            )
+        steps[step], known[condition, seed, step] = outcomes, file
         if isinstance(total := result["config"].get("total_steps"), int):
             planned[condition] = max(planned.get(condition, 0), total)
         if (limit := result.get("force_limit")) is not None:

@@ -151,7 +151,7 @@ def main(args: Args) -> Path:
     require_file("--out", args.out, "results.md")
     by_file = results_by_file(*args.results)
     results = list(by_file.values())
-    collected = collect(results)
+    collected = collect(results, files=by_file)
     figures = _draw(args, results, of_the_protocol(collected))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities)))

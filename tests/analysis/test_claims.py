@@ -98,7 +98,7 @@ def test_one_pair_of_conditions_is_one_test_whatever_claims_rest_on_it(tmp_path)
     assert [claim[:2] for claim, _, _ in found] == ["2.", "8."]  # TacRGB helps, and does so from the front camera
     assert len({one.conditions for _, _, one in found}) == 1
     assert all(one.p_holm == one.p_value == found[0][2].p_value for _, _, one in found)
-    assert "The table tests 1 pairs" in " ".join(page_of(tmp_path).split())
+    assert "The table tests 1 pair of conditions" in " ".join(page_of(tmp_path).split())
 
 
 def test_the_page_says_what_touch_adds_to_vision(tmp_path):
@@ -194,13 +194,21 @@ def test_runs_of_other_purposes_are_listed_and_enter_nothing(tmp_path):
     assert "batch_size 16" not in tables
 
 
+def test_observations_are_the_same_in_whatever_order_they_are_named(tmp_path):
+    write_run(tmp_path, VISION, 0.4)
+    assert not answered(tmp_path)
+    write_run(tmp_path, "tacff+rgb", 0.6)
+    assert answered(tmp_path)
+
+
 def test_two_results_of_one_condition_seed_and_step_are_refused(tmp_path):
     write_run(tmp_path / "a", VISION, 0.4)
     write_run(tmp_path / "b", VISION, 0.6, run_dir="elsewhere", keep=3)  # the same policy, kept in another folder
     with pytest.raises(
         ResultError, match=r"two results of PegInsertion, rgb wrist, diffusion_policy, 50 .*seed 0 and step \d+"
-    ):
+    ) as refused:
         claims.main(claims.Args((tmp_path,)))
+    assert re.search(rf"step \d+: {tmp_path}/a/.*/(\d+\.json) and {tmp_path}/b/.*/\1; leave one", str(refused.value))
 
 
 @pytest.mark.parametrize(
