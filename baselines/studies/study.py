@@ -292,13 +292,13 @@ def _is_of(value: Any, annotation: Any) -> bool:
         return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
     if get_origin(annotation) is dict:
         return isinstance(value, dict) and all(isinstance(key, str) and _is_of(item, inner[1]) for key, item in value.items())
-    if annotation is Any and isinstance(value, list | dict):
-        return _is_of(value, list[Any] if isinstance(value, list) else dict[str, Any])
+    if annotation is Any:  # yaml also knows dates, bytes and sets, which no argument takes
+        if isinstance(value, list | dict):
+            return _is_of(value, list[Any] if isinstance(value, list) else dict[str, Any])
+        return value is None or isinstance(value, int | float | str)
     if isinstance(value, bool):  # which is an int, too
-        return annotation in (Any, bool)
-    if annotation is Any and not isinstance(value, int | float | str | None):  # yaml also knows dates, bytes and sets
-        return False
-    return annotation is Any or isinstance(value, int | float if annotation is float else annotation)
+        return annotation is bool
+    return isinstance(value, int | float if annotation is float else annotation)
 
 
 def _require_known(entry: dict[Any, Any], known: set[str], place: str) -> None:
