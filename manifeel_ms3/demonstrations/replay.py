@@ -19,7 +19,7 @@ from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
 from .formats.h5_checks import POSE_SIZE
-from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header
 
 log = logging.getLogger(__name__)
 POSITION, ROTATION = slice(0, 3), slice(3, POSE_SIZE)
@@ -112,7 +112,7 @@ def _recorded(path: Path, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str
     with open_trajectories(path) as file:
         group = group_of(file, episode)
         actors = group["env_states/actors"]
-        return group["actions"][()], {name: actors[name][-1] for name in actors}
+        return actions_of(file, episode), {name: actors[name][-1] for name in actors}
 
 
 def main(args: Args) -> int:

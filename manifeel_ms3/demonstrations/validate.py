@@ -46,13 +46,14 @@ def validate(path: Path, num_replays: int = 0) -> list[str]:
     Raises:
         DemonstrationError: The folder has no manifest that can be read.
     """
-    if Path(path).is_file():
-        return _problems_of_file(Path(path), {}, num_replays)
+    path = Path(path)
+    if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):  # a file that is missing is named as a file
+        return _problems_of_file(path, {}, num_replays)
     problems = []
-    folder, files = Path(path), read_manifest(path)["files"]
+    files = read_manifest(path)["files"]
     with progress_bar() as bar:
         for name, entry in bar.track(files.items(), description="checking"):
-            problems += [f"{name}: {problem}" for problem in _problems(folder, name, entry, num_replays)]
+            problems += [f"{name}: {problem}" for problem in _problems(path, name, entry, num_replays)]
     return problems
 
 

@@ -285,6 +285,11 @@ def test_set_without_manifest_says_what_writes_one(tmp_path):
         validate.validate(tmp_path)
 
 
+def test_a_file_that_is_missing_is_said_rather_than_a_manifest(tmp_path):
+    (problem,) = validate.validate(tmp_path / "absent.h5")
+    assert "absent.h5 does not exist" in problem
+
+
 def test_bad_arguments_say_what_is_wrong(tmp_path, folder, monkeypatch):
     with pytest.raises(ValueError, match="Juggling"):
         dataset.main(dataset.Args(tmp_path, ("ManiFeel-Juggling-v1",)))

@@ -11,7 +11,7 @@ import torch
 
 from baselines.common.dataset import read_episodes, recorded_env_kwargs, recorded_task
 from baselines.common.observation import observation_spec
-from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations
+from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations, replay
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
@@ -85,6 +85,16 @@ def test_an_episode_that_the_json_names_and_the_file_lacks_is_said(tmp_path):
     other.with_suffix(".json").write_bytes(SAMPLE.with_suffix(".json").read_bytes())
     with pytest.raises(DemonstrationError, match="lacks traj_1, which its json names"):
         read_demonstrations(other, KEYS)
+
+
+def test_a_json_of_another_recording_is_said(tmp_path):
+    copy = Path(shutil.copy(SAMPLE, tmp_path))
+    shutil.copy(observed_sample("ManiFeel-USBInsertion-v1").with_suffix(".json"), copy.with_suffix(".json"))
+    with pytest.raises(DemonstrationError, match=r"actions in traj_0, and its json says \d+: the two files are not of one"):
+        export.main(export.Args(copy, "npz", tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(DemonstrationError, match="the two files are not of one recording"):
+        replay.replay(copy, 1)
 
 
 def test_a_file_without_episodes_has_nothing_to_export(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
@@ -161,6 +162,25 @@ def group_of(file: Any, episode: dict[str, Any]) -> Any:
     return file[name]
 
 
+def actions_of(file: Any, episode: dict[str, Any]) -> np.ndarray:
+    """The actions (T, A) of an episode in an opened trajectory file.
+
+    Args:
+        file: The opened file.
+        episode: The episode's entry in the json.
+
+    Raises:
+        DemonstrationError: The file lacks the episode, or has another number of actions than its json says.
+    """
+    actions = group_of(file, episode)["actions"][()]
+    if len(actions) != episode["elapsed_steps"]:
+        raise DemonstrationError(
+            f"{file.filename} has {len(actions)} actions in traj_{episode['episode_id']}, and its json says "
+            f"{episode['elapsed_steps']}: the two files are not of one recording; copy both again"
+        )
+    return actions
+
+
 def _is_of_h5py(error: Exception) -> bool:
     """Whether h5py raised an error, as it does for damaged files, and not the code that works with what it read."""
     *_, (frame, _line) = traceback.walk_tb(error.__traceback__)
@@ -185,7 +205,8 @@ def read_demonstrations(
         progress: Wraps the iteration over episodes, to show a progress bar.
 
     Raises:
-        DemonstrationError: The file is missing, truncated or of another task, has fewer episodes, or lacks one of the keys.
+        DemonstrationError: The file is missing, truncated, of another task or another recording than its json, has fewer
+            episodes, or lacks one of the keys.
     """
     return list(read_trajectories(path, keys, num=num, progress=progress, env_id=env_id))
 
@@ -209,7 +230,8 @@ def read_trajectories(
         outcomes: Arrays (T,) of what followed the actions, such as "success", that are read where the file has them.
 
     Raises:
-        DemonstrationError: The file is missing, truncated or of another task, has fewer episodes, or lacks one of the keys.
+        DemonstrationError: The file is missing, truncated, of another task or another recording than its json, has fewer
+            episodes, or lacks one of the keys.
     """
     path = Path(path)
     header = read_header(path)
@@ -220,6 +242,8 @@ def read_trajectories(
             f"{path} holds {len(header['episodes'])} episodes, {count} are wanted; record more, or ask for fewer"
         )
     with open_trajectories(path) as file:
+        for entry in header["episodes"][:count]:
+            group_of(file, entry)  # an episode that is missing is said before any is read
         for i in progress(range(count)):
             entry = header["episodes"][i]
             yield _read_episode(file, entry, keys, path, header) | _outcomes(group_of(file, entry), outcomes)
@@ -260,7 +284,7 @@ def _read_episode(file: Any, entry: dict[str, Any], keys: list[str], path: Path,
             f"{path} was recorded with obs_mode={mode!r} and lacks {missing}; record it with an obs_mode, cameras and "
             "tactile_sensors that include them"
         )
-    episode = dict(actions=group["actions"][()]) | {key: group[f"obs/{key}"][()] for key in keys}
+    episode = dict(actions=actions_of(file, entry)) | {key: group[f"obs/{key}"][()] for key in keys}
     steps = len(episode["actions"])
     if wrong := [key for key in keys if episode[key].ndim < 2 or len(episode[key]) != steps + 1]:
         raise DemonstrationError(
