@@ -33,6 +33,9 @@ itself is not changed. All rows of a policy were evaluated on the same processor
 95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows
 of the policy (Holm 1979). One policy of each kind was tested: nothing here tells how other training seeds or tasks behave.
 The study `configs/perturbation.yaml` trains and evaluates policies of three tasks, with vision alone, TacRGB and TacFF.
+
+Touch does not make a policy robust that has only seen the usual appearance. In ObjectSearch, TacFF doubles success under the
+usual appearance (23 and 46 of 50 episodes), but under all changes together one episode succeeds with TacFF, and one without.
 """
 
 
