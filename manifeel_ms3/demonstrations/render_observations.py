@@ -30,7 +30,8 @@ from manifeel_ms3.workers import WorkerPool
 
 from .convert_actions import converted
 from .episode import run_episode
-from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header, task_of
+from .formats.folder_checks import require_revision
+from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header, task_of
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
 from .replay import pose_difference
 
@@ -72,7 +73,8 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
 
     Raises:
         InvalidArgumentError: The file to write is the file to read, or an argument is not allowed.
-        DemonstrationError: A trajectory file is missing or broken, was recorded with other arguments, or holds a seed twice.
+        DemonstrationError: A trajectory file is missing or broken, was recorded with other arguments or with another revision
+            of the task, or holds a seed twice.
         InUseError: Another process writes the file.
         WorkFailedError: A worker process died.
     """
@@ -80,7 +82,8 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     source = read_header(args.path)
     if args.path.resolve() == args.out.resolve():
         raise InvalidArgumentError(f"--out {args.out} is the file that is read; give another")
-    env_id, env_kwargs = task_of(source), _env_kwargs(args, source)
+    require_revision(args.path, env_id := task_of(source), source.get("revision"))
+    env_kwargs = _env_kwargs(args, source)
     header = make_header(env_id, env_kwargs) | _origin(source) | dict(failed_seeds=[])
     source_kwargs = None
     if args.control_mode is not None:
@@ -173,7 +176,7 @@ def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) ->
     """
     seed = recorded["episode_seed"]
     with open_trajectories(path) as file:
-        actions = group_of(file, recorded)["actions"][()]
+        actions = actions_of(file, recorded)
     source = recorder.source
     episode = run_episode(
         recorder.env, seed, lambda: actions if source is None else converted(actions, seed, source, recorder.env)

@@ -18,8 +18,9 @@ from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
+from .formats.folder_checks import require_revision
 from .formats.h5_checks import POSE_SIZE
-from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header
+from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header, task_of
 
 log = logging.getLogger(__name__)
 POSITION, ROTATION = slice(0, 3), slice(3, POSE_SIZE)
@@ -56,10 +57,11 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
         num: Number of episodes; all of them if not given.
 
     Raises:
-        DemonstrationError: The file is missing or broken.
+        DemonstrationError: The file is missing or broken, or of another revision of the task.
         UnknownNameError: The task of the file is not registered.
     """
     header = read_header(path)
+    require_revision(path, task_of(header), header.get("revision"))
     results = []
     with closing(_recorded_env(path, header)) as env, progress_bar() as bar:
         base: Any = env.unwrapped

@@ -25,6 +25,7 @@ import tyro
 
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.demonstrations.formats.folder_checks import require_revision
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Policy, PolicySource
@@ -149,7 +150,7 @@ def read_source(path: Path, episode: int) -> Source:
     """Find an episode in a trajectory file, or in a result of an evaluation.
 
     Raises:
-        DemonstrationError: The trajectory file, or its json, is missing or broken.
+        DemonstrationError: The trajectory file, or its json, is missing or broken, or another revision of the task was run.
         ResultError: The result is missing or broken.
         InvalidArgumentError: There is no such episode.
     """
@@ -161,6 +162,7 @@ def read_source(path: Path, episode: int) -> Source:
     if not 0 <= episode < count:
         raise InvalidArgumentError(f"--episode {episode}: {path} has the episodes 0 to {count - 1}")
     env_id = task_spec(about["env_id"]).env_id
+    require_revision(path, env_id, content.get("revision"))
     entry = content["episodes"][episode]
     return Source(path if is_result else recording, env_id, dict(about["env_kwargs"]), entry, content if is_result else None)
 

@@ -20,7 +20,7 @@ from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .folder_checks import broken_if_fails, read_origin, require_task
-from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
+from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories
 from .touch_units import recorded_units
 from .zarr_arrays import open_arrays
 
@@ -196,7 +196,7 @@ def _about(path: Path, keys: list[str]) -> dict[str, Any]:
     env_kwargs = header["env_info"]["env_kwargs"]
     units = recorded_units(env_kwargs, keys)
     same = len(set(units.values())) == 1
-    return dict(env_id=task_of(header), env_kwargs=env_kwargs, force_field_units=next(iter(units.values())) if same else units)
+    return about_task(header) | dict(force_field_units=next(iter(units.values())) if same else units)
 
 
 def _from_paper(key: str, values: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
+from manifeel_ms3.tasks.registry import task_spec
 
 from .demonstration_format import DemonstrationError
 
@@ -50,14 +51,41 @@ def read_origin(path: Path, schema: dict[str, Any], what: str, advice: str) -> d
 
 
 def require_task(path: Path, origin: dict[str, Any], env_id: str | None) -> None:
-    """Check that a file or folder is of a task, if one is asked for and it names its own.
+    """Check that a file or folder is of a task as it is now, if one is asked for and it names its own.
+
+    Args:
+        path: Path of the file or folder.
+        origin: What it says of its origin: `env_id` and `revision` of its task, either of which may be missing.
+        env_id: Id of the task that is asked for; any task in any revision if None.
 
     Raises:
-        DemonstrationError: It is of another task.
+        DemonstrationError: It is of another task, or of another revision of the task.
     """
-    if env_id not in (None, found := origin.get("env_id", env_id)):
+    if env_id is None:
+        return
+    if (found := origin.get("env_id", env_id)) != env_id:
         raise DemonstrationError(
             f"{path} holds demonstrations of {found}, not of {env_id}; ask for {found}, or give those of {env_id}"
+        )
+    require_revision(path, env_id, origin.get("revision"))
+
+
+def require_revision(path: Path, env_id: str, recorded: int | None) -> None:
+    """Check that a task has not changed since something was recorded of it.
+
+    Args:
+        path: Path of what was recorded, for the message.
+        env_id: Id of the task.
+        recorded: Revision of the task when it was recorded; None if that is not known, which passes.
+
+    Raises:
+        DemonstrationError: The task has another revision now.
+        UnknownNameError: The task is not registered.
+    """
+    if recorded not in (None, here := task_spec(env_id).revision):
+        raise DemonstrationError(
+            f"{path} was recorded with revision {recorded} of {env_id}, which is revision {here} here; record it again, or use "
+            "the version of manifeel-ms3 with which it was recorded"
         )
 
 

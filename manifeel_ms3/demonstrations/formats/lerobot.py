@@ -64,7 +64,7 @@ DESCRIPTION = {
 ABOUT = {
     "type": "object",
     "required": ["env_id", "env_kwargs"],
-    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}},
+    "properties": {"env_id": {"type": "string"}, "env_kwargs": {"type": "object"}, "revision": {"type": "integer"}},
 }
 """Json schema of meta/manifeel.json."""
 

@@ -19,7 +19,7 @@ from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
 from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
-from .maniskill_h5 import observation_keys, read_header, read_trajectories, task_of
+from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories, task_of
 
 FILES_PER_CHUNK = 1000
 """Number of files in a folder, lerobot's default."""
@@ -70,7 +70,7 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     write_json(folder / "meta/stats.json", {name: joined_statistics(name, entries) for name in writer.features})
     info = _info(writer, len(entries), start)
     (folder / CARD).write_text(card(header, keys, task, info), encoding="utf-8")
-    write_json(folder / ORIGIN, dict(env_id=task_of(header), env_kwargs=header["env_info"]["env_kwargs"]))
+    write_json(folder / ORIGIN, about_task(header))
     write_json(folder / INFO, info)  # last: a folder without it is not a dataset
 
 

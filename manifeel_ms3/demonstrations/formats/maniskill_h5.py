@@ -88,6 +88,16 @@ def task_of(header: dict[str, Any]) -> str:
     return header["env_info"]["env_id"].rpartition(":")[2]
 
 
+def about_task(header: dict[str, Any]) -> dict[str, Any]:
+    """Id, arguments and, if it is known, revision of the task of a trajectory file, as exported data sets hold them.
+
+    Args:
+        header: The json beside the file.
+    """
+    about = dict(env_id=task_of(header), env_kwargs=header["env_info"]["env_kwargs"])
+    return about | ({"revision": header["revision"]} if "revision" in header else {})
+
+
 def origins(header: dict[str, Any], name: str) -> list[Any]:
     """What a trajectory file says of its episodes' origin: the different values, in the order of the episodes.
 
@@ -226,7 +236,7 @@ def read_trajectories(
         keys: Observations to read.
         num: Number of episodes; all of them if not given.
         progress: Wraps the iteration over episodes, to show a progress bar.
-        env_id: Id of the task that the file must be of; any task if not given.
+        env_id: Id of the task that the file must be of, in its present revision; any task if not given.
         outcomes: Arrays (T,) of what followed the actions, such as "success", that are read where the file has them.
 
     Raises:
@@ -235,7 +245,7 @@ def read_trajectories(
     """
     path = Path(path)
     header = read_header(path)
-    require_task(path, dict(env_id=task_of(header)), env_id)
+    require_task(path, dict(env_id=task_of(header), revision=header.get("revision")), env_id)
     count = len(header["episodes"]) if num is None else num
     if not 0 < count <= len(header["episodes"]):
         raise DemonstrationError(
