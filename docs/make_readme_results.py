@@ -61,7 +61,7 @@ def block() -> str:
     conditions = {(task, mode): condition for task, (_, by_mode) in overview.items() for mode, condition in by_mode.items()}
     here = {place: found[condition] for place, condition in conditions.items()}
     gains = _corrected_gains(here)
-    trained = [result["config"] for result in results if condition_of(result) in conditions.values()]
+    trained = [result["config"] for result in results.values() if condition_of(result) in conditions.values()]
     minutes = [config["training_seconds"] / 60 for config in trained if "training_seconds" in config]
     text = TEXT.format(
         fastest=min(minutes),

@@ -21,7 +21,7 @@ import tyro
 
 from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import run
-from manifeel_ms3.evaluation.result import results_by_file
+from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
 from .condition import Condition
@@ -188,8 +188,7 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
     """
     if args.out:
         require_file("--out", args.out, "claims.md")
-    by_file = results_by_file(*args.results)
-    collected = collect(by_file.values(), files=by_file)
+    collected = collect(results_in(*args.results))
     found = of_the_protocol(collected)
     for condition in set(collected) - set(found):
         log.warning("%s is left out: %s", condition, collected[condition].why_left_out)

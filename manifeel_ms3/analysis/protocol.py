@@ -1,8 +1,7 @@
 """The paper's protocol: success is the mean over the last ten checkpoints, all episodes and training seeds of a condition."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import chain, repeat
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -72,33 +71,30 @@ class ConditionResults:
         return float(rates.std(ddof=1)) if len(rates) > 1 else None
 
 
-def collect(
-    results: Iterable[dict[str, Any]], last: int = LAST, files: Iterable[Path] = ()
-) -> dict[Condition, ConditionResults]:
+def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Condition, ConditionResults]:
     """The results of each condition.
 
     Args:
-        results: Contents of result files, one for each checkpoint.
+        results: Contents of result files by their paths, one for each checkpoint.
         last: Largest number of checkpoints at the end of training that count.
-        files: Paths of the results in the same order, which the error about two results of one checkpoint then names.
 
     Raises:
         ResultError: The results of a condition are of different episodes, or two of them are of the same checkpoint.
     """
     found: dict[Condition, dict[int | None, dict[int, Outcomes]]] = {}
-    known: dict[tuple[Condition, int | None, int], Path | None] = {}
+    files: dict[tuple[Condition, int | None, int], Path] = {}
     planned: dict[Condition, int] = {}
     limits: dict[Condition, float] = {}
-    for result, file in zip(results, chain(files, repeat(None)), strict=False):
+    for path, result in results.items():
         outcomes = {episode["seed"]: episode for episode in result["episodes"]}
         condition, seed, step = condition_of(result), result["training_seed"], result["config"].get("step", 0)
         steps = found.setdefault(condition, {}).setdefault(seed, {})
         if step in steps:
-            both = f": {known[condition, seed, step]} and {file}" if file else ""
             raise ResultError(
-                f"two results of {condition} are of training seed {seed} and step {step}{both}; leave one of them out"
+                f"two results of {condition} are of training seed {seed} and step {step}: {files[condition, seed, step]} and "
+                f"{path}; leave one of them out"
             )
-        steps[step], known[condition, seed, step] = outcomes, file
+        steps[step], files[condition, seed, step] = outcomes, path
         if isinstance(total := result["config"].get("total_steps"), int):
             planned[condition] = max(planned.get(condition, 0), total)
         if (limit := result.get("force_limit")) is not None:

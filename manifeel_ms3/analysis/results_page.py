@@ -20,7 +20,7 @@ from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
 from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
-from manifeel_ms3.evaluation.result import ResultError, results_by_file, successes_by_the_paper
+from manifeel_ms3.evaluation.result import ResultError, results_in, successes_by_the_paper
 from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.tasks.registry import all_tasks
@@ -149,23 +149,23 @@ def main(args: Args) -> Path:
         ResultError: There is no result, or one is broken.
     """
     require_file("--out", args.out, "results.md")
-    by_file = results_by_file(*args.results)
+    by_file = results_in(*args.results)
     results = list(by_file.values())
-    collected = collect(results, files=by_file)
-    figures = _draw(args, results, of_the_protocol(collected))
+    collected = collect(by_file)
+    figures = _draw(args, by_file, of_the_protocol(collected))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
     write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities)))
     return args.out
 
 
-def _draw(args: Args, results: list[dict[str, Any]], found: Found) -> Figures:
+def _draw(args: Args, by_file: Mapping[Path, dict[str, Any]], found: Found) -> Figures:
     """Draw the figures of the page, those for which there are results."""
     folder, stem = args.out.parent / IMAGES, args.out.stem
     loss, success = folder / f"{stem}.png", folder / f"{stem}_success.png"
     sensing, gentle = folder / f"{stem}_sensing.png", folder / f"{stem}_gentle.png"
     drawn = {
         loss: training_curves(args.results, loss) or loss.is_file(),
-        success: write_curves(results, success, success.with_suffix(".csv")),
+        success: write_curves(by_file, success, success.with_suffix(".csv")),
         sensing: draw_sensing_by_task(found, sensing),
         gentle: draw_success_under_force(found, gentle),
     }

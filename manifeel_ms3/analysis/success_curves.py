@@ -7,7 +7,7 @@ epoch; samples are therefore no environment steps.
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,19 +52,19 @@ class Point:
     """Number of evaluation episodes of each training seed."""
 
 
-def success_curves(results: Sequence[dict[str, Any]]) -> dict[Condition, list[Point]]:
+def success_curves(results: Mapping[Path, dict[str, Any]]) -> dict[Condition, list[Point]]:
     """The success of each condition after each number of gradient steps that has results; two such numbers make a curve.
 
     Args:
-        results: Contents of result files.
+        results: Contents of result files by their paths.
 
     Raises:
         ResultError: Two results are of the same checkpoint, or of different initial states.
     """
-    by_step: dict[Condition, dict[int, list[dict[str, Any]]]] = {}
-    for result in results:
+    by_step: dict[Condition, dict[int, dict[Path, dict[str, Any]]]] = {}
+    for path, result in results.items():
         if isinstance(step := result["config"].get("step"), int):
-            by_step.setdefault(condition_of(result), {}).setdefault(step, []).append(result)
+            by_step.setdefault(condition_of(result), {}).setdefault(step, {})[path] = result
     return {
         condition: [_point(step, here) for step, here in sorted(steps.items())]
         for condition, steps in by_step.items()
@@ -72,9 +72,9 @@ def success_curves(results: Sequence[dict[str, Any]]) -> dict[Condition, list[Po
     }
 
 
-def _point(step: int, results: list[dict[str, Any]]) -> Point:
+def _point(step: int, results: dict[Path, dict[str, Any]]) -> Point:
     (evaluated,) = collect(results).values()
-    samples = samples_per_step(results[0]["config"])
+    samples = samples_per_step(next(iter(results.values()))["config"])
     seeds, _, episodes = evaluated.success.shape
     return Point(step, None if samples is None else step * samples, mean_success(evaluated), seeds, episodes)
 
@@ -100,11 +100,11 @@ def curve_table(curves: dict[Condition, list[Point]]) -> str:
     return out.getvalue()
 
 
-def write_curves(results: Sequence[dict[str, Any]], figure: Path, table: Path) -> bool:
+def write_curves(results: Mapping[Path, dict[str, Any]], figure: Path, table: Path) -> bool:
     """Draw the curves, with one panel for each task, and write their table.
 
     Args:
-        results: Contents of result files.
+        results: Contents of result files by their paths.
         figure: Path of the figure.
         table: Path of the csv file.
 

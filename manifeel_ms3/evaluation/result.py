@@ -162,19 +162,11 @@ def read_result(path: Path) -> dict[str, Any]:
     return result
 
 
-def results_in(*folders: Path) -> list[dict[str, Any]]:
-    """The results of all checkpoints in some folders: files named by the gradient step, such as 00002000.json.
+def results_in(*folders: Path) -> dict[Path, dict[str, Any]]:
+    """The results of all checkpoints in some folders, by the paths of their files.
 
-    Raises:
-        ResultError: There is no result, or one is broken.
-    """
-    return list(results_by_file(*folders).values())
-
-
-def results_by_file(*folders: Path) -> dict[Path, dict[str, Any]]:
-    """The results that `results_in` returns, by the paths of their files.
-
-    Hidden folders are left out, such as one that a killed process was copying results into.
+    Such a file is named by the gradient step, such as 00002000.json. Hidden folders are left out, such as one that a killed
+    process was copying results into.
 
     Raises:
         ResultError: There is no result, or one is broken.

@@ -90,7 +90,7 @@ def rows_of(submission: Submission) -> list[Row]:
     rows, by_condition = [], dict[Condition, dict[Path, dict[str, Any]]]()
     for path, result in submission.results.items():
         by_condition.setdefault(condition_of(result), {})[path] = result
-    for condition, results in collect(submission.results.values(), files=submission.results).items():
+    for condition, results in collect(submission.results).items():
         files, episodes = by_condition[condition], results.episodes
         latency = float(np.median([episode["inference_ms"] for episode in episodes]))
         force = float(np.median([episode["peak_contact_force"] for episode in episodes]))

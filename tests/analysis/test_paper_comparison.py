@@ -15,5 +15,5 @@ def test_minutes_of_an_epoch_count_the_samples_of_all_processes(processes, minut
         num_samples=24_000, batch_size=8, training_seconds=float(TOTAL_STEPS), trained_on=dict(gpu="A30", cpu="EPYC", cores=16)
     )
     write_run(tmp_path, TACRGB, 0.5, task="BallSorting", checkpoints=1, num_demos=RUNTIME_DEMOS, **timed, **processes)
-    (row,) = (line for line in runtime_table(results_in(tmp_path)).splitlines() if "A30 |" in line)
+    (row,) = (line for line in runtime_table(list(results_in(tmp_path).values())).splitlines() if "A30 |" in line)
     assert [cell.strip() for cell in row.split("|")][3:6] == [minutes, rate, "A30"]

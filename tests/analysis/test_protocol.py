@@ -76,12 +76,12 @@ def test_the_endings_of_the_last_checkpoints_are_counted(tmp_path):
             for k in (0, 2):  # the first one succeeds in the last checkpoints
                 result["episodes"][k]["peak_contact_force"] = 1000.0
             path.write_text(json.dumps(result))
-    results = results_in(tmp_path)
-    *_, row = census_table(results, list(collect(results))).splitlines()
+    conditions, results = list(collect(results_in(tmp_path))), list(results_in(tmp_path).values())
+    *_, row = census_table(results, conditions).splitlines()
     assert row.endswith("| 6 | 2 | 2 lost, 2 beside or above the hole | 2 |")
     for result in results:
         del result["episodes"][0]["ending"]
-    assert census_table(results, list(collect(results))) == ""
+    assert census_table(results, conditions) == ""
 
 
 def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
