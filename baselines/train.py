@@ -1,8 +1,6 @@
 """Train any registered policy: `manifeel train diffusion_policy cpu --demo-path peg.h5`."""
 
 import sys
-from collections.abc import Iterable
-from difflib import get_close_matches
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -12,6 +10,7 @@ import tyro
 
 from baselines.common.train_args import TrainArgs
 from baselines.registry import PolicySpec, all_policies, next_step
+from manifeel_ms3.arguments import meant
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
 
@@ -43,21 +42,15 @@ def check_arguments(arguments: list[str]) -> None:
     if (spec := all_policies().get(policy)) is None:
         raise InvalidArgumentError(
             f"`manifeel train` needs the name of a policy before that of a preset; choose from {list(all_policies())}"
-            f"{_meant(policy, all_policies())}"
+            f"{meant(policy, all_policies())}"
         )
     if preset in spec.presets:
         return
     choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
     raise InvalidArgumentError(
         f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}"
-        f"{_meant(preset, spec.presets)}"
+        f"{meant(preset, spec.presets)}"
     )
-
-
-def _meant(given: str, names: Iterable[str]) -> str:
-    """A question that names the choice nearest to what was given; "" if none is near."""
-    near = get_close_matches(given, list(names), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def main(args: TrainArgs) -> Path:

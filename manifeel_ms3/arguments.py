@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,6 +24,12 @@ def one_of(name: str, given: T, allowed: Iterable[T]) -> T:
     if given not in list(allowed):
         raise InvalidArgumentError(f"{name}={given!r} is unknown; choose from {list(allowed)}")
     return given
+
+
+def meant(given: str, names: Iterable[str]) -> str:
+    """The end of an error about an unknown name: a question with the nearest of the names; "" if none is near."""
+    near = get_close_matches(given, list(names), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def several_of(name: str, given: Any, allowed: Iterable[str]) -> tuple[str, ...]:

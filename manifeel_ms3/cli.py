@@ -13,7 +13,6 @@ completion, which needs the flags of all commands.
 import logging
 import sys
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cache, reduce
 from importlib import import_module
 from importlib.metadata import version
@@ -23,6 +22,7 @@ from typing import Annotated, Any
 import tyro
 
 from manifeel_ms3 import plugins
+from manifeel_ms3.arguments import meant
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import PluginError, UnknownNameError
 from manifeel_ms3.plugins import Command
@@ -106,9 +106,9 @@ def _run(arguments: list[str]) -> Any:
             log.info("%s", module.next_step(args, answer))
         return answer
     if arguments and not arguments[0].startswith("-"):
-        near = get_close_matches(arguments[0], commands, n=1)
-        meant = f" (did you mean {near[0]!r}?)" if near else ""
-        raise UnknownNameError(f"{arguments[0]!r} is not a command{meant}; choose from {list(commands)}")
+        raise UnknownNameError(
+            f"{arguments[0]!r} is not a command; choose from {list(commands)}{meant(arguments[0], commands)}"
+        )
     completion = any("-completion" in argument for argument in arguments)
     forms: list[Any] = [
         Annotated[

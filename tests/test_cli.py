@@ -290,7 +290,9 @@ def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):
         cli.main(["record", PEG, "--obs-moed", "tacff"])
     assert "--obs-mode" in capsys.readouterr().err
     assert cli.main(["recrod", PEG]) == 1
-    assert "'recrod' is not a command (did you mean 'record'?); choose from ['tasks'" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "'recrod' is not a command; choose from ['tasks'" in said
+    assert "]; did you mean 'record'?" in said
     assert cli.main(["record", PEG, "-n", "0"]) == 1
     assert "--num-demos 0: at least 1" in capsys.readouterr().err
     assert cli.main(["--version"]) == 0

@@ -184,7 +184,7 @@ def test_the_commands_of_a_page_run_one_after_the_other(page, shelf, tmp_path):
         (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(REPOSITORY / file, tmp_path / file)
     for study in (tmp_path / "configs").glob("*.yaml"):
-        study.write_text(TINY)  # the real ones are hours; tests/baselines/test_studies.py plans them
+        study.write_text(TINY)  # the real ones are hours; tests/baselines/test_study_planning.py plans them
     (tmp_path / ".venv").symlink_to(sys.prefix)
     shown = commands(page)
     for thing in shelf.iterdir():

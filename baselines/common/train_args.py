@@ -12,7 +12,7 @@ from tyro.conf import arg
 from manifeel_ms3.arguments import is_number, require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode
+from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode, check_seed
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
 from .observation import CameraView, PoseForm
@@ -157,6 +157,8 @@ def check_run(args: TrainArgs) -> None:
     """
     require_positive(
         num_demos=args.num_demos,
+        image_size=args.image_size,
+        tactile_image_size=args.tactile_image_size,
         batch_size=args.batch_size,
         total_iters=args.steps,
         epochs=args.epochs,
@@ -170,6 +172,7 @@ def check_run(args: TrainArgs) -> None:
         log_freq=args.log_freq,
     )
     require_not_negative(seed=args.seed, warmup_steps=args.warmup_steps)
+    check_seed(args.seed)
     if args.lr is not None and not (is_number(args.lr) and args.lr >= 0):
         raise InvalidArgumentError(f"--lr {args.lr} must be a number of at least 0")
     if args.inference_steps < (least := args.policy.least_inference_steps):

@@ -9,6 +9,7 @@ from typing import Any
 
 from baselines.common.train_args import check_run
 from baselines.registry import policy_spec, preset_cli
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.paths import CHECKPOINTS
 
 from .planning import Job
@@ -80,8 +81,8 @@ def require_valid_flags(jobs: Iterable[Job]) -> None:
     """Check that `manifeel train` takes the flags of every training of a study, before the first job begins.
 
     Raises:
-        StudyError: A flag is not known, or its value is not one that it takes; the parser's own message names it on stderr.
-        InvalidArgumentError: Two settings of a run contradict each other.
+        StudyError: A flag is not known, or its value is not one that it takes, in which case the parser's own message names it
+            on stderr; or two settings of a run contradict each other.
     """
     checked = set()
     for job in (job for job in jobs if job.kind == "train"):
@@ -97,6 +98,8 @@ def require_valid_flags(jobs: Iterable[Job]) -> None:
                 f"{job.title}: `manifeel train {policy}` does not take one of its flags, {of_the_grid}; correct `train` or "
                 "`encoder_flags` in the study's file"
             ) from error
+        except InvalidArgumentError as error:
+            raise StudyError(f"{job.title}: {error}; correct `train` or `encoder_flags` in the study's file") from error
 
 
 def half_precision_arguments(checkpoint: str, copy: str) -> list[str]:

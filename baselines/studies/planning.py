@@ -15,7 +15,7 @@ from manifeel_ms3.command_line import PACKAGE
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
-from .study import Grid, Kind, Study, StudyError
+from .study import Grid, Kind, Study
 
 OF_THE_MACHINE = ("device", "precision", "compile")
 """Settings of a preset that depend on the machine on which it is read."""
@@ -112,13 +112,7 @@ def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num
 
 @cache
 def _hash_of_preset(policy: str, preset: str) -> str:
-    """Hash of a preset's settings, so that a run that was made before the preset changed counts as another run.
-
-    Raises:
-        StudyError: The policy has no such preset.
-    """
-    presets = policy_spec(policy).presets
-    if preset not in presets:
-        raise StudyError(f"the policy {policy} has no preset {preset!r}; choose from {list(presets)}")
-    settings = {name: value for name, value in as_json(presets[preset].args).items() if name not in OF_THE_MACHINE}
+    """Hash of a preset's settings, so that a run that was made before the preset changed counts as another run."""
+    args = as_json(policy_spec(policy).presets[preset].args)
+    settings = {name: value for name, value in args.items() if name not in OF_THE_MACHINE}
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]

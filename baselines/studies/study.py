@@ -12,10 +12,10 @@ from baselines.common.encoders import TACRGB_ENCODERS
 from baselines.common.train_args import TrainArgs
 from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
-from manifeel_ms3.arguments import several_of
+from manifeel_ms3.arguments import one_of, several_of
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import SHOWN_LENGTH
-from manifeel_ms3.tasks.checks import check_argument_names
+from manifeel_ms3.tasks.checks import check_argument_names, check_seed
 from manifeel_ms3.tasks.obs_modes import in_usual_order, split_obs_mode
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS
@@ -204,8 +204,9 @@ def _grid(entry: Any, place: str) -> Grid:
             names = grid.task_args.keys() | set().union(*grid.evaluation_args)
             check_argument_names(task_spec(task).env_class, names - {"max_episode_steps"})  # which gym.make takes
         for policy in grid.policies:
-            policy_spec(policy)
+            one_of(f"preset of {policy}", grid.preset, policy_spec(policy).presets)
         _check_sensing(grid)
+        check_seed(grid.seeds)
         train = _train_flags(grid.train, f"{place}: train")
         of_encoders = {
             name: _train_flags(flags, f"{place}: encoder_flags/{name}") for name, flags in grid.encoder_flags.items()
