@@ -13,7 +13,7 @@ from rich.table import Table
 from manifeel_ms3.arguments import require_not_negative
 from manifeel_ms3.command_line import run
 
-from .formats.maniskill_h5 import group_of, open_trajectories, origins, read_header, task_of
+from .formats.maniskill_h5 import group_of, open_trajectories, origins, read_header, task_of, versions_of
 
 BARS = " ▁▂▃▄▅▆▇█"
 """Characters of a sparkline, from the lowest level to the highest: Unicode's eighths of a block."""
@@ -91,9 +91,11 @@ def _file_table(path: Path, header: dict) -> Table:
     lengths = np.array([episode["elapsed_steps"] for episode in episodes] or [0])
     successes = sum(bool(episode["success"]) for episode in episodes)
     table = Table(title=str(path), show_header=False)
-    table.add_row("task", task_of(header))
+    table.add_row("task", f"{task_of(header)}, revision {header.get('revision', 'not known')}")
     table.add_row("observations", str(env["env_kwargs"].get("obs_mode")))
     table.add_row("source", ", ".join(map(str, origins(header, "source_type"))))
+    versions = versions_of(header) or {}
+    table.add_row("recorded with", ", ".join(f"{name} {number}" for name, number in versions.items()) or "not known")
     table.add_row(
         "episodes", f"{len(episodes)}, {successes} successes, {len(header.get('failed_seeds', []))} seeds that failed"
     )

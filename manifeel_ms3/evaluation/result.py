@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -201,11 +202,16 @@ def check_result(result: Any, source: Path) -> None:
             f"{source} has the schema {given!r}, this version reads {RESULT_SCHEMA!r}; evaluate the policy again, or update "
             "manifeel-ms3"
         )
-    for error in jsonschema.Draft202012Validator(result_schema()).iter_errors(result):
+    for error in _validator().iter_errors(result):
         place = "/".join(str(part) for part in error.absolute_path) or "the whole file"
         raise ResultError(f"{source} is not a result: {place}: {error.message[:LONGEST_MESSAGE]}")
     if place := not_finite(result):
         raise ResultError(f"{source} is not a result: {place}: it is NaN or infinite; all numbers of a result are finite")
+
+
+@cache
+def _validator() -> jsonschema.Draft202012Validator:
+    return jsonschema.Draft202012Validator(result_schema())
 
 
 def result_schema() -> dict[str, Any]:

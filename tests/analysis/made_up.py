@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from baselines.registry import policy_spec
 from manifeel_ms3.analysis import results_page
-from manifeel_ms3.evaluation.result import result_of
+from manifeel_ms3.evaluation.result import provenance, result_of
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import evaluation_seeds, full_id, task_spec
 from tests.outcomes import made_up
@@ -64,4 +65,10 @@ def write_run(
         outcomes = [made_up(one, bool(win)) for one, win in zip(seeds, won, strict=True)]
         path = folder / str(rng.integers(1 << 62)) / f"evaluations/{step:08d}.json"
         path.parent.mkdir(parents=True)
-        path.write_text(json.dumps(result_of(full_id(task), kwargs, config | dict(step=step), outcomes)))
+        path.write_text(json.dumps(result_of(full_id(task), kwargs, config | dict(step=step), outcomes, origin=_origin(task))))
+
+
+@cache
+def _origin(task: str) -> dict[str, Any]:
+    """Where the results come from; git is asked once for all of them."""
+    return provenance(full_id(task))

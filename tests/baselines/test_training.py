@@ -130,7 +130,7 @@ def test_checkpoints_are_json_and_safetensors(run, checkpoint):
 
 
 def test_only_the_last_checkpoints_are_kept(run, tmp_path):
-    run.again(run_dir=tmp_path, steps=20, save_freq=4, keep=3)
+    run.again(run_dir=tmp_path, steps=20, batch_size=4, save_freq=4, keep=3)
     kept = sorted(path.name for path in (tmp_path / "checkpoints").iterdir())
     assert kept == ["00000012", "00000016", "00000020", "last"]
 
@@ -177,7 +177,7 @@ def test_a_policy_of_several_segments_is_not_evaluated_with_fewer_steps(run, che
 def test_the_seed_fixes_everything(run, tmp_path):
     losses = []
     for name, seed in (("first", 0), ("same", 0), ("other", 1)):
-        run.again(run_dir=tmp_path / name, seed=seed, steps=30)
+        run.again(run_dir=tmp_path / name, seed=seed, steps=30, batch_size=4)
         losses.append(log_of(tmp_path / name)[0]["losses/total_loss"])
     assert losses[0] == losses[1] != losses[2]
 
@@ -197,7 +197,7 @@ def test_resume_without_a_checkpoint(run, tmp_path):
 
 def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_path):
     with pytest.raises(TrainingError, match=r"the loss of step \d+ is (nan|inf), on episode \d step \d+, .*--lr"):
-        run.again(run_dir=tmp_path, lr=1e30, save_freq=10, log_freq=10)
+        run.again(run_dir=tmp_path, lr=1e30, batch_size=4, save_freq=10, log_freq=10)
     weights = sorted((tmp_path / "checkpoints").glob("*/model.safetensors"))
     assert all(torch.isfinite(tensor).all() for path in weights for tensor in read_tensors(path).values())
 
@@ -205,7 +205,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_names_its_batch(run, tmp_pat
 @pytest.mark.parametrize("run", QUICK, indirect=True)
 def test_bf16_agrees_with_fp32(run, tmp_path):
     for precision in ("bf16", "fp32"):
-        run.again(run_dir=tmp_path / precision, precision=precision, steps=30, log_freq=10)
+        run.again(run_dir=tmp_path / precision, precision=precision, steps=30, batch_size=8, log_freq=10)
     halves, wholes = ([entry["losses/total_loss"] for entry in log_of(tmp_path / name)] for name in ("bf16", "fp32"))
     assert halves == pytest.approx(wholes, rel=0.1, abs=1e-3)
     assert max(abs(half - whole) / whole for half, whole in zip(halves, wholes, strict=True)) > 1e-5  # a bf16 has 8 bits

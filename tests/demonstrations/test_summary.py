@@ -27,6 +27,8 @@ def test_it_counts_what_is_there():
     episodes = read_header(SAMPLE)["episodes"]
     with open_trajectories(SAMPLE) as file:
         forces = [file[f"traj_{i}/contact_force"][()] for i in range(len(episodes))]
+    assert f"{PEG}, revision {read_header(SAMPLE)['revision']} " in told
+    assert f"manifeel-ms3 {read_header(SAMPLE)['versions']['manifeel-ms3']}, " in told
     assert f"{len(episodes)}, {len(episodes)} successes, 0 seeds that failed" in told
     assert f"{sum(episode['elapsed_steps'] for episode in episodes)} in all" in told
     assert all(f"{force.max():.1f}" in told for force in forces)
