@@ -157,6 +157,7 @@ def _start_ray(address: str | None) -> None:
         ray_constants.ENABLE_RAY_CLUSTER = False  # else it replaces 127.0.0.1 by this machine's outer address, except on macOS
         os.environ.pop("RAY_AUTH_MODE", None)  # if it is not set, a Ray that is started here asks for a token
         os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        logging.getLogger("ray._private.authentication").setLevel(logging.ERROR)  # it would say that Ray asks for a token
         for name, value in RAY_SETTINGS.items():
             os.environ.setdefault(name, value)
     here = Path.cwd()
@@ -209,6 +210,8 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
                 for result in ended:
                     del running[result]
                 live.update(progress(study, jobs, root))
+        if not console.is_terminal:
+            console.print()  # rich ends the table's last line in a terminal alone
         return {key: error for key, result in results.items() if (error := _error(result))}
     finally:
         ray.shutdown()
