@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from manifeel_ms3 import cli
+from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.videos import layout
 from manifeel_ms3.videos.__main__ import read_source
 from manifeel_ms3.videos.shots import Shot, Take, shown_steps
@@ -132,15 +134,27 @@ def test_an_export_is_not_taken_for_the_recording_beside_it(tmp_path, capsys):
     assert read_source(tmp_path / "peg.json", 0).path == tmp_path / "peg.h5"
 
 
+def copy_of_result(folder: Path, revision: int) -> Path:
+    """A copy of a result that says this revision of its task."""
+    result = json.loads(Path("tests/trust/result.json").read_text())
+    path = folder / "evaluation.json"
+    path.write_text(json.dumps(result | dict(revision=revision)))
+    return path
+
+
 def test_a_result_without_its_policy_says_what_to_give(tmp_path, capsys):
-    shutil.copy("tests/trust/result.json", tmp_path / "evaluation.json")
-    assert cli.main(["film", str(tmp_path / "evaluation.json")]) == 1
+    assert cli.main(["film", str(copy_of_result(tmp_path, task_spec(PEG).revision))]) == 1
     assert "give its --checkpoint or --policy" in capsys.readouterr().err
 
 
+def test_a_result_of_an_earlier_revision_of_its_task_is_not_run_again(tmp_path):
+    path = copy_of_result(tmp_path, here := task_spec(PEG).revision - 1)
+    with pytest.raises(DemonstrationError, match=f"it is of revision {here} of {PEG}, but the task has revision {here + 1}"):
+        read_source(path, 0)
+
+
 def test_a_result_names_the_seed_and_the_length_of_an_episode(tmp_path):
-    path = tmp_path / "evaluation.json"
-    shutil.copy("tests/trust/result.json", path)
+    path = copy_of_result(tmp_path, task_spec(PEG).revision)
     episodes = json.loads(path.read_text())["episodes"]
     source = read_source(path, len(episodes) - 1)
     assert (source.seed, source.length) == (episodes[-1]["seed"], episodes[-1]["episode_len"])

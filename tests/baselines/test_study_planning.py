@@ -305,7 +305,7 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ),
         (
             "grids: [{tasks: table I, preset: fast}]",
-            r"study.yaml: grids/0: preset of diffusion_policy='fast' is unknown; choose from \['paper', 'cpu'",
+            r"tiny\.yaml: grids/0: preset of diffusion_policy='fast' is unknown; choose from \['paper', 'cpu'",
         ),
         ("grids: [{tasks: table I, seeds: [0, 1099511627776]}]", r"seed=\(0, 1099511627776\) must be a whole number from 0"),
         ("grids: [{tasks: [ManiFeel-PegInsertion-v1], num_demos: [900]}]", r"num_demos \[900\] are more than the 50 recorded"),

@@ -22,7 +22,7 @@ from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG
 
 HERE = task_spec(PEG).revision
-REFUSED = rf"recorded with revision {HERE - 1} of {PEG}, which is revision {HERE} here; record it again"
+REFUSED = rf"it is of revision {HERE - 1} of {PEG}, but the task has revision {HERE} here; make it again"
 
 
 def copy_of(path: Path, folder: Path, revision: int | None) -> Path:

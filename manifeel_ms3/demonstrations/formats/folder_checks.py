@@ -71,12 +71,12 @@ def require_task(path: Path, origin: dict[str, Any], env_id: str | None) -> None
 
 
 def require_revision(path: Path, env_id: str, recorded: int | None) -> None:
-    """Check that a task has not changed since something was recorded of it.
+    """Check that a task has not changed since it was recorded or evaluated.
 
     Args:
-        path: Path of what was recorded, for the message.
+        path: Path of the recording or the result, for the message.
         env_id: Id of the task.
-        recorded: Revision of the task when it was recorded; None if that is not known, which passes.
+        recorded: Revision of the task at that time; None if that is not known, which passes.
 
     Raises:
         DemonstrationError: The task has another revision now.
@@ -84,8 +84,8 @@ def require_revision(path: Path, env_id: str, recorded: int | None) -> None:
     """
     if recorded not in (None, here := task_spec(env_id).revision):
         raise DemonstrationError(
-            f"{path} was recorded with revision {recorded} of {env_id}, which is revision {here} here; record it again, or use "
-            "the version of manifeel-ms3 with which it was recorded"
+            f"{path}: it is of revision {recorded} of {env_id}, but the task has revision {here} here; make it again, or use "
+            "the version of manifeel-ms3 that made it"
         )
 
 
