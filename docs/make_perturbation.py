@@ -33,8 +33,10 @@ itself is not changed. All rows of a policy were evaluated on the same processor
 of the policy (Holm 1979). One policy of each kind was tested: nothing here tells how other training seeds or tasks behave.
 The study `configs/perturbation.yaml` trains and evaluates policies of three tasks, with vision alone, TacRGB and TacFF.
 
-Touch does not make a policy robust that has only seen the usual appearance. In ObjectSearch, TacFF doubles success under the
-usual appearance (23 and 46 of 50 episodes), but under all changes together one episode succeeds with TacFF, and one without.
+Touch does not make a policy robust that has only seen the usual appearance. In ObjectSearch, touch doubles success under the
+usual appearance: 23 of 50 episodes succeed with vision alone, 46 with TacFF and 48 with TacRGB. Under all changes together, one
+episode succeeds with each of the three. Light from another direction is enough for that: two or three episodes succeed with
+each. Brighter or darker light is not: 30, 45 and 37 episodes succeed.
 """
 
 
