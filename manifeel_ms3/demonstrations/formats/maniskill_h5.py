@@ -245,7 +245,7 @@ def read_trajectories(
     """
     path = Path(path)
     header = read_header(path)
-    require_task(path, dict(env_id=task_of(header), revision=header.get("revision")), env_id)
+    require_task(path, about_task(header), env_id)
     count = len(header["episodes"]) if num is None else num
     if not 0 < count <= len(header["episodes"]):
         raise DemonstrationError(
