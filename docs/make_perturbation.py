@@ -6,6 +6,7 @@ makes.
 """
 
 from pathlib import Path
+from typing import Any
 
 from manifeel_ms3.analysis.estimates import difference, holm, mean_success, p_text
 from manifeel_ms3.analysis.markdown import markdown_table
@@ -49,13 +50,13 @@ def page() -> str:
 
 def _table(folder: Path) -> str:
     """The table of one policy, whose results lie in a folder."""
-    usual = _of(folder / USUAL)
+    usual = _of(folder / USUAL, read_result(folder / USUAL))
     rows: list[tuple[str, ...]] = []
     p_values: list[float] = []
     for path in sorted(set(folder.glob("*.json")) - {folder / USUAL}):
-        change, p_value = difference(here := _of(path), usual)
-        half_ranges = read_result(path)["env_kwargs"]["visual_randomization"]
-        ranges = ", ".join(f"`{name}` {value:g}" for name, value in half_ranges.items())
+        result = read_result(path)
+        change, p_value = difference(here := _of(path, result), usual)
+        ranges = ", ".join(f"`{name}` {value:g}" for name, value in result["env_kwargs"]["visual_randomization"].items())
         rows.append((path.stem.replace("_", " "), ranges, _linked_success(here, path), change.signed))
         p_values.append(p_value)
     tested = [(*row, p_text(p), p_text(p_holm)) for row, p, p_holm in zip(rows, p_values, holm(p_values), strict=True)]
@@ -68,8 +69,8 @@ def _linked_success(results: ConditionResults, path: Path) -> str:
     return linked(mean_success(results), str(path.relative_to(PAGE.parent)))
 
 
-def _of(path: Path) -> ConditionResults:
-    (results,) = collect({path: read_result(path)}).values()
+def _of(path: Path, result: dict[str, Any]) -> ConditionResults:
+    (results,) = collect({path: result}).values()
     return results
 
 

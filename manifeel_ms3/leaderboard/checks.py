@@ -14,7 +14,7 @@ from manifeel_ms3.analysis.protocol import FEWEST_EPISODES
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
-from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, task_spec
+from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, evaluation_seeds, other_revision, task_spec
 
 from .rerun import INVENTED
 from .submission import Submission, SubmissionError, read_submission
@@ -136,8 +136,7 @@ def _faults(result: dict[str, Any]) -> list[str]:
 
 def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
     """What is wrong with the episodes, the observations and the revision of the task of a result."""
-    env_id, faults = result["env_id"], []
-    seeds, here = evaluation_seeds(EPISODES), task_spec(env_id).revision
+    env_id, faults, seeds = result["env_id"], [], evaluation_seeds(EPISODES)
     given = [episode["seed"] for episode in result["episodes"]]
     if given != seeds:
         missing, foreign = sorted(set(seeds) - set(given)), sorted(set(given) - set(seeds))
@@ -153,11 +152,8 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
     limit, most = result["env_kwargs"].get("max_episode_steps"), task_spec(env_id).max_episode_steps
     if isinstance(limit, int) and limit > most:  # running episodes again could take for ever
         faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
-    if result["revision"] != here:
-        faults.append(
-            f"it is of revision {result['revision']} of {env_id}, but the task has revision {here} here; evaluate again with "
-            f"manifeel-ms3 {version('manifeel-ms3')}"
-        )
+    if fault := other_revision(env_id, result["revision"]):
+        faults.append(f"{fault}; evaluate again with manifeel-ms3 {version('manifeel-ms3')}")
     return faults
 
 

@@ -140,6 +140,22 @@ def register_demonstrator(*env_ids: str) -> Callable[[Demonstrator], Demonstrato
     return attach
 
 
+def other_revision(env_id: str, revision: int | None) -> str:
+    """The beginning of an error about what was made of another revision of a task than the present one; "" if it was not.
+
+    Args:
+        env_id: Id of the task.
+        revision: Revision of the task at that time; None if that is not known, which passes.
+
+    Raises:
+        UnknownNameError: The task is not registered.
+    """
+    here = task_spec(env_id).revision
+    if revision in (None, here):
+        return ""
+    return f"it is of revision {revision} of {env_id}, but the task has revision {here} here"
+
+
 def task_spec(env_id: str) -> TaskSpec:
     """The specification of a task.
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
-from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.tasks.registry import other_revision
 
 from .demonstration_format import DemonstrationError
 
@@ -82,11 +82,8 @@ def require_revision(path: Path, env_id: str, recorded: int | None) -> None:
         DemonstrationError: The task has another revision now.
         UnknownNameError: The task is not registered.
     """
-    if recorded not in (None, here := task_spec(env_id).revision):
-        raise DemonstrationError(
-            f"{path}: it is of revision {recorded} of {env_id}, but the task has revision {here} here; make it again, or use "
-            "the version of manifeel-ms3 that made it"
-        )
+    if fault := other_revision(env_id, recorded):
+        raise DemonstrationError(f"{path}: {fault}; make it again, or use the version of manifeel-ms3 that made it")
 
 
 @contextmanager
