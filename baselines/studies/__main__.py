@@ -47,6 +47,8 @@ POLL_SECONDS = 2
 """Time between two updates of the table, in s; set once, not tuned."""
 RESOURCES = (("CPU", "cpus"), ("GPU", "gpus"))
 """Ray's name of each resource, and the field of `Resources` that asks for it."""
+FREE_SECONDS, FREE_POLL_SECONDS = 5.0, 0.05
+"""Longest wait until Ray counts the resources of a job that has ended as free, and the time between two looks at it."""
 SHARE_DECIMALS = 4
 """Decimals with which Ray counts shares of a resource."""
 RAY_SETTINGS = {
@@ -197,6 +199,7 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
                 while job := _next_job(study, waiting, running):
                     waiting.remove(job)
                     needs = study.resources[job.kind]
+                    _await_free(needs)
                     task = worker.options(num_cpus=needs.cpus, num_gpus=needs.gpus, name=job.title)
                     needed = [results[need.key] for need in job.needs if need.key in results]
                     results[job.key] = task.remote(Path.cwd(), job, root, needs, *needed)
@@ -232,6 +235,20 @@ def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job 
         if fits and not any(need.key in unfinished for need in job.needs):
             return job
     return None
+
+
+def _await_free(needs: Resources) -> None:
+    """Wait until Ray counts a job's resources as free as well, some tenths of a second after the job before it has ended.
+
+    Ray prints a warning about a task that it cannot place at once. On a cluster that others use, too, the wait ends after a
+    while, and the job waits in Ray.
+    """
+    deadline = time.monotonic() + FREE_SECONDS
+    while time.monotonic() < deadline:
+        available = ray.available_resources()
+        if all(round(available.get(name, 0.0), SHARE_DECIMALS) >= getattr(needs, field) for name, field in RESOURCES):
+            return
+        time.sleep(FREE_POLL_SECONDS)
 
 
 def _error(result: Any) -> str:

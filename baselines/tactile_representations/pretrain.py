@@ -27,7 +27,8 @@ from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.arguments import require_file, require_positive
 from manifeel_ms3.command_line import run
 from manifeel_ms3.demonstrations import DemonstrationError
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header, task_of
+from manifeel_ms3.demonstrations.formats.folder_checks import require_task
+from manifeel_ms3.demonstrations.formats.maniskill_h5 import about_task, group_of, open_trajectories, read_header
 from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
@@ -93,7 +94,7 @@ def main(args: Args) -> list[float]:
     Raises:
         InvalidArgumentError: A number is too small, the representation does not take images of this size, or the path of the
             weights is a folder.
-        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
+        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for or of another revision of it.
         FileWriteError: The weights cannot be written.
         InUseError: Another process trains into the same file.
     """
@@ -139,13 +140,12 @@ def tacrgb_images(files: Iterable[Path], size: int, env_id: str | None = None) -
         env_id: Environment id of the task that all files must be of; any tasks if None.
 
     Raises:
-        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for.
+        DemonstrationError: The files hold no TacRGB images, or are of another task than asked for or of another revision of it.
     """
     images = []
     for path in files:
         header = read_header(path)
-        if env_id not in (None, task := task_of(header)):
-            raise DemonstrationError(f"{path} holds demonstrations of {task}, not of {env_id}; leave it out of --demo-path")
+        require_task(path, about_task(header), env_id)
         with open_trajectories(path) as file:
             for episode in header["episodes"]:
                 sensors = group_of(file, episode).get("obs/sensor_data", {})

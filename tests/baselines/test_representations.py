@@ -112,6 +112,14 @@ def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
     assert not out.exists()
 
 
+def test_demonstrations_of_an_earlier_revision_of_the_task_are_refused(pictures, tmp_path):
+    older = Path(shutil.copy(pictures, tmp_path / "older.h5"))
+    header = json.loads(pictures.with_suffix(".json").read_text())
+    older.with_suffix(".json").write_text(json.dumps(header | dict(revision=1)))
+    with pytest.raises(DemonstrationError, match=r"older\.h5: .*revision 1"):
+        trained("unit", older, tmp_path / "weights.safetensors", env_id=PEG)
+
+
 def test_episodes_are_found_by_their_numbers(pictures, tmp_path):
     other = Path(shutil.copy(pictures, tmp_path / "trajectory.h5"))
     with h5py.File(other, "r+") as file:
