@@ -1,7 +1,7 @@
 """Result files with made-up outcomes, of runs with the settings of a policy's preset."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,8 @@ import numpy as np
 
 from baselines.registry import policy_spec
 from manifeel_ms3.analysis import results_page
-from manifeel_ms3.evaluation.result import provenance, result_of
+from manifeel_ms3.analysis.protocol import collect
+from manifeel_ms3.evaluation.result import provenance, result_of, results_in
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import evaluation_seeds, full_id, task_spec
 from tests.outcomes import made_up
@@ -21,6 +22,14 @@ TOTAL_STEPS = 50_000
 def page_of(results: Path, page: Path | None = None) -> str:
     """The page of the results in a folder, which is written into the same folder unless another path is given."""
     return results_page.main(results_page.Args((results,), page or results / "results.md")).read_text()
+
+
+def text_of(results: Path) -> str:
+    """The page of the results in a folder without its figures, which take most of the time."""
+    by_file = results_in(results)
+    none = results_page.Figures(*[None] * len(fields(results_page.Figures)))
+    links = results_page._links(by_file, results)
+    return "".join(results_page.page(list(by_file.values()), collect(by_file), links, none, ()))
 
 
 def config_of(policy: str, preset: str, task: str, mode: str, seed: int, encoder: str = "", **changes: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import PEG
 
-from .made_up import TOTAL_STEPS, page_of, write_run
+from .made_up import TOTAL_STEPS, page_of, text_of, write_run
 
 ROOT = Path(__file__).parents[2]
 WEIGHTS = dict(unit="unit.safetensors", t3="t3_medium", anytouch="anytouch.pth")
@@ -87,7 +87,7 @@ def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
     assert [one.p_holm for one in found] == holm([one.p_value for one in found])
     assert any(one.verdict == "holds" and one.p_value < 0.05 < one.p_holm for one in found)
     remaining = sum(one.p_holm < 0.05 for one in found)
-    assert f"{remaining} of the 3 differences have a corrected p below 0.05" in " ".join(page_of(tmp_path).split())
+    assert f"{remaining} of the 3 differences have a corrected p below 0.05" in " ".join(text_of(tmp_path).split())
 
 
 def test_one_pair_of_conditions_is_one_test_whatever_claims_rest_on_it(tmp_path):
@@ -98,14 +98,14 @@ def test_one_pair_of_conditions_is_one_test_whatever_claims_rest_on_it(tmp_path)
     assert [claim[:2] for claim, _, _ in found] == ["2.", "8."]  # TacRGB helps, and does so from the front camera
     assert len({one.conditions for _, _, one in found}) == 1
     assert all(one.p_holm == one.p_value == found[0][2].p_value for _, _, one in found)
-    assert "The table tests 1 pair of conditions" in " ".join(page_of(tmp_path).split())
+    assert "The table tests 1 pair of conditions" in " ".join(text_of(tmp_path).split())
 
 
 def test_the_page_says_what_touch_adds_to_vision(tmp_path):
     write_run(tmp_path, VISION, 0.2)
-    assert "What touch adds, and how" not in page_of(tmp_path)  # nothing to compare with
+    assert "What touch adds, and how" not in text_of(tmp_path)  # nothing to compare with
     write_run(tmp_path, TACFF, 0.5)
-    (paragraph,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
+    (paragraph,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
     change = r"TacFF changes success by \+30 \[\+\d+, \+\d+\] points \({}the paper: \+26\)\. "
     assert re.search(change.format("too few training seeds to tell; "), paragraph)
     assert "TacRGB" not in paragraph
@@ -113,7 +113,7 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
     for seed in (1, 2):
         write_run(tmp_path, VISION, 0.2, seed)
         write_run(tmp_path, TACFF, 0.5, seed)
-    (paragraph,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
+    (paragraph,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
     assert re.search(change.format(""), paragraph)
 
 
@@ -123,7 +123,7 @@ def test_the_page_says_what_touch_adds_on_average_over_the_tasks_of_a_category(t
         write_run(tmp_path, TACFF, 0.5 if task == "PegInsertion" else 0.3, seed, task=task)
     write_run(tmp_path, VISION, 0.2, task="GearAssembly")  # one training seed: not in the mean
     write_run(tmp_path, TACFF, 0.9, task="GearAssembly")
-    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("| insertion | "))
+    (row,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("| insertion | "))
     change = r"\+20 \[\+\d+, \+\d+\]"
     papers = r"\+1[67]"  # +26 and +7 points
     assert re.search(rf"TacFF \| PegInsertion, USBInsertion \| {change} \| {change} \| {change} \| {papers} \|", row)
@@ -132,7 +132,7 @@ def test_the_page_says_what_touch_adds_on_average_over_the_tasks_of_a_category(t
 def test_a_claim_stands_beside_the_papers_difference(tmp_path):
     for policy, seed in product(("diffusion_policy", "flow_matching"), range(3)):
         write_run(tmp_path, TACRGB, 0.5, seed, task="BallSortingDim", policy=policy)
-    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("| 4. ") and "undecided" in line)
+    (row,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("| 4. ") and "undecided" in line)
     assert "diffusion_policy over flow_matching (front, rgb+tacrgb, 50 demonstrations) | " in row  # each preset has its encoder
     assert "] | +4 | " in row  # Table II: 73 and 69 %
 
@@ -170,7 +170,7 @@ def test_both_sides_have_the_papers_number_of_demonstrations(tmp_path):
     ((claim, _, outcome),) = answered(tmp_path)
     assert claim.startswith("1.")
     assert abs(outcome.difference.value) < 0.1
-    (beside,) = (line for line in page_of(tmp_path).splitlines() if line.startswith("| GearAssembly | ["))
+    (beside,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("| GearAssembly | ["))
     pattern = r"\| \[[45]\d%\]\([^|]* / 66 ± 1% \| \d+% \[\d+%, \d+%\] \|$"  # the run with 100 demonstrations succeeds in 90 %
     assert re.search(pattern, beside)
 
@@ -185,7 +185,7 @@ def test_runs_of_other_purposes_are_listed_and_enter_nothing(tmp_path):
     write_run(tmp_path, TACRGB, 0.1, seed=1, **short)  # too short, even with fifty episodes
     write_run(tmp_path, TACRGB, 0.1, seed=2, task="BallSorting", last_step=30_000, batch_size=16)  # stopped early
     assert answered(tmp_path) == before
-    page = page_of(tmp_path)
+    page = text_of(tmp_path)
     for reason in ("1 episodes", "300 gradient steps", "stopped at step 30000 of 50000"):
         assert f"left out: {reason}" in page
     assert "| paper, steps 300 |" in page
@@ -284,7 +284,7 @@ def test_whether_no_encoder_is_best_on_all_tasks(tmp_path, best, verdict):
     assert {ranking.task: ranking.encoders[0] for ranking in ranked} == best
     assert all(ranking.best_over_second.low > 0.4 for ranking in ranked)
     assert verdict_on(ranked) == verdict
-    page = page_of(tmp_path)
+    page = text_of(tmp_path)
     assert f"**6. No tactile encoder is best on all tasks**: {verdict} (settings: paper)." in page
     header, _, *rows = page.partition("### Table III")[2].strip().partition("\n\n")[2].partition("\n\n")[0].splitlines()
     tables = [dict(zip(*(line.strip("| ").split(" | ") for line in (header, row)), strict=True)) for row in rows]
@@ -310,7 +310,7 @@ def test_an_encoder_that_is_chosen_as_the_best_afterwards_must_be_better_by_more
     assert clear
     assert not any(ranking.beats(*pair) for ranking, pair in clear)
     assert verdict_on(ranked) == "undecided"
-    (row,) = (line for line in page_of(tmp_path).splitlines() if line.startswith(f"| GearAssembly | {ranked[0].encoders[0]} |"))
+    (row,) = (line for line in text_of(tmp_path).splitlines() if line.startswith(f"| GearAssembly | {ranked[0].encoders[0]} |"))
     assert row.endswith(f"| {ranked[0].p_values[ranked[0].encoders[:2]]:.3f} |")
 
 

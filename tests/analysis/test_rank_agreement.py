@@ -9,7 +9,7 @@ from manifeel_ms3.analysis.paper import MODES, TABLE_II, paper_condition
 from manifeel_ms3.analysis.protocol import ConditionResults
 from manifeel_ms3.analysis.rank_agreement import Ranked, agreement_of, mean_tau, rank_violation
 
-from .made_up import page_of, write_run
+from .made_up import text_of, write_run
 
 ALL = [[0, 1, 2, 3]]
 PAPER = np.array([0.1, 0.2, 0.4, 0.8])
@@ -59,10 +59,10 @@ def test_intervals_hold_the_value_and_shrink_with_what_is_certain():
 def test_the_page_ranks_three_conditions_or_more(tmp_path):
     for mode, rate in zip(MODES, (0.2, 0.3, 0.6), strict=True):
         if (tmp_path / "runs").exists():  # one or two conditions
-            assert "## Ranks" not in page_of(tmp_path / "runs", tmp_path / "results.md")
+            assert "## Ranks" not in text_of(tmp_path / "runs")
         for seed in range(3):
             write_run(tmp_path / "runs", mode, rate, seed, checkpoints=3)
-    page = page_of(tmp_path / "runs", tmp_path / "results.md")
+    page = text_of(tmp_path / "runs")
     assert "| I | paper | within tasks | 3 | 1.00 [" in page
     assert "| 0.00 [0.00, " in page
 
@@ -70,11 +70,11 @@ def test_the_page_ranks_three_conditions_or_more(tmp_path):
 def test_tables_whose_conditions_do_not_differ_in_what_they_compare_are_not_ranked(tmp_path):
     for mode, rate in zip(MODES, (0.2, 0.3, 0.6), strict=True):
         write_run(tmp_path, mode, rate, task="GearAssembly")
-    page = page_of(tmp_path)
+    page = text_of(tmp_path)
     assert "| I | paper | within tasks | 3 |" in page
     assert "| II | " not in page
     write_run(tmp_path, MODES[0], 0.4, task="GearAssembly", policy="flow_matching")
-    page = page_of(tmp_path)
+    page = text_of(tmp_path)
     assert "| II | paper | within tasks | 4 |" in page
     table = page.partition("### Table II, ")[2].partition("\n##")[0]
     rows = [line.split(" | ") for line in table.splitlines() if line.startswith("| GearAssembly | ")]

@@ -24,6 +24,7 @@ from baselines.references import MeanAction, Untrained
 from baselines.registry import PolicySpec
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config, samples_per_step
+from tests.command_process import run_module
 from tests.tasks_and_marks import PEG
 from tests.trajectories import changed_copy
 from tests.trust.running_evaluations import wait_for_episodes
@@ -339,6 +340,5 @@ def test_two_processes_train_one_policy(run, tmp_path):
     assert losses[-1] < 0.8 * losses[0]
     config = checkpoint_config(tmp_path / "checkpoints/last")
     assert (config["step"], samples_per_step(config)) == (60, 2 * 16)
-    alone = [sys.executable, "baselines/diffusion_policy/train.py", *arguments, "--resume"]
-    resumed = subprocess.run(alone, capture_output=True, text=True, check=False)
+    resumed = run_module("baselines.diffusion_policy.train", *arguments, "--resume", folder=tmp_path)
     assert "was trained with other settings (num_processes: 2 there, 1 now)" in resumed.stderr

@@ -8,19 +8,24 @@ from dataclasses import replace
 
 import torch
 import torch.distributed as dist
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import start_processes
 
 from baselines.common.processes import Processes
 from baselines.common.train_args import TrainArgs
 from baselines.common.training import Trainer
 from baselines.diffusion_policy.policy import DiffusionPolicy
+from manifeel_ms3.workers import WorkerContext
 
 
 def in_two_processes(what: Callable[[TrainArgs], None], args: TrainArgs) -> None:
-    """Run a function in two processes; what one of them raises is raised here."""
+    """Run a function in two processes, forked from the server that has imported most of what they need.
+
+    What one of them raises is raised here.
+    """
+    WorkerContext()  # starts the server
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
-    spawn(_run, (what, args, port), nprocs=2, daemon=True)
+    start_processes(_run, (what, args, port), nprocs=2, daemon=True, start_method="forkserver")
 
 
 def _run(rank: int, what: Callable[[TrainArgs], None], args: TrainArgs, port: int) -> None:
