@@ -15,7 +15,8 @@ import hashlib
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.metadata import version
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 
 import fast_simplification
@@ -41,6 +42,7 @@ SMOOTH_ANGLE = np.deg2rad(35)  # rad: sharper edges stay sharp; chosen by eye
 NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; chosen by eye
 ROUGHNESS = 0.35  # roughness of the arm's painted and plastic surfaces; chosen by eye
 LIBRARIES = ("mani-skill", "trimesh", "fast-simplification", "scipy", "numpy")  # that the meshes come from, or are made by
+version = cache(metadata.version)  # takes 2 ms; each reset asks for 20, as ManiSkill asks for the robot's path four times
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
