@@ -49,6 +49,7 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             the command made, and what one can do with it.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s")
+    gc.freeze()  # ManiSkill collects garbage at every reset; it need not search the modules
     atexit.register(gc.freeze)  # else the interpreter searches all objects of torch for garbage as it ends, for about 1 s
     try:
         import_typed_tasks(args)
