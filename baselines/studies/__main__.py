@@ -32,7 +32,8 @@ from manifeel_ms3.errors import MachineError, WorkFailedError
 from manifeel_ms3.network import LOOPBACK
 
 from . import cost
-from .command_lines import require_valid_flags, shell_command
+from .checks import require_valid_environments, require_valid_flags
+from .command_lines import shell_command
 from .jobs import FAILED, STARTED, Status, is_done, perform_in, read_status, restore_child_signals, status_of
 from .planning import Job, jobs_of
 from .publish import publish
@@ -115,6 +116,7 @@ def main(args: Args) -> None:
         console.print(f"{args.publish} has {count} results")
         return
     _require_writable(args.root)
+    require_valid_environments(jobs, args.root)
     if args.dry_run:
         console.print(plan(study, jobs, args.root))
         return

@@ -1,19 +1,15 @@
 """The commands that do a study's jobs; a job runs with exactly the arguments that are printed here."""
 
-import json
 import shlex
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from baselines.common.train_args import check_run
 from baselines.registry import policy_spec, preset_cli
-from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.paths import CHECKPOINTS
 
 from .planning import Job
-from .study import OBS_MODE, OF_THE_STUDY, Kind, Resources, StudyError
+from .study import OBS_MODE, Kind, Resources
 
 STEP = "$step"
 """Variable of the shell that holds the name of a checkpoint."""
@@ -75,31 +71,6 @@ def _flag(name: str, value: Any) -> list[str]:
         *groups, last = name.split(".")
         return ["--" + ".".join((*groups, last if value else f"no-{last}"))]
     return [f"--{name}", *map(str, value if isinstance(value, list) else [value])]
-
-
-def require_valid_flags(jobs: Iterable[Job]) -> None:
-    """Check that `manifeel train` takes the flags of every training of a study, before the first job begins.
-
-    Raises:
-        StudyError: A flag is not known, or its value is not one that it takes, in which case the parser's own message names it
-            on stderr; or two settings of a run contradict each other.
-    """
-    checked = set()
-    for job in (job for job in jobs if job.kind == "train"):
-        of_the_grid = {name: value for name, value in job.settings["flags"].items() if name not in OF_THE_STUDY}
-        if (key := json.dumps([job.settings["policy"], job.settings["preset"], of_the_grid])) in checked:
-            continue
-        checked.add(key)
-        try:
-            check_run(training_args(job))
-        except SystemExit as error:
-            policy = f"{job.settings['policy']} {job.settings['preset']}"
-            raise StudyError(
-                f"{job.title}: `manifeel train {policy}` does not take one of its flags, {of_the_grid}; correct `train` or "
-                "`encoder_flags` in the study's file"
-            ) from error
-        except InvalidArgumentError as error:
-            raise StudyError(f"{job.title}: {error}; correct `train` or `encoder_flags` in the study's file") from error
 
 
 def half_precision_arguments(checkpoint: str, copy: str) -> list[str]:

@@ -19,7 +19,8 @@ from baselines.common.train_args import planned_steps
 from baselines.registry import policy_spec, preset_cli
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost
-from baselines.studies.command_lines import require_valid_flags, shell_command, training_args
+from baselines.studies.checks import require_valid_flags
+from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import OF_THE_STUDY, Resources, StudyError, read_study
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
@@ -129,6 +130,22 @@ def test_a_flag_that_no_training_takes_is_refused_before_any_job_begins(study, f
 def test_numbers_that_no_training_can_meet_are_refused_before_any_job_begins(study, tmp_path):
     study.write_text(TINY.replace("batch-size: 4", "image-size: 0"))
     with pytest.raises(StudyError, match=r"seed 0: --image-size 0 must be at least 1.*correct `train` or `encoder_flags`"):
+        study_command.main(study_command.Args(study, root=tmp_path / "root"))
+    assert not list(tmp_path.glob("root/*/*"))
+
+
+@pytest.mark.parametrize(
+    ("argument", "said"),
+    [
+        ("task_args: {randomization: {socket: 0.0}}", r"1 demonstrations, .*: randomization\['socket'\] is unknown"),
+        ("task_args: {sensor_configs: {wirst: {fov: 1.0}}}", r"sensor_configs\['wirst'\] is neither a sensor"),
+        ("evaluation_args: [{}, {tactile: {units: grams}}]", "seed 0, .*: units='grams' is unknown; choose from .*newton"),
+    ],
+)
+def test_arguments_that_a_task_does_not_take_are_refused_before_any_job_begins(study, argument, said, tmp_path):
+    lines = [f"    {argument}" if "task_args" in line else line for line in TINY.splitlines()]
+    study.write_text("\n".join(lines))
+    with pytest.raises(StudyError, match=rf"PegInsertion, .*{said}.*; correct `task_args` or `evaluation_args`"):
         study_command.main(study_command.Args(study, root=tmp_path / "root"))
     assert not list(tmp_path.glob("root/*/*"))
 
