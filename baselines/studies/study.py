@@ -14,6 +14,7 @@ from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
 from manifeel_ms3.arguments import one_of, several_of
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
+from manifeel_ms3.evaluation.variant import SENSING
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.tasks.checks import check_argument_names, check_seed
 from manifeel_ms3.tasks.obs_modes import in_usual_order, split_obs_mode
@@ -203,6 +204,8 @@ def _grid(entry: Any, place: str) -> Grid:
         for task in grid.tasks:
             names = grid.task_args.keys() | set().union(*grid.evaluation_args)
             check_argument_names(task_spec(task).env_class, names - {"max_episode_steps"})  # which gym.make takes
+            if sensing := sorted(names & {*SENSING}):
+                raise InvalidArgumentError(f"{sensing} of a task are set by the study itself; use `obs_modes` and `cameras`")
         for policy in grid.policies:
             one_of(f"preset of {policy}", grid.preset, policy_spec(policy).presets)
         _check_sensing(grid)
