@@ -91,8 +91,8 @@ def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Co
         steps = found.setdefault(condition, {}).setdefault(seed, {})
         if step in steps:
             raise ResultError(
-                f"two results of {condition} are of training seed {seed} and step {step}: {files[condition, seed, step]} and "
-                f"{path}; leave one of them out"
+                f"two results of {condition} are of training seed {seed} and step {step}: {files[condition, seed, step]}, with "
+                f"{len(steps[step])} episodes, and {path}, with {len(outcomes)}; move the one that is not to count elsewhere"
             )
         steps[step], files[condition, seed, step] = outcomes, path
         if isinstance(total := result["config"].get("total_steps"), int):

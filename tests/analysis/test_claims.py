@@ -208,7 +208,7 @@ def test_two_results_of_one_condition_seed_and_step_are_refused(tmp_path):
         ResultError, match=r"two results of PegInsertion, rgb wrist, diffusion_policy, 50 .*seed 0 and step \d+"
     ) as refused:
         claims.main(claims.Args((tmp_path,)))
-    assert re.search(rf"step \d+: {tmp_path}/a/.*/(\d+\.json) and {tmp_path}/b/.*/\1; leave one", str(refused.value))
+    assert re.search(rf"step \d+: {tmp_path}/a/.*/(\d+\.json), with 50 .*{tmp_path}/b/.*/\1, with 50; move", str(refused.value))
 
 
 @pytest.mark.parametrize(
