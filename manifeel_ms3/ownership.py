@@ -18,6 +18,9 @@ from filelock import FileLock, Timeout
 from .errors import InUseError, MachineError
 from .processes import process_exists
 
+MAX_COMMAND = 80
+"""Largest number of characters of a command in a message; those of Ray's workers have 900."""
+
 
 @contextmanager
 def owned(path: Path) -> Iterator[None]:
@@ -60,7 +63,7 @@ def _described(path: Path) -> str:
     try:
         holder = json.loads(path.read_text(encoding="utf-8"))
         if holder["host"] != socket.gethostname() or process_exists(holder["pid"]):
-            return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command']})"
+            return f"process {holder['pid']} on {holder['host']} since {holder['since']} ({holder['command'][:MAX_COMMAND]})"
     except (OSError, ValueError, KeyError, TypeError):  # the other process has just begun, or has just ended
         pass
     return "another process"

@@ -286,6 +286,8 @@ def _reason(job: Job, root: Path, errors: dict[str, str]) -> str:
     """
     if not all(is_done(need, root) for need in job.needs):
         return "a job that it needs is not done"
+    if elsewhere := [errors[need.key] for need in job.needs if need.key in errors]:
+        return f"a job that it needs was not done by this study, but is done by now ({elsewhere[0]})"
     if failed := read_status(path := job.folder(root) / FAILED):
         return f"{failed['error']} ({path} has the traceback)"
     return errors.get(job.key) or "its worker died"

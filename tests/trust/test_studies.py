@@ -86,6 +86,16 @@ def test_a03_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
         perform(record, tmp_path, Resources())
 
 
+def test_a03_a_job_is_not_said_to_hold_a_file_that_another_study_holds(study, tmp_path):
+    """Another study did the recording while this one gave up the training that needs it."""
+    record, train, *_ = jobs_of(read_study(study))
+    record.folder(tmp_path).mkdir(parents=True)
+    (record.folder(tmp_path) / DONE).write_text('{"seconds": 1}')
+    held = "started.json is in use by process 7"
+    reason = study_command._reason(train, tmp_path, {record.key: held, train.key: held})
+    assert reason == f"a job that it needs was not done by this study, but is done by now ({held})"
+
+
 def test_b05_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp_path):
     (tmp_path / "file").write_text("")
     for root in (tmp_path / "file", tmp_path / "file/inside", Path("/proc/study")):
