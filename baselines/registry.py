@@ -11,6 +11,7 @@ from typing import Any
 import tyro
 
 from manifeel_ms3 import plugins
+from manifeel_ms3.command_line import as_typed
 from manifeel_ms3.errors import PluginError, UnknownNameError
 
 from . import tactile_representations as tactile_representations  # registers its encoders for every policy
@@ -114,7 +115,7 @@ def policy_spec(name: str) -> PolicySpec:
 
 def next_step(_args: TrainArgs, made: Path) -> str:
     """What training made, and what one can do with it."""
-    return f"{made} is the trained policy; `manifeel eval --checkpoint {made}` evaluates it"
+    return f"{made} is the trained policy; {as_typed('manifeel', 'eval', '--checkpoint', made)} evaluates it"
 
 
 def preset_cli(spec: PolicySpec, args: list[str] | None = None) -> Any:

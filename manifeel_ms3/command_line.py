@@ -10,6 +10,7 @@ import json
 import logging
 import os
 import platform
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -96,6 +97,11 @@ def _extra_with(module: str) -> tuple[str, bool] | None:
             if requirement.name == name and marker and marker.evaluate({"extra": extra} | NEWER_PYTHON):
                 return extra, marker.evaluate({"extra": extra})
     return None
+
+
+def as_typed(*words: object) -> str:
+    """A command as one types it in a shell, in backquotes; paths with spaces are quoted."""
+    return f"`{shlex.join(map(str, words))}`"
 
 
 def json_object(flag: str, given: str) -> dict[str, Any]:

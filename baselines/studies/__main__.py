@@ -9,6 +9,7 @@ again, and a study that was stopped goes on where it stopped.
 import logging
 import os
 import secrets
+import signal
 import sys
 import time
 from collections import Counter
@@ -27,7 +28,7 @@ from rich.live import Live
 from rich.progress import track
 from rich.table import Table
 
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import MachineError, WorkFailedError
 from manifeel_ms3.network import LOOPBACK
 
@@ -190,6 +191,7 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
     first, since these wait for nothing.
     """
     _start_ray(address)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C; Ray's own handler prints a stack trace
     restore_child_signals()
     try:
         worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform_in)  # a new process for each job
@@ -352,15 +354,15 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
 
 def next_step(args: Args, _answer: None) -> str:
     """What the command made, and what one can do with it."""
+    study = as_typed("manifeel", "study", args.study, "--root", args.root)
     if args.print_commands:
-        return f"these commands do by hand what `manifeel study {args.study} --root {args.root}` does"
+        return f"these commands do by hand what {study} does"
     if args.dry_run:
-        return f"nothing was run; `manifeel study {args.study} --root {args.root}` runs what is left"
+        return f"nothing was run; {study} runs what is left"
     if args.publish:
         return f"{args.publish} is a submission; `manifeel leaderboard build` makes the page of the leaderboard"
-    return (
-        f"{args.root} has all results; `manifeel results --results {args.root} --out results.md` sets them beside the paper's"
-    )
+    page = as_typed("manifeel", "results", "--results", args.root, "--out", "results.md")
+    return f"{args.root} has all results; {page} sets them beside the paper's"
 
 
 if __name__ == "__main__":

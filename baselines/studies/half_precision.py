@@ -12,7 +12,7 @@ from pathlib import Path
 import tyro
 
 from baselines.common.checkpoint import save_in_half_precision
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 
 
 @dataclass
@@ -39,7 +39,7 @@ def main(args: Args) -> Path:
 
 def next_step(_args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
-    return f"{made} has the rounded weights; `manifeel eval --checkpoint {made}` evaluates them"
+    return f"{made} has the rounded weights; {as_typed('manifeel', 'eval', '--checkpoint', made)} evaluates them"
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
 from manifeel_ms3.arguments import require_file, require_positive
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.folder_checks import require_task
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import about_task, group_of, open_trajectories, read_header
@@ -231,8 +231,8 @@ def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
 
 def next_step(args: Args, _losses: list[float]) -> str:
     """What the command made, and what one can do with it."""
-    flags = f"--policy.encoder.tacrgb {args.representation} --tacrgb-weights {args.out}"
-    return f"{args.out} holds the weights; `manifeel train ... {flags}` trains a policy with them"
+    flags = ("--policy.encoder.tacrgb", args.representation, "--tacrgb-weights", args.out)
+    return f"{args.out} holds the weights; {as_typed('manifeel', 'train', '...', *flags)} trains a policy with them"
 
 
 if __name__ == "__main__":

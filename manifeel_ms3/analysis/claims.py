@@ -20,7 +20,7 @@ from typing import Literal
 import tyro
 
 from manifeel_ms3.arguments import require_file
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
 
@@ -202,9 +202,9 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
 
 def next_step(args: Args, _answers: dict[Comparison, list[ClaimResult]]) -> str:
     """What the command made, and what one can do with it."""
-    results = " ".join(map(str, args.results))
+    page = as_typed("manifeel", "results", "--results", *args.results, "--out", "results.md")
     made = f"{args.out} has this table" if args.out else "--out FILE.md writes this table to a file"
-    return f"{made}; `manifeel results --results {results} --out results.md` makes the page with it and all other results"
+    return f"{made}; {page} makes the page with it and all other results"
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import tyro
 from scipy import linalg
 
 from manifeel_ms3.arguments import require_positive
-from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.command_line import as_typed, missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.demonstrations.formats.touch_units import recorded_sensor
 from manifeel_ms3.errors import InvalidArgumentError
@@ -362,8 +362,9 @@ def _resnet(name: str) -> Features:
 
 def next_step(args: Args, _result: Similarity) -> str:
     """What the command made, and what one can do with it."""
-    beside = f"`manifeel results --results {args.out} FOLDER --out results.md` sets them beside the paper's"
-    return f"{args.out} has the distances in similarity.json and the nearest images in nearest.png; {beside}"
+    page = as_typed("manifeel", "results", "--results", args.out, "FOLDER", "--out", "results.md")
+    made = f"{args.out} has the distances in similarity.json and the nearest images in nearest.png"
+    return f"{made}; {page} sets them beside the paper's"
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Common parts of all commands that record: a trajectory file to which episodes are added, its json, the state of a worker."""
 
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from uuid import uuid4
 
 import gymnasium as gym
 
+from manifeel_ms3.command_line import as_typed
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, move, read_json, remove_folder, write_json
 from manifeel_ms3.nested_settings import differing
@@ -349,12 +351,13 @@ def next_step(_args: Any, path: Path) -> str:
     recorded = header["env_info"]
     count, seen = len(header["episodes"]), recorded["env_kwargs"]
     held = f"{path} holds {count} episode{'s' * (count != 1)}"
+    rendering = as_typed("manifeel", "render-observations", path, "--out", "FILE")
     if seen["obs_mode"] == "none":
-        return f"{held}; `manifeel render-observations {path} --out FILE` adds observations"
+        return f"{held}; {rendering} adds observations"
     if not _learnable(seen["obs_mode"]):
-        rendered = f"`manifeel render-observations {path} --out FILE` makes a file with cameras and touch instead"
+        rendered = f"{rendering} makes a file with cameras and touch instead"
         return f"{held}; no policy is trained on the obs_mode {seen['obs_mode']}: {rendered}"
-    return f"{held}; `manifeel view {path}` shows them, `{train_command(path, header)}` trains a policy"
+    return f"{held}; {as_typed('manifeel', 'view', path)} shows them, `{train_command(path, header)}` trains a policy"
 
 
 def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
@@ -373,7 +376,7 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
         sensing += f" --cameras {' '.join(seen['cameras'])}"
     if (pads := seen.get("tactile_sensors")) and "right" not in pads:  # policies observe the right one unless told otherwise
         sensing += f" --tactile-sensors {' '.join(pads)}"
-    return f"manifeel train diffusion_policy cpu --demo-path {demonstrations} {sensing}"
+    return f"manifeel train diffusion_policy cpu --demo-path {shlex.quote(str(demonstrations))} {sensing}"
 
 
 def _learnable(obs_mode: str) -> str:

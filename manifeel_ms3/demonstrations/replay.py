@@ -13,7 +13,7 @@ import tyro
 from mani_skill.utils import common
 
 from manifeel_ms3.arguments import require_positive
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
@@ -148,8 +148,10 @@ def _comparison(deviation: float) -> str:
 def next_step(args: Args, failed: int) -> str:
     """What the command found, and what one can do next."""
     if failed:
-        return f"{args.path} does not repeat on this machine; `manifeel validate {args.path}` checks whether the file is sound"
-    return f"{args.path} repeats on this machine; `manifeel film {args.path} --out FILE.mp4` shows an episode"
+        check = as_typed("manifeel", "validate", args.path)
+        return f"{args.path} does not repeat on this machine; {check} checks whether the file is sound"
+    film = as_typed("manifeel", "film", args.path, "--out", "FILE.mp4")
+    return f"{args.path} repeats on this machine; {film} shows an episode"
 
 
 if __name__ == "__main__":

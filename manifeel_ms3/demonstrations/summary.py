@@ -11,7 +11,7 @@ from rich.console import Console, Group
 from rich.table import Table
 
 from manifeel_ms3.arguments import require_not_negative
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 
 from .formats.maniskill_h5 import group_of, open_trajectories, origins, read_header, task_of, versions_of
 
@@ -140,7 +140,8 @@ def _size_table(sizes: dict[str, int], episodes: int) -> Table:
 
 def next_step(args: Args, _answer: None) -> str:
     """What one can do with the file."""
-    return f"`manifeel validate {args.file}` checks the file, `manifeel film {args.file} --out FILE.mp4` shows an episode"
+    check, film = as_typed("manifeel", "validate", args.file), as_typed("manifeel", "film", args.file, "--out", "FILE.mp4")
+    return f"{check} checks the file, {film} shows an episode"
 
 
 if __name__ == "__main__":

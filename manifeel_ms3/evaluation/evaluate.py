@@ -16,7 +16,6 @@ goes on with the other episodes.
 
 import json
 import logging
-import shlex
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +24,7 @@ from typing import Annotated, Any
 import tyro
 
 from manifeel_ms3.arguments import is_number, require_file, require_positive
-from manifeel_ms3.command_line import json_object, missing_extras_named, run
+from manifeel_ms3.command_line import as_typed, json_object, missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
 from manifeel_ms3.ownership import owned
@@ -347,17 +346,17 @@ def next_step(args: Args, made: Path) -> str:
     if errors := [episode["error"] for episode in episodes if episode["error"]]:
         first = " ".join("".join(letter if letter.isprintable() else " " for letter in errors[0]).split())[:SHOWN_LENGTH]
         outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {first})"
-    film = shlex.join(["manifeel", "film", str(made), *_policy_flags(args, made), "--out", "FILE.mp4"])
-    return f"{outcome}; `{film}` shows one, {_page_of(args, made)}"
+    film = as_typed("manifeel", "film", made, *_policy_flags(args, made), "--out", "FILE.mp4")
+    return f"{outcome}; {film} shows one, {_page_of(args, made)}"
 
 
 def _page_of(args: Args, made: Path) -> str:
     """Which command makes a page with a result: that of all results if the file is named by a gradient step."""
     if made.stem.isdigit():
-        return f"`{shlex.join(['manifeel', 'results', '--results', str(made.parent)])}` sets it beside the paper's"
+        return f"{as_typed('manifeel', 'results', '--results', made.parent)} sets it beside the paper's"
     checkpoints = (made.parent / CHECKPOINTS).resolve()
     if args.checkpoint is not None and made.name == "evaluation.json" and args.checkpoint.resolve().parent == checkpoints:
-        return f"`{shlex.join(['manifeel', 'report', '--run-dir', str(made.parent)])}` writes a page about the run"
+        return f"{as_typed('manifeel', 'report', '--run-dir', made.parent)} writes a page about the run"
     return "`manifeel results` reads files named by the step, as 00007000.json"
 
 

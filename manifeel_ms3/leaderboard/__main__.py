@@ -19,7 +19,7 @@ from typing import Annotated
 import tyro
 
 from manifeel_ms3.arguments import require_not_negative, require_positive
-from manifeel_ms3.command_line import json_object, run
+from manifeel_ms3.command_line import as_typed, json_object, run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.files import write_json
@@ -137,13 +137,14 @@ def _sources(submission: Submission, args: Submit) -> dict[Path, PolicySource]:
 def next_step(args: Hash | Submit | Build, made: Path) -> str:
     """What the command made, and what one can do with it."""
     if isinstance(args, Hash):
-        checkpoints = " ".join(map(str, args.checkpoint))
-        return f"{made} names them; `manifeel leaderboard submit {args.folder} --checkpoint {checkpoints}` checks and takes it"
+        submission = as_typed("manifeel", "leaderboard", "submit", args.folder, "--checkpoint", *args.checkpoint)
+        return f"{made} names them; {submission} checks and takes it"
     if isinstance(args, Build):
         return f"{made} is a page to open in a browser"
     if args.check_only:
         return f"{made} is not taken yet; the same command without --check-only takes it"
-    return f"{made} is on the leaderboard; `manifeel leaderboard build --board {args.board}` makes its page anew"
+    build = as_typed("manifeel", "leaderboard", "build", "--board", args.board)
+    return f"{made} is on the leaderboard; {build} makes its page anew"
 
 
 if __name__ == "__main__":

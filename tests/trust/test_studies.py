@@ -155,7 +155,8 @@ def test_b03_and_a13_ray_is_reached_from_here_alone_and_imports_nothing_from_the
 
 
 @pytest.mark.slow  # a whole Ray: a minute
-def test_a06_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, figure):
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a06_ctrl_c_and_term_end_a_study_at_once_and_say_what_is_kept(study, tmp_path, sent, figure):
     root = tmp_path / "root"
     record, *_ = jobs_of(read_study(study))
     process = subprocess.Popen(
@@ -173,7 +174,7 @@ def test_a06_ctrl_c_ends_a_study_at_once_and_says_what_is_kept(study, tmp_path, 
             assert time.monotonic() < until
             time.sleep(0.2)
         begin = time.monotonic()
-        os.killpg(process.pid, signal.SIGINT)
+        (os.killpg if sent == signal.SIGINT else os.kill)(process.pid, sent)  # a terminal sends Ctrl-C to every process
         errors = process.communicate(timeout=PATIENCE)[1]
         figure("seconds from Ctrl-C to the end of a study", time.monotonic() - begin, at_most=2.0)
     finally:
