@@ -82,10 +82,10 @@ class Args:
     """Folder of a submission on the leaderboard, such as leaderboard/cpu, into which the results that are done are copied, with
     a checkpoint of each row; nothing is run. Other results of the folder stay. Only evaluations with `half_precision: true` are
     copied."""
-    name: str = ""
-    """Name of that submission; the study's name if not given."""
-    authors: str = "The authors of manifeel_ms3"
-    """Authors of that submission."""
+    name: str | None = None
+    """Name of that submission; if not given, that which it has, or that of its folder."""
+    authors: str | None = None
+    """Names of the authors of that submission, which a new one needs; those that it has if not given."""
     print_commands: bool = False
     """Print the shell commands that do the same by hand, one line for each job, without running them."""
 
@@ -113,8 +113,9 @@ def main(args: Args) -> None:
             console.print(f"# {job.kind}: {job.title}\n{line}", soft_wrap=True, markup=False, highlight=False)
         return
     if args.publish:
-        count = publish(jobs, args.root, args.publish, args.name or study.name, args.authors)
-        console.print(f"{args.publish} has {count} results")
+        count = publish(jobs, args.root, args.publish, args.name, args.authors)
+        left = sum(job.kind == "evaluate" and not is_done(job, args.root) for job in jobs)
+        console.print(f"{args.publish} has {count} results; {left} evaluations of {args.study} are not done")
         return
     _require_writable(args.root)
     require_valid_environments(jobs, args.root)

@@ -21,7 +21,7 @@ from .jobs import is_done
 from .planning import Job
 
 
-def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) -> int:
+def publish(jobs: list[Job], root: Path, folder: Path, name: str | None = None, authors: str | None = None) -> int:
     """Copy the results of a study's finished evaluations into a submission's folder.
 
     Results that the folder holds of other evaluations stay, such as those of a machine that did another part of the study.
@@ -31,14 +31,15 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
         jobs: Jobs of the study; of those that are evaluations, those in half precision are published.
         root: Folder of all jobs.
         folder: Folder of the submission, such as leaderboard/cpu.
-        name: Name of the submission.
-        authors: Names of its authors.
+        name: Name of the submission; if None, that which it has, or that of its folder.
+        authors: Names of its authors; if None, those that it has.
 
     Returns:
         The number of results that the folder then holds.
 
     Raises:
-        InvalidArgumentError: No evaluation in half precision is done, or two results would have the same place.
+        InvalidArgumentError: No evaluation in half precision is done, two results would have the same place, or the authors of
+            a new submission are not given.
         FileExistsAlreadyError: The folder exists and is not a submission, or results of another set-up have the place of new
             ones.
         ResultError: A result is broken.
@@ -58,10 +59,13 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str, authors: str) 
             raise FileExistsAlreadyError(f"{folder} exists and is not a submission: it has no {ABOUT}; give another folder")
         _check_places(results, folder)
         with atomic_folder(folder, replace=True) as partial:
-            about = _copy_old(folder, partial)
+            given = {key: value for key, value in dict(name=name, authors=authors).items() if value}
+            about = dict(name=folder.absolute().name) | _copy_old(folder, partial) | given
+            if "authors" not in about:
+                raise InvalidArgumentError(f"{folder} is a new submission; give --authors, the names of those who made it")
             hashes = about.get("checkpoints", {}) | _publish_results(results, partial)
             hashes = {result: sha256 for result, sha256 in hashes.items() if (partial / result).is_file()}
-            write_json(partial / ABOUT, about | dict(name=name, authors=authors, checkpoints=hashes))
+            write_json(partial / ABOUT, about | dict(checkpoints=hashes))
     return len(hashes)
 
 

@@ -76,13 +76,19 @@ def test_results_of_another_set_up_are_not_overwritten(tmp_path):
         with pytest.raises(InvalidArgumentError, match=r"would both be published in .*PegInsertion/rgb\+tacrgb"):
             publish(both, root, board, "tables", "us")
     assert not board.exists()
-    assert publish([first], root, board, "tables", "us") == 1
+    with pytest.raises(InvalidArgumentError, match="board is a new submission; give --authors"):
+        publish([first], root, board)
+    assert not board.exists()
+    assert publish([first], root, board, authors="us") == 1
+    assert json.loads((board / "submission.json").read_text())["name"] == "board"
     (published,) = board.glob("*/*/seed0/*.json")
     before = published.read_bytes()
     for seed in (0, 1):
         with pytest.raises(FileExistsAlreadyError, match=r"\(they differ in lr\); remove .*PegInsertion/rgb\+tacrgb, or"):
             publish([finished(root, f"slower, seed {seed}", lr=1e-5, seed=seed)], root, board, "tables", "us")
-    assert publish([other_seed], root, board, "tables", "us") == 2
+    assert publish([other_seed], root, board, "tables") == 2
+    about = json.loads((board / "submission.json").read_text())
+    assert (about["name"], about["authors"]) == ("tables", "us")
     assert published.read_bytes() == before
 
 
