@@ -98,9 +98,12 @@ def saved_checkpoints(checkpoints: Path) -> list[Path]:
 def newest_checkpoint(checkpoints: Path) -> Path:
     """The checkpoint of the last step; `last` leads to an older one if a process was killed before it moved the link.
 
-    If there is no checkpoint, the path that the link `last` would have.
+    Raises:
+        CheckpointError: There is no checkpoint.
     """
-    return (saved_checkpoints(checkpoints) or [checkpoints / LAST_LINK])[-1]
+    if not (saved := saved_checkpoints(checkpoints)):
+        raise CheckpointError(f"{checkpoints} has no checkpoint from which training could continue; leave out --resume")
+    return saved[-1]
 
 
 def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:

@@ -23,6 +23,7 @@ from baselines.common.checkpoint import (
     random_state,
     read_tensors,
     save_checkpoint,
+    saved_checkpoints,
     unpack,
 )
 from baselines.common.run_log import entries_until
@@ -73,7 +74,7 @@ def test_a02_training_goes_on_wherever_it_is_killed(kills, undisturbed, tmp_path
         run_dir = tmp_path / str(runs)
         runs += 1
         while True:
-            resume = newest_checkpoint(run_dir / "checkpoints").is_dir()
+            resume = bool(saved_checkpoints(run_dir / "checkpoints"))
             resumed += resume
             process = start(tiny_args(run_dir, resume=resume))
             if killed == kills:
@@ -201,7 +202,7 @@ def test_b06_a_second_training_in_a_folder_is_told_of_the_first(tmp_path):
     process = start(tiny_args(run_dir, steps=100_000))
     try:
         until = time.monotonic() + PATIENCE
-        while not newest_checkpoint(run_dir / "checkpoints").is_dir():
+        while not saved_checkpoints(run_dir / "checkpoints"):
             assert time.monotonic() < until
             time.sleep(0.01)
         for changes in ({}, dict(resume=True), dict(overwrite=True)):
