@@ -232,7 +232,8 @@ def _grid(entry: Any, place: str) -> Grid:
 
 def _check_sensing(grid: Grid) -> None:
     """Check the names of what the policies observe, and of the encoders of TacRGB."""
-    several_of("cameras", grid.cameras, ("policy", *CAMERAS))
+    for task in grid.tasks:
+        several_of("cameras", grid.cameras, ("policy", *CAMERAS, *task_spec(task).env_class.own_cameras))
     several_of("encoders", grid.encoders, ("", *TACRGB_ENCODERS))
     for mode in grid.obs_modes:
         split_obs_mode(mode)

@@ -46,14 +46,17 @@ FAR_LINKS = ("panda_link0", "panda_link1", "panda_link2", "panda_link3")
 class SceneryEnv(SensingEnv):
     """An environment with the robot at a wooden table in a light room.
 
-    Subclasses set `_camera_names` and call `_set_looks` before they call the constructor.
+    Subclasses set `camera_names` and call `_set_looks` before they call the constructor.
     """
 
     front_camera_at = (0.68, 0.0, 0.15)
     """Position of the front camera, in m (public code of the paper)."""
     side_camera_at = (0.5, -0.17, 0.17)
     """Position of the side camera, in m (public code of the paper)."""
-    _camera_names: tuple[str, ...]
+    own_cameras: tuple[str, ...] = ()
+    """Names of the cameras that a task adds to "front", "side" and "wrist" in `_default_sensor_configs`."""
+    camera_names: tuple[str, ...]
+    """Names of the cameras that are rendered."""
 
     def _set_looks(self, lighting: str, quality: str, randomization: dict[str, float], num_envs: int) -> None:
         self._lighting = one_of("lighting", lighting, LIGHTING)
@@ -73,7 +76,7 @@ class SceneryEnv(SensingEnv):
         lens: dict[str, Any] = dict(width=IMAGE_SIZE, height=IMAGE_SIZE, fov=FIELD_OF_VIEW, near=NEAREST, far=FARTHEST)
         return [
             CameraConfig(name, looking_down(*views[name]), **lens, shader_config=camera_shader())
-            for name in self._camera_names
+            for name in self.camera_names
             if name in views
         ]
 

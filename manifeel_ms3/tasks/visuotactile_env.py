@@ -80,7 +80,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         render_backend: "auto", "gpu", "cpu" or "none".
         human_render_camera_configs: Fields of the camera of `render_mode="rgb_array"` to change, such as `dict(width=512)`; its
             images have 768 x 768 pixels, and take about a second each on a CPU.
-        cameras: Cameras to render, of "front", "side", "wrist"; the task's policy camera if not given.
+        cameras: Cameras to render, of "front", "side", "wrist" and the task's own; its policy camera if not given.
         tactile_sensors: Pads to observe, of "left", "right"; by default the right one, as in the paper.
         sensor: Sensor on both fingers: "gelsight_r15", "gelsight_mini", "digit", or one that another package registers.
         tactile: Fields of the pads' `TactileSensorConfig` to change, by dotted name: `{"units": "tacsl", "optics.noise": 2.0}`.
@@ -146,13 +146,13 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         **kwargs,
     ):
         check_argument_names(type(self), kwargs)
-        own_mode, self._tactile_outputs = split_obs_mode(obs_mode or "state")
         self._full_obs_mode = obs_mode or "state"
-        self._camera_names = several_of("cameras", self.policy_cameras if cameras is None else cameras, CAMERAS)
-        self._sides = several_of("tactile_sensors", tactile_sensors, SIDES)
-        self.sensor = sensor
+        own_mode, self._tactile_outputs = split_obs_mode(self._full_obs_mode)
+        asked = self.policy_cameras if cameras is None else cameras
+        self.camera_names = several_of("cameras", asked, (*CAMERAS, *self.own_cameras))
+        self.sensor, self._sides = sensor, several_of("tactile_sensors", tactile_sensors, SIDES)
         names = {side: PAD + side for side in SIDES}
-        camera_configs, own = split_sensor_configs(sensor_configs or {}, self._camera_names, [names[s] for s in self._sides])
+        camera_configs, own = split_sensor_configs(sensor_configs or {}, self.camera_names, [names[s] for s in self._sides])
         pad_options = by_name("tactile", tactile or {}, '{"units": "tacsl", "optics.noise": 2.0}')
         configs = {
             side: task_sensor(sensor, name, f"gel_{side}", {**pad_options, **own.get(name, {})}, imperfections)
@@ -280,7 +280,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         self.agent = PandaGelSight(
             self.scene, self._control_freq, self._control_mode, initial_pose=sapien.Pose(), finger=self._finger
         )
-        self.agent.mounted_cameras = tuple(name for name in self._camera_names if name == "wrist")
+        self.agent.mounted_cameras = tuple(name for name in self.camera_names if name == "wrist")
 
     def _load_scene(self, options: dict):
         self._build_bench()

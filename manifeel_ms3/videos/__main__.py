@@ -138,7 +138,6 @@ def _check(args: Args) -> None:
     """
     if not args.files:
         raise InvalidArgumentError("no file is given; give a trajectory file (.h5) or a result of `manifeel eval` (.json)")
-    one_of("--camera", args.camera, (None, *CAMERAS))
     one_of("--pad", args.pad, SIDES)
     for name, least in SMALLEST.items():
         value = getattr(args, name)
@@ -174,6 +173,7 @@ def _take(source: Source, args: Args) -> Take:
         DemonstrationError: The recorded actions now fail where they succeeded before, or the other way round.
     """
     spec = task_spec(source.env_id)
+    one_of("--camera", args.camera, (None, *CAMERAS, *spec.env_class.own_cameras))
     view = View(args.camera or spec.policy_camera, args.pad)
     kind = "policy" if source.is_result else "demonstration"
     take = Take(f"{spec.name}, {kind}, seed {source.seed}", spec.force_limit)

@@ -79,8 +79,12 @@ def test_each_kind_changes_the_image_and_leaves_the_state(make_env, env, plain, 
 class PegFromAboveEnv(PegInsertionEnv):
     """PegInsertion with one more camera."""
 
+    own_cameras = ("above",)
+
     @property
     def _default_sensor_configs(self):
+        if "above" not in self.camera_names:
+            return super()._default_sensor_configs
         pose = sapien.Pose([0.5, 0.0, 0.6], [0.7071, 0.0, 0.7071, 0.0])
         above = CameraConfig("above", pose, 32, 32, fov=1.0, near=0.01, far=100, shader_config=camera_shader())
         return [*super()._default_sensor_configs, above]
@@ -90,14 +94,18 @@ class PegFromAboveEnv(PegInsertionEnv):
 def test_a_camera_that_a_task_adds_is_one_of_its_cameras():
     seen = {}
     for size in (0.0, 0.03):
-        env = PegFromAboveEnv(obs_mode="rgb", cameras=(), visual_randomization=dict(camera_position=size))
+        env = PegFromAboveEnv(obs_mode="rgb", cameras=("above",), visual_randomization=dict(camera_position=size))
         obs, info = env.reset(seed=5)
+        assert set(obs["sensor_data"]) == {"above"}
         seen[size] = obs["sensor_data"]["above"]["rgb"]
         env.close()
     assert info["looks"]["above_position"].abs().max() > 0.001
     assert not torch.equal(*seen.values())
+    env = PegFromAboveEnv(obs_mode="rgb")
+    assert set(env.reset(seed=5)[0]["sensor_data"]) == {"wrist"}  # it costs nothing where nobody asks for it
+    env.close()
     with pytest.raises(InvalidArgumentError, match="camera 'above' draw no albedo"):
-        PegFromAboveEnv(obs_mode="rgb+albedo", cameras=())
+        PegFromAboveEnv(obs_mode="rgb+albedo", cameras=("above",))
 
 
 @needs_renderer
