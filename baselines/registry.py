@@ -11,7 +11,7 @@ from typing import Any
 import tyro
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.command_line import as_typed
+from manifeel_ms3.command_line import as_typed, missing_extras_named
 from manifeel_ms3.errors import PluginError, UnknownNameError
 
 from . import tactile_representations as tactile_representations  # registers its encoders for every policy
@@ -52,6 +52,7 @@ class PolicySpec:
         Raises:
             PluginError: The policy names another class of settings than its arguments have, so that its checkpoints could not
                 be read.
+            MissingExtraError: Training needs an optional dependency that is not installed.
         """
         given, named = type(args.policy), self.policy_class.Config
         if given is not named:
@@ -60,7 +61,8 @@ class PolicySpec:
                 f"read as {named.__qualname__}; give the class {self.policy_class.__qualname__} the line "
                 f"`Config = {given.__qualname__}`"
             )
-        from .common.training import train  # imported here, because it takes seconds
+        with missing_extras_named():
+            from .common.training import train  # imported here, because it takes seconds
 
         return train(args, self.policy_class)
 

@@ -15,6 +15,11 @@ gc.disable()  # imports make many objects and no garbage: to search them again a
 try:
     from . import agents as agents
     from . import tasks as tasks
+except ImportError as error:
+    if Path(sys.argv[0]).stem != "manifeel" or os.environ.get("MANIFEEL_TRACEBACK"):
+        raise
+    sys.stderr.write(f"error: {error}; a dependency is missing or broken, and installing manifeel-ms3 again repairs it\n")
+    sys.exit(1)
 except KeyboardInterrupt:
     if Path(sys.argv[0]).stem != "manifeel":
         raise

@@ -39,6 +39,7 @@ RENDERER_REMEDY = (
     "Without a GPU: install Mesa 24.3 or newer, libvulkan1, libegl1 and libgl1, as scripts/setup.sh does. With a GPU: install "
     "its driver and libvulkan1. Until then, use obs_mode='state' or 'tacff' with render_backend='none'."
 )
+CACHE_REMEDY = f"Set the environment variable {CACHE_DIR} to a folder that can be written."
 
 
 @dataclass(frozen=True)
@@ -118,14 +119,19 @@ def _simulation() -> Finding:
     ran = _run(MAKE_WITHOUT_RENDERER + STEP)
     if ran.worked:
         return Finding("a step with touch", True, "works")
-    return Finding("a step with touch", False, ran.reason, "Repair the packages that are listed above.")
+    return Finding("a step with touch", False, ran.reason, _remedy(ran.reason, "Repair the packages that are listed above."))
 
 
 def _images() -> Finding:
     ran = _run(MAKE_WITH_IMAGES + STEP + RENDERER)
     if ran.worked:
         return Finding("a step with images", True, f"works, with Vulkan on the {ran.out.upper()}")
-    return Finding("a step with images", False, ran.reason.partition(". ")[0], RENDERER_REMEDY)
+    return Finding("a step with images", False, ran.reason.partition(". ")[0], _remedy(ran.reason, RENDERER_REMEDY))
+
+
+def _remedy(reason: str, usual: str) -> str:
+    """The usual remedy of a step that fails, or that of a cache that cannot be written, if that is the reason."""
+    return CACHE_REMEDY if CACHE_DIR in reason else usual
 
 
 def _disk() -> Finding:
@@ -142,8 +148,7 @@ def _cache() -> Finding:
             probe.write_text("")
             probe.unlink()
     except MachineError as error:
-        remedy = f"Set the environment variable {CACHE_DIR} to a folder that can be written."
-        return Finding("cache", False, str(error.__cause__ or error), remedy)
+        return Finding("cache", False, str(error.__cause__ or error), CACHE_REMEDY)
     return Finding("cache", True, str(folder))
 
 

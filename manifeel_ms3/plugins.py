@@ -13,7 +13,8 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-from .errors import PluginError, UnknownNameError
+from .command_line import missing_extras_named
+from .errors import MissingExtraError, PluginError, UnknownNameError
 
 TASKS = "manifeel.tasks"
 """Modules that register tasks when they are imported (`manifeel_ms3.tasks.registry.register_task`)."""
@@ -59,13 +60,17 @@ def load(group: str, name: str) -> Any:
 
     Raises:
         UnknownNameError: No plug-in of this name is registered.
+        MissingExtraError: The plug-in needs an optional dependency that is not installed.
         PluginError: The plug-in does not import.
     """
     points = registered(group)
     if name not in points:
         raise UnknownNameError(f"{name!r} is not registered in {group}; registered are {list(points)}")
     try:
-        return points[name].load()
+        with missing_extras_named():
+            return points[name].load()
+    except MissingExtraError:
+        raise
     except Exception as error:  # a plug-in may raise anything
         raise PluginError(
             f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); repair "

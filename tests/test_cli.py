@@ -11,6 +11,7 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import tyro
@@ -18,7 +19,7 @@ import tyro
 from baselines import floors
 from baselines.flow_matching import train as flow_matching
 from baselines.tactile_representations import pretrain
-from manifeel_ms3 import cli, command_line
+from manifeel_ms3 import cli, command_line, plugins
 from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import TRACEBACK, missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
@@ -254,6 +255,25 @@ def test_a_command_without_its_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "baselines.studies.__main__", raising=False)
     assert cli.main(["study", "configs/smoke.yaml"]) == 1
     assert "error: ray is not installed: pip install 'manifeel-ms3[study]'" in capsys.readouterr().err
+
+
+def test_a_plug_in_without_an_extra_names_the_extra(monkeypatch):
+    def load():
+        raise ModuleNotFoundError("No module named 'diffusers'", name="diffusers")
+
+    monkeypatch.setattr(plugins, "registered", lambda _: dict(lacking=SimpleNamespace(load=load)))
+    with pytest.raises(MissingExtraError, match=r"diffusers is not installed: pip install 'manifeel-ms3\[train\]'"):
+        plugins.load("manifeel.policies", "lacking")
+
+
+@pytest.mark.parametrize(("program", "lines"), [("manifeel", 1), ("of_ones_own", None)])
+def test_a_command_without_a_dependency_is_one_line(program, lines):
+    code = f"import sys; sys.modules['torch'] = None; sys.argv = ['bin/{program}', 'doctor']; import manifeel_ms3"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert ("Traceback" in done.stderr) == (lines is None)
+    assert lines is None or len(done.stderr.splitlines()) == lines
+    assert "torch" in done.stderr
 
 
 def test_what_a_worker_refuses_is_a_message_too(tmp_path, capsys):

@@ -61,6 +61,9 @@ def test_a_full_disk_and_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
     monkeypatch.setenv("MANIFEEL_CACHE_DIR", str(tmp_path / "file"))
     assert doctor._cache().ok is False
     assert "MANIFEEL_CACHE_DIR" in doctor._cache().remedy
+    failed = doctor._Ran(False, "", "MachineError: derived files cannot be kept in /none; set MANIFEEL_CACHE_DIR")
+    monkeypatch.setattr(doctor, "_run", lambda _: failed)
+    assert {doctor._images().remedy, doctor._simulation().remedy} == {doctor._cache().remedy}
 
 
 def test_the_page_about_trouble_shows_the_columns_and_the_checks_of_the_program():

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from manifeel_ms3.command_line import missing_extras_named
+from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest
 
@@ -35,9 +37,13 @@ def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy])
 
     Raises:
         CheckpointError: The config does not describe this policy.
+        MissingExtraError: Its networks need an optional dependency that is not installed.
     """
     try:
-        return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
+        with missing_extras_named():
+            return policy_class(_from_json(policy_class.Config, config["policy"]), spec_of(config), config["action_dim"])
+    except MissingExtraError:
+        raise
     except Exception as error:  # the config may come from a stranger
         raise CheckpointError(
             f"config does not describe the policy {policy_class.name!r} ({error!r}); evaluate it with the code that trained it"

@@ -60,7 +60,7 @@ def publish(jobs: list[Job], root: Path, folder: Path, name: str | None = None, 
         _check_places(results, folder)
         with atomic_folder(folder, replace=True) as partial:
             given = {key: value for key, value in dict(name=name, authors=authors).items() if value}
-            about = dict(name=folder.absolute().name) | _copy_old(folder, partial) | given
+            about: dict[str, Any] = dict(name=folder.absolute().name) | _copy_old(folder, partial) | given
             if "authors" not in about:
                 raise InvalidArgumentError(f"{folder} is a new submission; give --authors, the names of those who made it")
             hashes = about.get("checkpoints", {}) | _publish_results(results, partial)
