@@ -207,7 +207,7 @@ def _grid(entry: Any, place: str) -> Grid:
             if sensing := sorted(names & {*SENSING}):
                 raise InvalidArgumentError(f"{sensing} of a task are set by the study itself; use `obs_modes` and `cameras`")
         if any("control_mode" in further for further in grid.evaluation_args):
-            raise InvalidArgumentError("evaluation_args: a policy acts with the control_mode of its demonstrations; use `task_args`")
+            raise InvalidArgumentError("evaluation_args: a policy has the control_mode of its demonstrations; use `task_args`")
         for policy in grid.policies:
             one_of(f"preset of {policy}", grid.preset, policy_spec(policy).presets)
         _check_sensing(grid)

@@ -370,7 +370,7 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ),
         ("grids: [{tasks: table I, task_args: {fitt: paper}}]", r"grids/0: .* has no arguments \['fitt'\]; choose from"),
         ("grids: [{tasks: table I, evaluation_args: [{}, {imperfection: {delay: 2}}]}]", r"no arguments \['imperfection'\]"),
-        ("grids: [{tasks: table I, evaluation_args: [{control_mode: pd_ee_pose}]}]", "acts with the control_mode of its dem"),
+        ("grids: [{tasks: table I, evaluation_args: [{control_mode: pd_ee_pose}]}]", "has the control_mode of its dem"),
         ("grids: [{tasks: table I, evaluation_args: [{obs_mode: rgb}]}]", r"grids/0: \['obs_mode'\] of a task are set by the"),
         (
             "grids: [{tasks: table I, task_args: {sensor_configs: {width: 2026-01-02}}}]",
