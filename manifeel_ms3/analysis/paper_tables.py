@@ -158,7 +158,7 @@ def overview_of_table_one(found: Found) -> dict[str, tuple[TrainingSettings, dic
     """The settings of each task of Table I that was run, and its conditions by observation mode.
 
     Where a task was run with several settings, these are the ones with which most of its observation modes were run; among
-    equals, the ones of the fullest training (`presets.FULLEST`).
+    equals, the ones with most training seeds in every mode, and then those of the fullest training (`presets.FULLEST`).
 
     Args:
         found: The results that enter comparisons.
@@ -170,8 +170,15 @@ def overview_of_table_one(found: Found) -> dict[str, tuple[TrainingSettings, dic
             for settings, condition in answering(paper_condition(task, mode), found).items():
                 by_settings.setdefault(settings, {})[mode] = condition
         if by_settings:
-            overview[task] = min(by_settings.items(), key=lambda item: (-len(item[1]), item[0].fullness))
+            overview[task] = min(
+                by_settings.items(), key=lambda item: (-len(item[1]), -_num_seeds(item[1], found), item[0].fullness)
+            )
     return overview
+
+
+def _num_seeds(by_mode: dict[str, Condition], found: Found) -> int:
+    """The number of training seeds of the condition that has the fewest."""
+    return min(len(found[condition].success) for condition in by_mode.values())
 
 
 def draw_sensing_by_task(found: Found, out: Path) -> bool:

@@ -69,9 +69,10 @@ CHART = """
 ![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})
 
 Success in the tasks of the paper's Table I by what the policy senses; the preset of its training is below each task: `paper` or
-`cpu_long` where all sensings were run with it, otherwise `cpu`. The thin lines are 95 % intervals, which cover the
-variation over training only in tasks with several training seeds. Black lines are the paper's rates, which come from larger
-networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
+`cpu_long` where all sensings were run with it and as many training seeds, otherwise `cpu`. The thin lines are 95 % intervals,
+which cover the variation over training only in tasks with several training seeds. Black lines are the paper's rates, which
+come from larger networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the
+numbers.
 """
 AGAIN = """
 The success rate of each run links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is

@@ -64,15 +64,19 @@ def test_results_that_a_killed_process_was_copying_are_left_out(tmp_path):
     assert len(results_in(tmp_path)) == 2
 
 
-def test_the_overview_of_table_one_has_the_fullest_training_of_which_every_sensing_was_run(tmp_path):
+def test_the_overview_of_table_one_has_the_fullest_training_that_was_run_with_every_sensing_and_most_seeds(tmp_path):
     for preset, modes in (("cpu", MODES), ("cpu_long", MODES), ("paper", (VISION,))):
         for mode in modes:
             write_run(tmp_path, mode, 0.2, preset=preset)
     write_run(tmp_path, VISION, 0.2, preset="cpu", task="USBInsertion")
+    for preset, seeds in dict(cpu=(0, 1), cpu_long=(0,)).items():
+        for seed in seeds:
+            write_run(tmp_path, VISION, 0.2, seed, "GearAssembly", preset=preset)
     overview = overview_of_table_one(collect(results_in(tmp_path)))
     assert {task: (settings.preset, list(by_mode)) for task, (settings, by_mode) in overview.items()} == {
         "PegInsertion": ("cpu_long", list(MODES)),
         "USBInsertion": ("cpu", [VISION]),
+        "GearAssembly": ("cpu", [VISION]),
     }
 
 
