@@ -61,7 +61,7 @@ def test_a_killed_worker_is_started_again_and_nothing_is_done_twice(study, tmp_p
     assert (tmp_path / "images/page.png").stat().st_size > 1000  # the curve of training
 
     board = tmp_path / "leaderboard"
-    study_command.main(study_command.Args(study, root, publish=board / "tiny"))
+    study_command.main(study_command.Args(study, root, publish=board / "tiny", authors="the authors of this test"))
     monkeypatch.chdir(tmp_path)
     (entry,) = (path.parents[1].relative_to(board).as_posix() for path in board.rglob("00000012.json"))
     about = json.loads((board / "tiny/submission.json").read_text())
