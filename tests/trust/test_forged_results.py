@@ -74,7 +74,7 @@ def test_a16_a_checkpoint_counts_once(folder):
     submission = read_submission(folder)
     with pytest.raises(SubmissionError, match=r"2 results of .* are of training seed 0, step 200"):
         check(submission)
-    with pytest.raises(ResultError, match=r"seed 0 and step 200: results/0/00000100.json and .*00000200.json; leave one"):
+    with pytest.raises(ResultError, match=r"seed 0 and step 200: results/0/00000100.json, with 50 .*00000200.json, with 50;"):
         collect(submission.results)
 
 
