@@ -24,6 +24,7 @@ import torch
 import tyro
 from torch.utils.data import DataLoader, Dataset
 
+from manifeel_ms3.demonstrations.formats.demonstration_format import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import group_of, open_trajectories, read_header
 from manifeel_ms3.wrappers import resized
 
@@ -56,6 +57,8 @@ class DiffusionPolicyDataset(Dataset):
     def __init__(self, path: Path):
         with open_trajectories(path) as file:
             episodes = [group_of(file, entry) for entry in read_header(path)["episodes"]]
+            if not all("obs" in episode for episode in episodes):
+                raise DemonstrationError(f"{path} holds no observations; `manifeel render-observations` makes a file with them")
             self.observations = [obs_process_fn(episode["obs"]) for episode in episodes]
             self.actions = [episode["actions"][()] for episode in episodes]
         self.windows = [(i, t) for i, actions in enumerate(self.actions) for t in range(len(actions))]

@@ -53,6 +53,15 @@ def owned(path: Path) -> Iterator[None]:
         held.release()
 
 
+def is_owned(path: Path) -> bool:
+    """Whether another process, or another part of this one, holds a file or folder in whose parent folder one can write."""
+    try:
+        with owned(path):
+            return False
+    except InUseError:
+        return True
+
+
 def _write_holder(path: Path) -> None:
     started = datetime.now(timezone.utc).isoformat(timespec="seconds")
     content = dict(pid=os.getpid(), host=socket.gethostname(), command=" ".join(sys.argv), since=started)

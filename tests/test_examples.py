@@ -14,12 +14,13 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from mani_skill.trajectory.dataset import ManiSkillTrajectoryDataset
 from mani_skill.utils.wrappers import CPUGymWrapper, FlattenRGBDObservationWrapper
 
+from manifeel_ms3.demonstrations.formats.demonstration_format import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.sensors import pad_pose
 from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.wrappers import PadsAsCamerasWrapper
-from tests.sample import observed_sample
+from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -128,6 +129,10 @@ def test_our_recordings_feed_the_loader_of_maniskills_diffusion_policy():
     first, last = dataset[0], dataset[len(dataset.actions[0]) - 1]
     assert np.array_equal(first["observations"]["state"][0], first["observations"]["state"][1])  # padded
     assert np.array_equal(last["actions"][1], dataset.actions[0][-1])
+    with pytest.raises(
+        DemonstrationError, match=r"holds no observations; `manifeel render-observations` makes a file with them"
+    ):
+        example.main(states_sample(PEG))
 
 
 def test_maniskills_trajectory_dataset_reads_our_recordings():

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from manifeel_ms3.errors import InUseError, MachineError
-from manifeel_ms3.ownership import owned
+from manifeel_ms3.ownership import is_owned, owned
 from manifeel_ms3.processes import process_exists
 
 HOLD = """
@@ -39,6 +39,14 @@ def test_the_second_process_is_told_who_holds_the_file(holder, tmp_path):
     assert str(error.value).count("argument") < 10  # the beginning of its command
     with owned(tmp_path / "other.h5"):  # another file is free
         pass
+
+
+def test_whether_a_file_is_held(holder, tmp_path):
+    assert is_owned(tmp_path / "file.h5")
+    assert not is_owned(tmp_path / "other.h5")
+    holder.kill()
+    holder.wait(PATIENCE)
+    assert not is_owned(tmp_path / "file.h5")
 
 
 def test_a_killed_process_leaves_nothing_that_blocks(holder, tmp_path):

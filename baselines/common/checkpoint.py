@@ -124,8 +124,12 @@ def prune(checkpoints: Path, keep: int, in_use: set[Path]) -> None:
             remove_folder(folder)
 
 
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
+def read_tensors(path: Path, mend: str = "the checkpoint is broken, use another") -> dict[str, torch.Tensor]:
     """The tensors of a safetensors file.
+
+    Args:
+        path: Path of the file.
+        mend: What the message of an error advises.
 
     Raises:
         CheckpointError: The file is missing or broken.
@@ -135,7 +139,7 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
             raise FileNotFoundError("no such file")
         return load_file(path)
     except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise CheckpointError(f"{path} cannot be read ({error}); the checkpoint is broken, use another") from error
+        raise CheckpointError(f"{path} cannot be read ({error}); {mend}") from error
 
 
 def require_fit(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:

@@ -51,6 +51,7 @@ from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, 
 log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
 """Folder of the checkpoints' evaluations in the folder of a run."""
+BROKEN_STATE = "older checkpoints hold no state of training: evaluate one of them, or train anew with --overwrite"
 RANK_SEED_STRIDE = 1_000_003
 """Difference between the noise seeds of two processes; a prime number that is larger than usual seeds."""
 
@@ -231,7 +232,7 @@ class Trainer:
         last = newest_checkpoint(self.checkpoints)
         saved = IMPLIED | checkpoint_config(last)
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
-        state = read_tensors(last / TRAINING_STATE)
+        state = read_tensors(last / TRAINING_STATE, BROKEN_STATE)
         self.order.load_state_dict(state)
         unpack(state, self.optimizer, self.policy, last, self.processes.rank)
         averaged = read_tensors(last / WEIGHTS)

@@ -31,6 +31,7 @@ from rich.table import Table
 from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import MachineError, WorkFailedError
 from manifeel_ms3.network import LOOPBACK
+from manifeel_ms3.ownership import is_owned
 
 from . import cost
 from .checks import require_valid_environments, require_valid_flags
@@ -189,7 +190,7 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
     """Run every job that is not done, show the progress until none is left, and return the errors by the jobs' keys.
 
     A job is given to Ray when its resources are free, so that jobs run in the study's order: Ray itself would do all recordings
-    first, since these wait for nothing.
+    first, since these wait for nothing. A job that another study does at present waits until that study has done it or stops.
     """
     _start_ray(address)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C; Ray's own handler prints a stack trace
@@ -201,7 +202,7 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
         waiting, running = [job for job in jobs if not is_done(job, root)], dict[Any, Job]()
         with Live(console=console, refresh_per_second=1) as live:
             while waiting or running:
-                while job := _next_job(study, waiting, running):
+                while job := _next_job(study, root, waiting, running):
                     waiting.remove(job)
                     needs = study.resources[job.kind]
                     _await_free(needs)
@@ -209,14 +210,14 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
                     needed = [results[need.key] for need in job.needs if need.key in results]
                     results[job.key] = task.remote(Path.cwd(), job, root, needs, *needed)
                     running[results[job.key]] = job
-                if not running:
+                if not running and not any(_is_held(job, root) for job in waiting):
                     raise MachineError(
                         f"{study.name}: {len(waiting)} jobs wait, and no machine of the cluster has room for the first of "
                         f"them, {waiting[0].title}; add a machine, and start the study again, which continues"
                     )
-                ended, _ = ray.wait(list(running), timeout=POLL_SECONDS, fetch_local=False)
-                for result in ended:
-                    del running[result]
+                for job in _ended(running):
+                    if _is_held(job, root):  # another study was faster
+                        waiting.insert(0, job)
                 live.update(progress(study, jobs, root))
         if not console.is_terminal:
             console.print()  # rich ends the table's last line in a terminal alone
@@ -225,8 +226,26 @@ def _run(study: Study, jobs: list[Job], root: Path, address: str | None, console
         ray.shutdown()
 
 
-def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job | None:
-    """The first waiting job whose needed jobs have ended and whose resources are free; None if there is none."""
+def _is_held(job: Job, root: Path) -> bool:
+    """Whether another process does a job at present."""
+    started = job.folder(root) / STARTED
+    return started.is_file() and is_owned(started)
+
+
+def _ended(running: dict[Any, Job]) -> list[Job]:
+    """The jobs that end within the time between two updates of the table; they are removed from those that run."""
+    if not running:
+        time.sleep(POLL_SECONDS)  # only jobs of other studies run
+        return []
+    results, _ = ray.wait(list(running), timeout=POLL_SECONDS, fetch_local=False)
+    return [running.pop(result) for result in results]
+
+
+def _next_job(study: Study, root: Path, waiting: list[Job], running: dict[Any, Job]) -> Job | None:
+    """The first waiting job that can start; None if there is none.
+
+    The jobs that it needs have ended, its resources are free, and no other study does it at present.
+    """
     taken = [study.resources[job.kind] for job in running.values()]
     available = ray.cluster_resources()
     free = {
@@ -237,7 +256,7 @@ def _next_job(study: Study, waiting: list[Job], running: dict[Any, Job]) -> Job 
     for job in waiting:
         needs = study.resources[job.kind]
         fits = needs.cpus <= free["CPU"] and needs.gpus <= free["GPU"]
-        if fits and not any(need.key in unfinished for need in job.needs):
+        if fits and not any(need.key in unfinished for need in job.needs) and not _is_held(job, root):
             return job
     return None
 
@@ -289,8 +308,6 @@ def _reason(job: Job, root: Path, errors: dict[str, str]) -> str:
     """
     if not all(is_done(need, root) for need in job.needs):
         return "a job that it needs is not done"
-    if elsewhere := [errors[need.key] for need in job.needs if need.key in errors]:
-        return f"a job that it needs was not done by this study, but is done by now ({elsewhere[0]})"
     if failed := read_status(path := job.folder(root) / FAILED):
         return f"{failed['error']} ({path} has the traceback)"
     return errors.get(job.key) or "its worker died"

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 import zipfile
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -22,6 +22,7 @@ from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import Resources, StudyError, read_study
 from manifeel_ms3.command_line import INTERRUPTED, PACKAGE
 from manifeel_ms3.errors import InUseError, MachineError
+from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import full_id, task_spec
@@ -72,28 +73,52 @@ def test_a04_a_status_that_was_cut_off_is_none(study, tmp_path):
     study_command.progress(read_study(study), [record], tmp_path)
 
 
-def test_a03_a_job_that_another_process_does_is_left_to_it(study, tmp_path):
-    """The other process is this one: a worker of Ray finds that it holds the job."""
+def test_a04_errors_in_all_episodes_are_no_result(tmp_path):
+    """The policy observes the right pad, and the evaluation has the left one."""
+    trained = Job("train", "a training", {})
+    kwargs = json.dumps(dict(render_backend="none", max_episode_steps=3, tactile_sensors=["left"]))
+    settings = dict(episodes=2, checkpoints=1, stop_at_success=False, half_precision=False, env_kwargs=kwargs)
+    job = Job("evaluate", "an evaluation", settings, (trained,))
+    train(tiny_args(trained.folder(tmp_path), steps=2))
+    for _ in range(2):  # also where the result is there already
+        with pytest.raises(
+            PolicyError, match=r"all 2 episodes ended in an error .*tactile_right.*; mend its cause, delete .*2\.json"
+        ):
+            perform(job, tmp_path, Resources())
+        assert not is_done(job, tmp_path)
+
+
+def test_a03_a_job_that_another_process_does_is_left_to_it_and_awaited(study, tmp_path, monkeypatch):
+    """The other process is this one. A worker of Ray finds that it holds the job; the study waits until it has done it."""
     record, *others = jobs_of(read_study(study))
-    with owned(record.folder(tmp_path) / STARTED), pytest.raises(study_command.StudyFailed) as error:
+    for job in others:
+        job.folder(tmp_path).mkdir(parents=True)
+        (job.folder(tmp_path) / DONE).write_text('{"seconds": 1}')
+    started, found = record.folder(tmp_path) / STARTED, []
+    is_held, progress = study_command._is_held, study_command.progress
+
+    def finding(*args) -> bool:
+        found.append(is_held(*args))
+        return found[-1]
+
+    def shown(*args):
+        started.write_text("{}")  # as the other process writes it after it took the lock
+        if any(found):
+            (started.parent / DONE).write_text('{"seconds": 1}')
+            other.close()
+        return progress(*args)
+
+    monkeypatch.setattr(study_command, "_is_held", finding)
+    monkeypatch.setattr(study_command, "progress", shown)
+    with ExitStack() as other:
+        other.enter_context(owned(started))
+        with pytest.raises(InUseError, match=f"is in use by process {os.getpid()} on"):
+            perform(record, tmp_path, Resources())
         study_command.main(study_command.Args(study, tmp_path))
-    first, *further = str(error.value).splitlines()[1:]
-    assert f"is in use by process {os.getpid()} on" in first
-    assert len(further) == len(others)
-    assert all("a job that it needs is not done" in line for line in further)
+    assert found[0] is False  # so that a worker was started
+    assert any(found)
+    assert started.read_text() == "{}"
     assert not (record.folder(tmp_path) / FAILED).exists()
-    with owned(record.folder(tmp_path) / STARTED), pytest.raises(InUseError):
-        perform(record, tmp_path, Resources())
-
-
-def test_a03_a_job_is_not_said_to_hold_a_file_that_another_study_holds(study, tmp_path):
-    """Another study did the recording while this one gave up the training that needs it."""
-    record, train, *_ = jobs_of(read_study(study))
-    record.folder(tmp_path).mkdir(parents=True)
-    (record.folder(tmp_path) / DONE).write_text('{"seconds": 1}')
-    held = "started.json is in use by process 7"
-    reason = study_command._reason(train, tmp_path, {record.key: held, train.key: held})
-    assert reason == f"a job that it needs was not done by this study, but is done by now ({held})"
 
 
 def test_b05_a_folder_that_cannot_be_written_is_told_before_anything_runs(study, tmp_path):

@@ -109,6 +109,16 @@ def test_a02_a_checkpoint_that_was_not_made_the_last_one_counts(linked, undistur
     require_equal(tmp_path / "run", undisturbed[0])
 
 
+def test_b06_a_broken_state_of_training_is_told_with_what_is_left_to_do(undisturbed, tmp_path):
+    shutil.copytree(undisturbed[0], tmp_path / "run", symlinks=True)
+    state = tmp_path / "run/checkpoints/last" / TRAINING_STATE
+    state.write_bytes(state.read_bytes()[:100])
+    with pytest.raises(
+        CheckpointError, match=r"training.safetensors cannot be read .*; older checkpoints .* anew with --overwrite"
+    ):
+        train(tiny_args(tmp_path / "run", resume=True))
+
+
 def test_b06_what_was_logged_after_the_checkpoint_does_not_stay(tmp_path):
     """A run that was killed long after its last checkpoint, in the middle of a line of the log."""
     run_dir, saved = tmp_path / "run", STEPS - 10
