@@ -18,7 +18,7 @@ from baselines.common.observation import observation_spec
 from baselines.common.train_args import planned_steps
 from baselines.registry import policy_spec, preset_cli
 from baselines.studies import __main__ as study_command
-from baselines.studies import cost
+from baselines.studies import cost, running
 from baselines.studies.checks import require_valid_flags
 from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.planning import Job, jobs_of
@@ -57,12 +57,12 @@ grids:
     assert len({job.key for job in jobs}) == len(jobs)
 
 
-def test_five_jobs_share_a_gpu_of_which_each_takes_a_fifth(study, monkeypatch):
-    monkeypatch.setattr(study_command.ray, "cluster_resources", lambda: dict(CPU=8.0, GPU=1.0))
+def test_five_jobs_share_a_gpu_of_which_each_takes_a_fifth(study, tmp_path, monkeypatch):
+    monkeypatch.setattr(running.ray, "cluster_resources", lambda: dict(CPU=8.0, GPU=1.0))
     tiny = replace(read_study(study), resources=dict(record=Resources(cpus=1, gpus=0.2)))
     job = jobs_of(tiny)[0]
-    assert study_command._next_job(tiny, [job], dict.fromkeys("abcd", job)) is job
-    assert study_command._next_job(tiny, [job], dict.fromkeys("abcde", job)) is None
+    assert running._next_job(tiny, tmp_path, [job], dict.fromkeys("abcd", job)) is job
+    assert running._next_job(tiny, tmp_path, [job], dict.fromkeys("abcde", job)) is None
 
 
 def test_other_looks_are_further_evaluations_of_the_same_policies():
@@ -451,7 +451,7 @@ def test_a_ray_that_does_not_start_is_one_line(study, tmp_path, monkeypatch, add
     def init(*_, **__):
         raise Exception("timed out\nduring startup")  # a bare one, as of Ray
 
-    monkeypatch.setattr(study_command.ray, "init", init)
+    monkeypatch.setattr(running.ray, "init", init)
     with pytest.raises(MachineError, match=re.escape(said)):
         study_command.main(study_command.Args(study, tmp_path / "root", address=address))
     assert not (tmp_path / "root/record").exists()

@@ -17,6 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from baselines.studies import __main__ as study_command
+from baselines.studies import running
 from baselines.studies.jobs import DONE, FAILED, STARTED, is_done, perform
 from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import Resources, StudyError, read_study
@@ -95,7 +96,7 @@ def test_a03_a_job_that_another_process_does_is_left_to_it_and_awaited(study, tm
         job.folder(tmp_path).mkdir(parents=True)
         (job.folder(tmp_path) / DONE).write_text('{"seconds": 1}')
     started, found = record.folder(tmp_path) / STARTED, []
-    is_held, progress = study_command._is_held, study_command.progress
+    is_held, progress = running._is_held, study_command.progress
 
     def finding(*args) -> bool:
         found.append(is_held(*args))
@@ -108,7 +109,7 @@ def test_a03_a_job_that_another_process_does_is_left_to_it_and_awaited(study, tm
             other.close()
         return progress(*args)
 
-    monkeypatch.setattr(study_command, "_is_held", finding)
+    monkeypatch.setattr(running, "_is_held", finding)
     monkeypatch.setattr(study_command, "progress", shown)
     with ExitStack() as other:
         other.enter_context(owned(started))
