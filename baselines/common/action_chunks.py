@@ -8,7 +8,8 @@ from mani_skill.utils import common
 
 from manifeel_ms3.evaluation.policy import Ask, EpisodePolicy, PolicyRequest
 
-from .observation import ObservationSpec, prepare
+from .observation import POSE, ObservationSpec, prepare
+from .pose_targets import POSITION, Command, rotations_of
 
 
 class ActionChunks(EpisodePolicy):
@@ -21,10 +22,12 @@ class ActionChunks(EpisodePolicy):
         obs_horizon: Number of observations that condition a prediction.
         ask: Function that returns the actions (n, A) of a prediction.
         limit: Largest size of a component of an action; infinite for controllers that take joint angles or poses.
+        pose_targets: Whether predictions are targets (`pose_targets`), which are reached by actions.
     """
 
-    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask, limit: float = 1.0):
+    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask, limit: float = 1.0, pose_targets: bool = False):
         self.spec, self.obs_horizon, self._ask, self._limit = spec, obs_horizon, ask, limit
+        self._pose_targets = pose_targets
         self.reset()
 
     @property
@@ -41,6 +44,7 @@ class ActionChunks(EpisodePolicy):
         self._seed, self._step = seed, 0
         self._window: deque[dict[str, np.ndarray]] = deque(maxlen=self.obs_horizon)
         self._actions: deque[np.ndarray] = deque()
+        self._command: Command | None = None
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
         """The action (A,) for the observation of an environment with `num_envs=1`."""
@@ -50,14 +54,28 @@ class ActionChunks(EpisodePolicy):
             window = [self._window[0]] * (self.obs_horizon - len(self._window)) + list(self._window)
             observation = {key: np.stack([step[key] for step in window]) for key in window[0]}
             self._actions.extend(self._ask(PolicyRequest(self._seed, self._step, observation)))
+            self._seen_from = observation[POSE][-1, POSITION]
         self._step += 1
-        return self._actions.popleft().clip(-self._limit, self._limit)
+        action = self._actions.popleft()
+        return self._action_to(action, obs) if self._pose_targets else action.clip(-self._limit, self._limit)
+
+    def _action_to(self, target: np.ndarray, obs: dict[str, Any]) -> np.ndarray:
+        """The action that leads to a target (A,), whose position is relative to where the tool was at the prediction."""
+        pose = self._prepared_one(POSE, obs)
+        tool = pose[POSITION].astype(float), rotations_of(pose[None])[0]
+        self._command = self._command or Command(*tool)
+        self._command.follow(*tool)
+        target = target.astype(float)
+        target[POSITION] += self._seen_from
+        action = self._command.action_to(target)
+        self._command.move(action)
+        return action
 
     def _prepared(self, obs: dict[str, Any]) -> dict[str, np.ndarray]:
-        prepared = {}
-        for key in self.spec.keys:
-            value: Any = obs
-            for part in key.split("/"):
-                value = value[part]
-            prepared[key] = prepare(key, common.to_numpy(value), self.spec)[0]
-        return prepared
+        return {key: self._prepared_one(key, obs) for key in self.spec.keys}
+
+    def _prepared_one(self, key: str, obs: dict[str, Any]) -> np.ndarray:
+        value: Any = obs
+        for part in key.split("/"):
+            value = value[part]
+        return prepare(key, common.to_numpy(value), self.spec)[0]

@@ -115,8 +115,13 @@ class PolicyAgent(PolicyOfPart):
         if not isinstance(steps, int) or steps < least:
             raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of at least {least}")
         self.inference_steps = steps
+        settings = self.policy.config
         self.make_episode_part = partial(
-            ActionChunks, self.policy.spec, self.policy.config.obs_horizon, limit=self.policy.action_normalizer.limit
+            ActionChunks,
+            self.policy.spec,
+            settings.obs_horizon,
+            limit=self.policy.action_normalizer.limit,
+            pose_targets=settings.action_form == "target",
         )
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False

@@ -17,6 +17,7 @@ from manifeel_ms3.progress import progress_bar
 
 from .memory import return_freed_memory
 from .observation import POSE, ObservationSpec, prepare
+from .pose_targets import POSITION, as_targets
 
 
 def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num_demos: int | None) -> list[Demonstration]:
@@ -140,6 +141,8 @@ class SequenceDataset:
         pred_horizon: Number of actions of a sample.
         action_horizon: Number of actions that are executed from the last observation on.
         device: Device that holds the frames.
+        pose_targets: Whether actions are samples as targets (`pose_targets`), with positions relative to the tool's at the last
+            observation.
     """
 
     def __init__(
@@ -150,8 +153,12 @@ class SequenceDataset:
         pred_horizon: int,
         action_horizon: int,
         device: torch.device,
+        pose_targets: bool = False,
     ):
-        self.spec, self.device, self.num_episodes = spec, device, len(episodes)
+        self.spec, self.device, self.num_episodes, self.pose_targets = spec, device, len(episodes), pose_targets
+        if pose_targets:
+            for episode in episodes:
+                episode["actions"] = as_targets(episode[POSE], episode["actions"])
         lengths = np.array([len(episode["actions"]) for episode in episodes])
         self.observations = {name: torch.as_tensor(a, device=device) for name, a in _joined(episodes, spec.keys).items()}
         self.actions = self.observations.pop("actions")  # (S, A)
@@ -177,7 +184,19 @@ class SequenceDataset:
     def sample(self, index: torch.Tensor) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         """The observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A) of the samples `index` (B,)."""
         obs_index = self._obs_index[index]
-        return {key: frames[obs_index] for key, frames in self.observations.items()}, self.actions[self._action_index[index]]
+        return {key: frames[obs_index] for key, frames in self.observations.items()}, self._actions_of(index)
+
+    @property
+    def actions_to_fit(self) -> torch.Tensor:
+        """All actions (S, A), or the targets (N, pred_horizon, A) of all samples."""
+        return self._actions_of(torch.arange(len(self))) if self.pose_targets else self.actions
+
+    def _actions_of(self, index: torch.Tensor) -> torch.Tensor:
+        actions = self.actions[self._action_index[index]]
+        if self.pose_targets:
+            seen_from = self.observations[POSE][self._obs_index[index, -1]]
+            actions[..., POSITION] -= seen_from[:, None, POSITION]
+        return actions
 
 
 def _joined(episodes: list[Demonstration], keys: list[str]) -> Demonstration:

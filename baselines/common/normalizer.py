@@ -73,14 +73,14 @@ class ActionNormalizer(Normalizer):
     its square root with its sign, so that 4 % of the largest action becomes 20 %.
 
     Args:
-        action_dim: Number of components of an action.
+        shape: Number of components of an action, or (T, A) if each step of a prediction has ranges of its own.
         root: Whether actions are replaced by their roots.
         pairs: Indices of components that are the x and y of a vector. Such a vector is divided by the root of its length, so
             that its direction stays.
     """
 
-    def __init__(self, action_dim: int, root: bool = False, pairs: Iterable[tuple[int, int]] = ()):
-        super().__init__(action_dim)
+    def __init__(self, shape: int | tuple[int, ...], root: bool = False, pairs: Iterable[tuple[int, int]] = ()):
+        super().__init__(shape)
         self.root, self.pairs = root, [list(pair) for pair in pairs]
 
     @property

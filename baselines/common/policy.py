@@ -39,6 +39,9 @@ class PolicyConfig:
     """Number of actions of a prediction that are executed before the next prediction."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
+    action_form: Literal["delta", "target"] = "delta"
+    """Form in which actions are predicted: "delta", how far the hand moves at a step, as in the paper, or "target", the pose
+    that it is to have (`baselines.common.pose_targets`). The actions that are executed are motions in both cases."""
     action_scale: Literal["linear", "root"] = "linear"
     """Scale of the actions in the loss: "linear" as in the paper, or "root", which gives more weight to the small
     actions with which parts are brought together."""
@@ -132,7 +135,8 @@ class VisuotactilePolicy(nn.Module):
         normalizers = {POSE: Normalizer(spec.pose_features)}
         normalizers |= {key: Normalizer.of_taxels(spec.taxel_shape) for key in spec.force_fields}
         self.obs_normalizers = nn.ModuleDict({module_name(key): one for key, one in normalizers.items()})
-        self.action_normalizer = ActionNormalizer(action_dim, config.action_scale == "root", self.action_pairs())
+        shape = (config.pred_horizon, action_dim) if config.action_form == "target" else action_dim
+        self.action_normalizer = ActionNormalizer(shape, config.action_scale == "root", self.action_pairs())
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:
         """The observation encoder, and the network over action sequences."""
@@ -153,7 +157,12 @@ class VisuotactilePolicy(nn.Module):
         raise NotImplementedError
 
     def fit_normalizers(self, observations: dict[str, torch.Tensor], actions: torch.Tensor) -> None:
-        """Fit the normalisers to the observations {key: (S, ...)} and actions (S, A) of the demonstrations."""
+        """Fit the normalisers to the demonstrations.
+
+        Args:
+            observations: Observations {key: (S, ...)}.
+            actions: Actions (S, A), or targets (S, pred_horizon, A), which have a range for each step of a prediction.
+        """
         for key in (POSE, *self.spec.force_fields):
             self.obs_normalizer(key).fit(observations[key])
         self.action_normalizer.fit(actions)
@@ -182,7 +191,7 @@ class VisuotactilePolicy(nn.Module):
 
     @torch.no_grad()
     def sample(self, obs: dict[str, torch.Tensor], inference_steps: int, generators: list[torch.Generator]) -> torch.Tensor:
-        """The actions (B, action_horizon, A) to execute next, with noise from B generators."""
+        """The actions or targets (B, action_horizon, A) to execute next, with noise from B generators."""
         actions = self.generate(self.condition(obs), inference_steps, generators)
         first = self.config.obs_horizon - 1
         return self.action_normalizer.restore(actions)[:, first : first + self.config.action_horizon]

@@ -69,3 +69,14 @@ def in_epochs(small: Args, epochs: int = 30) -> Args:
     assert small.steps is not None
     policy = replace(small.policy, pose_noise=0.03)  # standard deviation, where the pose has the range [-1, 1]
     return replace(small, policy=policy, steps=None, epochs=epochs, min_steps=small.steps)
+
+
+def with_targets(args: Args) -> Args:
+    """Settings with which a policy predicts the poses that the hand is to have, instead of its motions.
+
+    docs/training.md has the trials in which the USB plug is inserted far more often with them.
+
+    Args:
+        args: Settings of a training whose policy predicts motions.
+    """
+    return replace(args, policy=replace(args.policy, action_form="target", action_scale="root"))

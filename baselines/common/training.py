@@ -16,7 +16,7 @@ from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
-from manifeel_ms3.evaluation.checkpoint_config import IMPLIED, TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config
+from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config, with_implied
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.ownership import owned
@@ -44,6 +44,7 @@ from .encoders import load_pretrained
 from .memory import keep_freed_memory, lay_out_channels_last
 from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
+from .pose_targets import CONTROL_MODES
 from .processes import Processes
 from .run_log import RunLog, wandb_run_of
 from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, default_exp_name, planned_steps
@@ -123,7 +124,7 @@ class Trainer:
         episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
         spec = with_taxel_shape(spec, episodes[0])
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
-        self.dataset = SequenceDataset(episodes, spec, *horizons, self.device)
+        self.dataset = SequenceDataset(episodes, spec, *horizons, self.device, args.policy.action_form == "target")
         self.batch_size = args.batch_size * self.processes.count
         self.total_steps = planned_steps(args, self.dataset.num_episodes, len(self.dataset), self.batch_size)
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
@@ -218,7 +219,7 @@ class Trainer:
         lay_out_channels_last(policy)
         if self.args.tacrgb_weights and not self.args.resume:
             load_pretrained(policy, self.args.tacrgb_weights)
-        policy.fit_normalizers(self.dataset.observations, self.dataset.actions)
+        policy.fit_normalizers(self.dataset.observations, self.dataset.actions_to_fit)
         if self.args.compile:
             policy.encoder.compile()
             policy.action_network.compile()
@@ -230,7 +231,7 @@ class Trainer:
         On a CPU this is so bit for bit with up to two processes; the sum over more may round differently in another order.
         """
         last = newest_checkpoint(self.checkpoints)
-        saved = IMPLIED | checkpoint_config(last)
+        saved = with_implied(checkpoint_config(last))
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
         state = read_tensors(last / TRAINING_STATE, BROKEN_STATE)
         self.order.load_state_dict(state)
@@ -367,10 +368,13 @@ def learnable_task(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> d
     assert args.env_id is not None
     env_kwargs = recorded_env_kwargs(args.demos)
     mode = env_kwargs.get("control_mode") or task_spec(args.env_id).env_class.default_control_mode
-    if policy_class.control_modes is not None and mode not in policy_class.control_modes:
+    known, learner = policy_class.control_modes, f"the policy {policy_class.name!r}"
+    if args.policy.action_form == "target":
+        known, learner = CONTROL_MODES, "a policy with the action_form 'target'"
+    if known is not None and mode not in known:
         raise InvalidArgumentError(
-            f"the actions of {', '.join(map(str, args.demos))} are of the control mode {mode!r}, which the policy "
-            f"{policy_class.name!r} cannot learn; record them in one of {list(policy_class.control_modes)}, or train another"
+            f"the actions of {', '.join(map(str, args.demos))} are of the control mode {mode!r}, which {learner} cannot learn; "
+            f"record them in one of {list(known)}, or train another"
         )
     return env_kwargs
 

@@ -12,6 +12,7 @@ from baselines.common.policy import make_action_network
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.arguments import require_at_least
+from manifeel_ms3.errors import InvalidArgumentError
 
 from .networks import ACTION_PAIRS, POSE_PAIRS, EquivariantActionNetwork, EquivariantObservationEncoder
 
@@ -38,6 +39,11 @@ class EquivariantConfig(DiffusionConfig):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(1, hidden=self.hidden, action_fields=self.action_fields)
+        if self.action_form == "target":
+            raise InvalidArgumentError(
+                "action_form='target': the orientation of a target does not turn with the scene as a vector does, which the "
+                "networks of equivariant_diffusion_policy need; use 'delta'"
+            )
 
 
 class EquivariantDiffusionPolicy(DiffusionPolicy):

@@ -12,7 +12,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from baselines.common.presets import for_cpu, in_epochs
+from baselines.common.presets import for_cpu, in_epochs, with_targets
 from baselines.common.train_args import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
 from baselines.registry import PolicySpec, Preset, next_step, preset_cli
@@ -38,6 +38,9 @@ PRESETS = {
     ),
     "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
     "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
+    "cpu_targets": Preset(
+        "The preset `cpu_long`, with the hand's pose predicted instead of motions.", with_targets(in_epochs(CPU))
+    ),
 }
 
 SPEC = PolicySpec(FlowMatchingPolicy, Args, PRESETS)

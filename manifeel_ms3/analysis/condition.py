@@ -156,10 +156,11 @@ def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:
     """
     idle = {name for name, modes in OF_MODALITIES.items() if not set(modes) & set(obs_mode.split("+"))}
     no_settings = NO_SETTINGS | {"obs_mode"}
-    named = {n: value for n, value in config.items() if n not in no_settings and (n, value) not in IMPLIED.items()}
+    named = {name: value for name, value in config.items() if name not in no_settings}
     if named.get("steps", 0) is None and (epochs := config.get("epochs")) is not None:
         named["steps"] = f"{epochs} epochs, at least {config.get('min_steps', 1)}"
-    return tuple(sorted((name, value) for name, value in _flat(named) if name not in idle))
+    implied = {(name, json.dumps(value)) for name, value in IMPLIED.items()}
+    return tuple(sorted(setting for setting in _flat(named) if setting[0] not in idle and setting not in implied))
 
 
 def _flat(config: dict[str, Any]) -> Iterator[tuple[str, str]]:

@@ -1,5 +1,6 @@
 """The configuration that a checkpoint folder holds, and the hash of its files."""
 
+import copy
 import hashlib
 import json
 from pathlib import Path
@@ -15,8 +16,8 @@ TRAINING_STATE = "training.safetensors"
 TRAINING_LOSS = "losses/total_loss"
 """Name of the training loss in log.jsonl, the log beside the checkpoints."""
 
-IMPLIED = {"num_processes": 1}
-"""Settings that configurations of older versions lack, with the values that they count as having."""
+IMPLIED = {"num_processes": 1, "policy.action_form": "delta"}
+"""Settings that configurations of older versions lack, with the values that they count as having. Dots join nested names."""
 
 
 class CheckpointError(InvalidFileError):
@@ -45,6 +46,19 @@ def checkpoint_config(checkpoint: Path) -> dict[str, Any]:
     return config
 
 
+def with_implied(config: dict[str, Any]) -> dict[str, Any]:
+    """A configuration with the settings that it lacks because it is older than they are."""
+    complete = copy.deepcopy(config)
+    for name, value in IMPLIED.items():
+        *groups, last = name.split(".")
+        entries: Any = complete
+        for group in groups:
+            entries = entries.get(group) if isinstance(entries, dict) else None
+        if isinstance(entries, dict):
+            entries.setdefault(last, value)
+    return complete
+
+
 def samples_per_step(config: dict[str, Any]) -> int | None:
     """Number of samples in a gradient step of a training run, over all its processes.
 
@@ -54,7 +68,7 @@ def samples_per_step(config: dict[str, Any]) -> int | None:
     Returns:
         None if the configuration does not name them.
     """
-    of_each, processes = config.get("batch_size"), (IMPLIED | config)["num_processes"]
+    of_each, processes = config.get("batch_size"), with_implied(config)["num_processes"]
     return of_each * processes if isinstance(of_each, int) and isinstance(processes, int) else None
 
 
