@@ -36,7 +36,8 @@ class Command:
     """The pose that the controller has been commanded to reach, as `LimitedLeadEEPoseController` computes it.
 
     Args:
-        position: Position (3,) of the tool at the start of the episode, in m.
+        position: Position (3,) of the tool at the start of the episode, in m; the controller's own target may be some tenths of
+            a millimetre beside it there.
         rotation: Orientation of the tool there.
     """
 

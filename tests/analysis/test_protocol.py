@@ -130,6 +130,14 @@ def test_a_run_of_several_processes_is_of_another_condition_than_one_that_does_n
     assert together == alone | {"num_processes": "2"}
 
 
+def test_a_run_that_predicts_targets_is_of_another_condition_than_one_that_does_not_say_what_it_predicts():
+    config = config_of("diffusion_policy", "paper", "PegInsertion", "rgb", 0)
+    named, targets = (config | dict(policy=config["policy"] | dict(action_form=form)) for form in ("delta", "target"))
+    older = config | dict(policy={name: value for name, value in config["policy"].items() if name != "action_form"})
+    assert settings_of(older, "rgb") == settings_of(named, "rgb")
+    assert dict(settings_of(targets, "rgb")) == dict(settings_of(older, "rgb")) | {"policy.action_form": '"target"'}
+
+
 def test_a_length_in_epochs_needs_no_smallest_number_of_steps():
     """A policy of another package may have settings by the same names, and not all of them."""
     (steps,) = (value for name, value in settings_of(dict(steps=None, epochs=5), "rgb") if name == "steps")

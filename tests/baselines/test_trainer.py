@@ -238,8 +238,9 @@ def test_a_step_changes_the_weights_and_a_trainer_resumes_where_another_saved(tr
     assert config_file.parent.name == "00000003"
     config = json.loads(config_file.read_text())
     assert config.pop("num_processes") == 1
+    assert config["policy"].pop("action_form") == "delta"
     config["training_seconds"] = 1000.0
-    config_file.write_text(json.dumps(config))  # as versions wrote it that did not record the number of processes
+    config_file.write_text(json.dumps(config))  # as versions wrote it that did not have these settings
     second = Trainer(dataclasses.replace(trainer_args, resume=True), diffusion.DiffusionPolicy, Processes("cpu"))
     assert second.step == 3
     own, other = first.policy.state_dict(), second.policy.state_dict()
