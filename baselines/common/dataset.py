@@ -141,8 +141,7 @@ class SequenceDataset:
         pred_horizon: Number of actions of a sample.
         action_horizon: Number of actions that are executed from the last observation on.
         device: Device that holds the frames.
-        pose_targets: Whether actions are samples as targets (`pose_targets`), with positions relative to the tool's at the last
-            observation.
+        pose_targets: Whether samples hold targets (`pose_targets`) instead of actions.
     """
 
     def __init__(

@@ -67,7 +67,8 @@ def run_jobs(study: Study, jobs: list[Job], root: Path, address: str | None, sho
         results: dict[str, Any] = {}
         waiting, running = [job for job in jobs if not is_done(job, root)], dict[Any, Job]()
         while waiting or running:
-            while job := _next_job(study, root, waiting, running):
+            held = {job.key for job in waiting if _is_held(job, root)}
+            while job := _next_job(study, held, waiting, running):
                 waiting.remove(job)
                 needs = study.resources[job.kind]
                 _await_free(needs)
@@ -75,7 +76,7 @@ def run_jobs(study: Study, jobs: list[Job], root: Path, address: str | None, sho
                 needed = [results[need.key] for need in job.needs if need.key in results]
                 results[job.key] = task.remote(Path.cwd(), job, root, needs, *needed)
                 running[results[job.key]] = job
-            if not running and not any(_is_held(job, root) for job in waiting):
+            if not running and not held:
                 raise MachineError(
                     f"{study.name}: {len(waiting)} jobs wait, and no machine of the cluster has room for the first of "
                     f"them, {waiting[0].title}; add a machine, and start the study again, which continues"
@@ -140,10 +141,14 @@ def _ended(running: dict[Any, Job]) -> list[Job]:
     return [running.pop(result) for result in results]
 
 
-def _next_job(study: Study, root: Path, waiting: list[Job], running: dict[Any, Job]) -> Job | None:
-    """The first waiting job that can start; None if there is none.
+def _next_job(study: Study, held: set[str], waiting: list[Job], running: dict[Any, Job]) -> Job | None:
+    """The first waiting job that can start, because the jobs that it needs have ended and its resources are free; or None.
 
-    The jobs that it needs have ended, its resources are free, and no other study does it at present.
+    Args:
+        study: The study.
+        held: Keys of jobs that other studies do at present, which do not start.
+        waiting: The jobs that have not started, in their order.
+        running: The jobs that run, by their results.
     """
     taken = [study.resources[job.kind] for job in running.values()]
     available = ray.cluster_resources()
@@ -155,7 +160,7 @@ def _next_job(study: Study, root: Path, waiting: list[Job], running: dict[Any, J
     for job in waiting:
         needs = study.resources[job.kind]
         fits = needs.cpus <= free["CPU"] and needs.gpus <= free["GPU"]
-        if fits and not any(need.key in unfinished for need in job.needs) and not _is_held(job, root):
+        if fits and job.key not in held and not any(need.key in unfinished for need in job.needs):
             return job
     return None
 

@@ -57,12 +57,13 @@ grids:
     assert len({job.key for job in jobs}) == len(jobs)
 
 
-def test_five_jobs_share_a_gpu_of_which_each_takes_a_fifth(study, tmp_path, monkeypatch):
+def test_five_jobs_share_a_gpu_of_which_each_takes_a_fifth(study, monkeypatch):
     monkeypatch.setattr(running.ray, "cluster_resources", lambda: dict(CPU=8.0, GPU=1.0))
     tiny = replace(read_study(study), resources=dict(record=Resources(cpus=1, gpus=0.2)))
     job = jobs_of(tiny)[0]
-    assert running._next_job(tiny, tmp_path, [job], dict.fromkeys("abcd", job)) is job
-    assert running._next_job(tiny, tmp_path, [job], dict.fromkeys("abcde", job)) is None
+    assert running._next_job(tiny, set(), [job], dict.fromkeys("abcd", job)) is job
+    assert running._next_job(tiny, set(), [job], dict.fromkeys("abcde", job)) is None
+    assert running._next_job(tiny, {job.key}, [job], {}) is None  # another study does it
 
 
 def test_other_looks_are_further_evaluations_of_the_same_policies():
