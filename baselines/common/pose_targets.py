@@ -3,7 +3,8 @@
 A target is relative to the tool's position at the last observation, in m, and its orientation is that relative to a hand that
 points down, as a rotation vector in rad, both along the axes of the robot's base. A hand that is to be upright thus has the
 same orientation as its target wherever it is, and the sum of many small predicted motions need not be exact. Diffusion Policy
-(Chi et al. 2023, section 4.3) and UMI (Chi et al. 2024, section 4.1) found targets to be learnt better than motions.
+(Chi et al. 2023) learns positions better than velocities, and UMI (Chi et al. 2024) predicts poses relative to the present one.
+docs/training.md has the trials.
 
 The environment's actions stay motions. A `Command` follows the controller's own target, and so turns one into the other.
 """
