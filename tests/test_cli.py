@@ -252,7 +252,8 @@ def test_a_library_of_an_extra_is_named_with_the_extra(monkeypatch, capsys):
 
 def test_a_command_without_its_extra_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "baselines.studies.__main__", raising=False)
+    for module in ("__main__", "running"):  # the one that imports Ray as well
+        monkeypatch.delitem(sys.modules, f"baselines.studies.{module}", raising=False)
     assert cli.main(["study", "configs/smoke.yaml"]) == 1
     assert "error: ray is not installed: pip install 'manifeel-ms3[study]'" in capsys.readouterr().err
 
