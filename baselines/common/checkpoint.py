@@ -14,6 +14,9 @@ from manifeel_ms3.files import atomic_folder, atomic_write, remove_folder
 from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.paths import LAST_LINK
 
+BROKEN_STATE = "older checkpoints hold no state of training: evaluate one of them, or train anew with --overwrite"
+"""What the error about a broken state of training advises, since only the newest checkpoint holds one."""
+
 
 def save_checkpoint(
     folder: Path, config: dict[str, Any], weights: dict[str, torch.Tensor], training: dict[str, torch.Tensor]

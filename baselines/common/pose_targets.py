@@ -21,14 +21,14 @@ POSITION, ROTATION = slice(0, 3), slice(3, 6)
 """Components of an action or target that move, and that turn, the hand; the others, such as the gripper's, stay as they are."""
 CONTROL_MODES = tuple(mode for mode, axes in ACTION_AXES.items() if axes[:6] == ("x", "y", "z", "roll", "pitch", "yaw"))
 """Control modes whose actions can be turned into targets."""
-POINTING_DOWN = Rotation.from_quat(np.roll(MIDDLE_QUATERNION, -1))  # scipy's quaternions end with w
+POINTING_DOWN = Rotation.from_quat(MIDDLE_QUATERNION, scalar_first=True)
 """Orientation of a hand that points down."""
 
 
 def rotations_of(poses: np.ndarray) -> Rotation:
     """The orientations of poses (T, 7) or (T, 9) in the form in which policies take them."""
     if poses.shape[1] == POSE_FEATURES["quaternion"]:
-        return Rotation.from_quat(np.roll(poses[:, 3:], -1, axis=1))
+        return Rotation.from_quat(poses[:, 3:], scalar_first=True)
     first, second = poses[:, 3:6], poses[:, 6:9]
     return Rotation.from_matrix(np.stack([first, second, np.cross(first, second)], axis=2))
 

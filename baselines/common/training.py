@@ -28,6 +28,7 @@ from manifeel_ms3.tasks.registry import task_spec
 from .agent import spec_of
 from .background_evaluation import SUCCESS, BackgroundEvaluation
 from .checkpoint import (
+    BROKEN_STATE,
     make_last,
     newest_checkpoint,
     pack,
@@ -52,7 +53,6 @@ from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, 
 log = logging.getLogger(__name__)
 EVALUATIONS = "evaluations"
 """Folder of the checkpoints' evaluations in the folder of a run."""
-BROKEN_STATE = "older checkpoints hold no state of training: evaluate one of them, or train anew with --overwrite"
 RANK_SEED_STRIDE = 1_000_003
 """Difference between the noise seeds of two processes; a prime number that is larger than usual seeds."""
 
