@@ -13,7 +13,7 @@ from tests.tasks_and_marks import PEG
 from tests.tiny_study import TINY
 
 torch.set_num_threads(1)
-LONG = ("test_studies", "test_training", "test_end_to_end", "test_recordings", "test_experts", "test_engine", "test_record")
+LONG = ("test_studies", "test_training", "test_end_to_end", "test_recorders", "test_experts", "test_engine", "test_record")
 """Names of files whose tests take minutes; they come in this order, so that none is left for the end."""
 
 

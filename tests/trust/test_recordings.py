@@ -11,75 +11,21 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 
-from manifeel_ms3.demonstrations import DemonstrationError, dataset, render_observations
-from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
+from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpisode, episode_folder, write_episode
-from manifeel_ms3.demonstrations.recording import STATES_FILE, make_header, open_recording
-from manifeel_ms3.errors import InUseError, ManifeelError
+from manifeel_ms3.demonstrations.recording import open_recording
+from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.files import remove_folder
-from manifeel_ms3.ownership import owned
 from manifeel_ms3.teleop.operator import Operator
 from manifeel_ms3.teleop.session import Session
-from tests.browser import wait_until
 from tests.tasks_and_marks import PEG
-from tests.trajectories import arrays_of, bytes_of
-from tests.trust.kills import PATIENCE, forked, recorded, start_recording, worker_processes
+from tests.trajectories import arrays_of
+from tests.trust.kills import PATIENCE, forked
+from tests.trust.made_up_recordings import HEADER, KWARGS, assert_same, made_up, record_made_up, seeds
 
-HEADER = make_header(PEG, dict(obs_mode="none")) | dict(failed_seeds=[])
-KWARGS = dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", fit="paper")
 ten_and_hundred = pytest.mark.parametrize("count", [10, pytest.param(100, marks=pytest.mark.slow)])
-two_and_hundred = pytest.mark.parametrize("count", [2, pytest.param(100, marks=pytest.mark.slow)])
-
-
-def seeds(path: Path) -> list[int]:
-    """Seeds of the episodes in a file's json; each episode must have as many actions as the json says."""
-    episodes = read_header(path)["episodes"]
-    with open_trajectories(path) as file:
-        for episode in episodes:
-            assert len(file[f"traj_{episode['episode_id']}/actions"]) == episode["elapsed_steps"]
-    return [episode["episode_seed"] for episode in episodes]
-
-
-def assert_same(path: Path, undisturbed: Path) -> None:
-    """Check that two recordings are equal, and that a killed one left nothing but its lock."""
-    assert path.read_bytes() == undisturbed.read_bytes() or bytes_of(path) == bytes_of(undisturbed)
-    assert path.with_suffix(".json").read_text() == undisturbed.with_suffix(".json").read_text()
-    assert sorted(file.name for file in path.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))) == sorted(
-        file.name for file in undisturbed.parent.iterdir() if not file.name.endswith((".lock", ".holder.json"))
-    )
-
-
-def made_up(seed: int) -> RecordedEpisode:
-    """A small episode, all of whose arrays tell its seed."""
-    steps = 3 + seed
-    arrays = dict(actions=np.full((steps, 6), seed, np.float32), env_states=dict(peg=np.full((steps + 1, 13), seed)))
-    return RecordedEpisode(seed, arrays, dict(elapsed_steps=steps, success=True, peak_contact_force=1.0))
-
-
-def record_made_up(path: Path, num: int, say=lambda word: None) -> None:
-    """What `record` does with its files, without a simulator; episodes finish in another order than they enter the file."""
-    with open_recording(path, HEADER, range(20)) as recording:
-        if recording.is_complete and len(recording.infos) >= num:
-            return
-        recording.begin()
-        left = [seed for seed in range(num + 1) if seed not in recording.infos and seed not in recording.failed]
-        for seed in sorted(left, key=lambda seed: seed ^ 1):
-            if seed == 1:
-                recording.reject(seed)
-            elif seed in recording.kept:
-                recording.accept_kept(seed)
-            else:
-                write_episode(recording.drafts, made_up(seed))
-                recording.accept(seed, made_up(seed).info)
-            for entered in recording.infos:
-                say(str(entered))
-        recording.finish()
-
-
-# -------------------------------------------------------------------- kills at every moment, without a simulator
 
 
 def kill_at_random(work, path: Path, count: int, held: set[int], chance: random.Random) -> int:
@@ -221,67 +167,6 @@ def test_a01_saves_of_teleoperation_are_killed_at_random_moments(make_env, tmp_p
     figure("kills of teleoperation's save", kills, at_least=count)
 
 
-# -------------------------------------------------------------------- real recordings
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("undisturbed") / "t.h5"
-    assert recorded(path, 3)[:2] == (0, 3)
-    return path
-
-
-def test_a01_a_kill_while_the_episodes_are_deleted_loses_nothing(undisturbed, tmp_path):
-    path = tmp_path / "t.h5"
-    assert recorded(path, 2, ["os.remove", "'seed_", 1])[0] == -signal.SIGKILL
-    assert len(seeds(path)) == 2
-    assert recorded(path, 3)[:2] == (0, 1)
-    assert_same(path, undisturbed)
-
-
-def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_path):
-    path = tmp_path / "t.h5"
-    first = start_recording(path, 3)
-    assert first.stdout.readline() == "begin\n"
-    wait_until(path.is_file, PATIENCE)
-    code, episodes, errors = recorded(path, 3)
-    assert (code, episodes) == (1, 0)
-    assert f"t.h5 is in use by process {first.pid}" in errors
-    assert "Traceback" not in errors
-    assert first.communicate(timeout=PATIENCE)[0].count("episode") == 3
-    assert_same(path, undisturbed)
-
-
-def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
-    with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
-        render_observations.main(render_observations.Args(undisturbed, tmp_path / "t.h5"))
-    with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
-        Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",)))
-    with owned(tmp_path / "manifest.json"), pytest.raises(InUseError):
-        dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
-    with owned(tmp_path / PEG / STATES_FILE), pytest.raises(InUseError):
-        dataset.main(dataset.Args(tmp_path, (PEG,), num=1, obs_mode="none"))
-    Session(make_env(**KWARGS), PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",))).finish()  # nothing was saved
-    assert not list(tmp_path.glob("t.*"))
-
-
-def test_b09_workers_end_with_a_killed_recorder(undisturbed, tmp_path, figure):
-    path = tmp_path / "t.h5"
-    process = start_recording(path, 3, workers=2)
-    assert process.stdout.readline() == "begin\n"
-    assert process.stdout.readline() == "episode\n"
-    workers = worker_processes(process.pid)
-    assert len(workers) == 2
-    process.kill()
-    begin = time.monotonic()
-    process.wait()
-    alive = psutil.wait_procs(workers, PATIENCE)[1]
-    figure("time until workers have ended after kill -9 of the main process, s", time.monotonic() - begin, at_most=5)
-    assert not alive
-    assert recorded(path, 3)[0] == 0
-    assert_same(path, undisturbed)
-
-
 def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_path):
     with open_recording(tmp_path / "t.h5", HEADER) as dead:
         dead.begin()
@@ -296,35 +181,6 @@ def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_p
     assert not episode_folder(tmp_path / "t.h5").exists()
 
 
-@two_and_hundred
-def test_a01_record_is_killed_at_random_moments(undisturbed, tmp_path, count, figure):
-    """Real processes, killed at random times; every second time the workers are left to themselves."""
-    span, chance, kills, rounds = 6.0, random.Random(2), 0, 0
-    while kills < count:
-        path, held = tmp_path / f"killed{rounds}/t.h5", 0
-        for _ in range(10):
-            process = start_recording(path, 3, workers=1 + rounds % 2)
-            assert process.stdout.readline() == "begin\n"
-            begin = time.monotonic()
-            try:
-                process.wait(chance.uniform(0, span))
-                span = 0.5 * (span + time.monotonic() - begin)  # as long as this machine takes
-                break
-            except subprocess.TimeoutExpired:
-                kills += 1
-            process.kill() if kills % 2 else os.killpg(process.pid, signal.SIGKILL)
-            held += process.communicate()[0].count("episode")
-            if held or path.exists():
-                assert len(seeds(path)) >= held
-        assert recorded(path, 3)[0] == 0
-        assert_same(path, undisturbed)
-        rounds += 1
-    figure("kills of `record` with the simulator", kills, at_least=count)
-
-
-# -------------------------------------------------------------------- other misfortunes
-
-
 def test_b10_episodes_reach_the_disk_before_they_count(tmp_path):
     """Every file and folder is flushed before the renaming that makes it count (seen by strace where it is installed)."""
     trace = """
@@ -337,7 +193,7 @@ def see(event, given):
     if event == "os.rename":
         renamed.append((str(Path(given[0]).absolute()), str(Path(given[0]).absolute()) in flushed))
 sys.addaudithook(see)
-from tests.trust.test_recordings import record_made_up
+from tests.trust.made_up_recordings import record_made_up
 record_made_up(Path(sys.argv[1]), 2)
 record_made_up(Path(sys.argv[1]), 3)
 for name, was_flushed in renamed:
@@ -430,7 +286,7 @@ ASCII = """
 import sys
 from pathlib import Path
 from manifeel_ms3.files import read_json, write_json, write_text
-from tests.trust.test_recordings import record_made_up, seeds
+from tests.trust.made_up_recordings import record_made_up, seeds
 
 folder = Path(sys.argv[1])
 write_text(folder / "page.html", "\\u00dcbung \\u2713")
