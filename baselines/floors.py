@@ -11,7 +11,7 @@ import logging
 import shlex
 import sys
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -89,13 +89,14 @@ def _measure_task(env_id: str, args: Args) -> Path:
     floors, commands = _earlier(path, spec.revision)
     if floors.keys() <= set(args.policies):  # all are measured anew
         commands = []
-    command = THEN.join(dict.fromkeys([*commands, command_of(spec.env_id, args)]))
-    for name in args.policies:
+    for number, name in enumerate(args.policies, start=1):
         with tempfile.TemporaryDirectory() as folder:
             result = _evaluate(name, spec.env_id, demos, Path(folder), args)
         numbers = dict(episodes=len(result["episodes"])) | result["success_once"]
         floors[name] = numbers
         log.info("%s, %s: %s", spec.env_id, name, numbers)
+        measured = replace(args, policies=args.policies[:number])
+        command = THEN.join(dict.fromkeys([*commands, command_of(spec.env_id, measured)]))
         about = dict(schema=FLOORS_SCHEMA, env_id=spec.env_id, revision=spec.revision, git_commit=result["git_commit"])
         write_json(path, about | dict(command=command, floors={known: floors[known] for known in POLICIES if known in floors}))
     return path

@@ -50,12 +50,16 @@ class ManiFeelBenchmark(StepBenchmark):
         self.tasks = [task_spec(task) for task in tasks or all_tasks()]
         self.make = partial(LeRobotEnv, obs_mode=obs_mode, env_kwargs=env_kwargs)
         self.first_seed = FIRST_EVALUATION_SEED
-        modes = {spec.env_class.default_control_mode for spec in self.tasks}
+        self.env_kwargs = env_kwargs or {}
+        modes = {spec.control_mode(self.env_kwargs) for spec in self.tasks}
         self.has_gripper = any("gripper" in ACTION_AXES[mode] for mode in modes)
         self.env, self.made = None, None
 
     def get_tasks(self) -> list[Task]:
-        return [{"name": spec.env_id, "suite": spec.category, "instruction": spec.instruction} for spec in self.tasks]
+        return [
+            {"name": spec.env_id, "suite": spec.category, "instruction": spec.instruction_for(self.env_kwargs)}
+            for spec in self.tasks
+        ]
 
     def reset(self, task: Task) -> Any:
         if self.made != task["name"]:
@@ -81,7 +85,7 @@ class ManiFeelBenchmark(StepBenchmark):
         return {"success": bool(step_result.info.get("is_success", False))}
 
     def get_metadata(self) -> dict[str, Any]:
-        return {"max_steps": max(spec.max_episode_steps for spec in self.tasks)}
+        return {"max_steps": self.env_kwargs.get("max_episode_steps") or max(spec.max_episode_steps for spec in self.tasks)}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         return {"position": POSITION_DELTA, "rotation": ROTATION} | ({"gripper": GRIPPER} if self.has_gripper else {})

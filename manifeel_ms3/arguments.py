@@ -80,7 +80,7 @@ def require_positive(**flags: int | None) -> None:
     Raises:
         InvalidArgumentError: A number is less than 1.
     """
-    _require(1, {f"{_flag(name)} ": given for name, given in flags.items()})
+    _require(1, {f"{flag_of(name)} ": given for name, given in flags.items()})
 
 
 def require_not_negative(**flags: int | None) -> None:
@@ -92,7 +92,7 @@ def require_not_negative(**flags: int | None) -> None:
     Raises:
         InvalidArgumentError: A number is less than 0.
     """
-    _require(0, {f"{_flag(name)} ": given for name, given in flags.items()})
+    _require(0, {f"{flag_of(name)} ": given for name, given in flags.items()})
 
 
 def require_file(flag: str, path: Path, example: str) -> None:
@@ -110,7 +110,8 @@ def require_file(flag: str, path: Path, example: str) -> None:
         raise InvalidArgumentError(f"{flag} {path} is a folder; give the path of a file, such as {path / example}")
 
 
-def _flag(name: str) -> str:
+def flag_of(name: str) -> str:
+    """The flag of a command line for a name with underscores."""
     return f"--{name.replace('_', '-')}"
 
 

@@ -22,12 +22,12 @@ class ActionChunks(EpisodePolicy):
         obs_horizon: Number of observations that condition a prediction.
         ask: Function that returns the actions (n, A) of a prediction.
         limit: Largest size of a component of an action; infinite for controllers that take joint angles or poses.
-        pose_targets: Whether predictions are targets (`pose_targets`), which are reached by actions.
+        targets_of: Control mode whose actions reach the targets (`pose_targets`) that are predicted; None if actions are.
     """
 
-    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask, limit: float = 1.0, pose_targets: bool = False):
+    def __init__(self, spec: ObservationSpec, obs_horizon: int, ask: Ask, limit: float = 1.0, targets_of: str | None = None):
         self.spec, self.obs_horizon, self._ask, self._limit = spec, obs_horizon, ask, limit
-        self._pose_targets = pose_targets
+        self._targets_of = targets_of
         self.reset()
 
     @property
@@ -57,13 +57,15 @@ class ActionChunks(EpisodePolicy):
             self._seen_from = observation[POSE][-1, POSITION]
         self._step += 1
         action = self._actions.popleft()
-        return self._action_to(action, obs) if self._pose_targets else action.clip(-self._limit, self._limit)
+        if self._targets_of is None:
+            return action.clip(-self._limit, self._limit)
+        return self._action_to(action, obs, self._targets_of)
 
-    def _action_to(self, target: np.ndarray, obs: dict[str, Any]) -> np.ndarray:
+    def _action_to(self, target: np.ndarray, obs: dict[str, Any], control_mode: str) -> np.ndarray:
         """The action that leads to a target (A,), whose position is relative to where the tool was at the prediction."""
         pose = self._prepared_one(POSE, obs)
         tool = pose[POSITION].astype(float), rotations_of(pose[None])[0]
-        self._command = self._command or Command(*tool)
+        self._command = self._command or Command(*tool, control_mode)
         self._command.follow(*tool)
         target = target.astype(float)
         target[POSITION] += self._seen_from

@@ -14,6 +14,7 @@ from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import MissingExtraError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config
 from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest
+from manifeel_ms3.tasks.registry import task_spec
 
 from .action_chunks import ActionChunks
 from .checkpoint import WEIGHTS, read_tensors, require_fit
@@ -28,8 +29,8 @@ TRIAL_STEPS = 3
 """Number of generation steps of a trial, and number of trials, in which a traced network must agree with the original; set
 once, not tuned."""
 ROUNDING = 1e-4
-"""Largest difference of an action, within [-1, 1], between the traced and the original network. Optimised convolutions round
-differently, which makes a difference of about 1e-6."""
+"""Largest difference of an action, within [-1, 1], or of a target, in m and rad, between the traced and the original network.
+Optimised convolutions round differently, which makes a difference of about 1e-6."""
 
 
 def build_policy(config: dict[str, Any], policy_class: type[VisuotactilePolicy]) -> VisuotactilePolicy:
@@ -111,17 +112,17 @@ class PolicyAgent(PolicyOfPart):
         self.device, self.seed, self.batch_size = torch.device(device or "cpu"), seed, batch_size or 1
         self.policy = build_policy(self.config, policy_class).to(self.device).eval()
         self.policy.load_state_dict(weights)
-        steps, least = inference_steps or self.config.get("inference_steps"), self.policy.config.least_inference_steps
-        if not isinstance(steps, int) or steps < least:
-            raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of at least {least}")
-        self.inference_steps = steps
+        steps = self.config.get("inference_steps") if inference_steps is None else inference_steps
         settings = self.policy.config
+        if not (isinstance(steps, int) and settings.can_generate_in(steps)):
+            raise CheckpointError(f"{checkpoint}: inference_steps={steps!r} must be a whole number of {settings.step_range}")
+        self.inference_steps = steps
         self.make_episode_part = partial(
             ActionChunks,
             self.policy.spec,
             settings.obs_horizon,
             limit=self.policy.action_normalizer.limit,
-            pose_targets=settings.action_form == "target",
+            targets_of=_control_mode(self.config) if settings.predicts_targets else None,
         )
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False
@@ -181,6 +182,11 @@ class PolicyAgent(PolicyOfPart):
             same = False
         if not same:
             self.policy.action_network = network
+
+
+def _control_mode(config: dict[str, Any]) -> str:
+    """The control mode of the demonstrations that a checkpoint was trained on."""
+    return task_spec(config["env_id"]).control_mode(config["env_kwargs"])
 
 
 def _generator_of(*numbers: int) -> torch.Generator:

@@ -4,14 +4,13 @@ import logging
 import os
 import subprocess
 import sys
+import time
 from collections import deque
 from pathlib import Path
 
-from manifeel_ms3.evaluation.result import MEANS, read_result
+from manifeel_ms3.evaluation.result import MEANS, RATES, read_result
 
 log = logging.getLogger(__name__)
-RATES = ("success_once", "success_at_end", "success_paper", "fail_once", "fail_at_end", "gentle_success")
-"""Rates of a result that are logged."""
 SUCCESS = "eval/success_once"
 """Scalar that every evaluation logs."""
 NOT_FROM_HERE = ["-P"] if sys.version_info >= (3, 11) else []
@@ -39,6 +38,7 @@ class BackgroundEvaluation:
         self._arguments += ["--videos", "0"] if video else []
         self._waiting: deque[Path] = deque()
         self._running: tuple[Path, subprocess.Popen] | None = None
+        self._began = 0  # ns since the epoch, of the evaluation that is running
 
     @property
     def in_use(self) -> set[Path]:
@@ -71,6 +71,7 @@ class BackgroundEvaluation:
 
     def _start(self, checkpoint: Path) -> tuple[Path, subprocess.Popen]:
         self.folder.mkdir(parents=True, exist_ok=True)
+        self._began = time.time_ns()
         result = self._result(checkpoint).absolute()
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
         # an interrupted run may have evaluated another checkpoint of this step
@@ -83,8 +84,11 @@ class BackgroundEvaluation:
     def _read(self, checkpoint: Path, code: int) -> list[dict[str, float]]:
         path = self._result(checkpoint)
         if code != 0:
-            log.warning("the evaluation of %s failed; %s says why", checkpoint, path.with_suffix(".log"))
-            return []
+            made = path.is_file() and path.stat().st_mtime_ns > self._began
+            what = "video" if made else "evaluation"
+            log.warning("the %s of %s failed; %s says why", what, checkpoint, path.with_suffix(".log"))
+            if not made:
+                return []
         step, result = int(checkpoint.name), read_result(path)
         if (video := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
             video.replace(video.with_name(f"{step}.mp4"))  # the next evaluation records the same episode

@@ -88,10 +88,10 @@ def _require_same_shapes(file: Path, first: Demonstration, episodes: list[Demons
 
 
 def recorded_task(files: Iterable[Path]) -> str:
-    """Id of the task of which the first file that says it says that its episodes are.
+    """Id of the task that the episodes are of, from the first file that names one.
 
     Raises:
-        DemonstrationError: No file says it, or one is broken.
+        DemonstrationError: No file names one, or a file is broken.
     """
     files = list(files)
     for file in files:
@@ -141,7 +141,7 @@ class SequenceDataset:
         pred_horizon: Number of actions of a sample.
         action_horizon: Number of actions that are executed from the last observation on.
         device: Device that holds the frames.
-        pose_targets: Whether samples hold targets (`pose_targets`) instead of actions.
+        targets_of: Control mode whose actions are turned into targets (`pose_targets`); None if samples hold actions.
     """
 
     def __init__(
@@ -152,12 +152,12 @@ class SequenceDataset:
         pred_horizon: int,
         action_horizon: int,
         device: torch.device,
-        pose_targets: bool = False,
+        targets_of: str | None = None,
     ):
-        self.spec, self.device, self.num_episodes, self.pose_targets = spec, device, len(episodes), pose_targets
-        if pose_targets:
+        self.spec, self.device, self.num_episodes, self._targets_of = spec, device, len(episodes), targets_of
+        if targets_of:
             for episode in episodes:
-                episode["actions"] = as_targets(episode[POSE], episode["actions"])
+                episode["actions"] = as_targets(episode[POSE], episode["actions"], targets_of)
         lengths = np.array([len(episode["actions"]) for episode in episodes])
         self.observations = {name: torch.as_tensor(a, device=device) for name, a in _joined(episodes, spec.keys).items()}
         self.actions = self.observations.pop("actions")  # (S, A)
@@ -188,11 +188,11 @@ class SequenceDataset:
     @property
     def actions_to_fit(self) -> torch.Tensor:
         """All actions (S, A), or the targets (N, pred_horizon, A) of all samples."""
-        return self._actions_of(torch.arange(len(self))) if self.pose_targets else self.actions
+        return self._actions_of(torch.arange(len(self))) if self._targets_of else self.actions
 
     def _actions_of(self, index: torch.Tensor) -> torch.Tensor:
         actions = self.actions[self._action_index[index]]
-        if self.pose_targets:
+        if self._targets_of:
             seen_from = self.observations[POSE][self._obs_index[index, -1]]
             actions[..., POSITION] -= seen_from[:, None, POSITION]
         return actions

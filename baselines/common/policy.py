@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, cast
 import torch
 import torch.nn as nn
 
-from manifeel_ms3.arguments import require_at_least
+from manifeel_ms3.arguments import is_number, require_at_least
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
@@ -67,9 +67,30 @@ class PolicyConfig:
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
     @property
+    def predicts_targets(self) -> bool:
+        """Whether the policy predicts targets instead of actions."""
+        return self.action_form == "target"
+
+    @property
     def least_inference_steps(self) -> int:
         """Smallest number of generation steps that leads to the actions that the policy has learnt."""
         return 1
+
+    @property
+    def most_inference_steps(self) -> int | None:
+        """Largest number of generation steps; None if there is no limit."""
+        return None
+
+    def can_generate_in(self, steps: int) -> bool:
+        """Whether the policy can generate actions in a number of steps."""
+        most = self.most_inference_steps
+        return self.least_inference_steps <= steps and (most is None or steps <= most)
+
+    @property
+    def step_range(self) -> str:
+        """The numbers of generation steps that are possible, in words."""
+        most = self.most_inference_steps
+        return f"at least {self.least_inference_steps}" + ("" if most is None else f" and at most {most}")
 
     def __post_init__(self):
         if self.obs_horizon < 1 or self.action_horizon < 1:
@@ -82,6 +103,8 @@ class PolicyConfig:
                 f"first of obs_horizon={self.obs_horizon} observations, and action_horizon={self.action_horizon} actions are "
                 "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
             )
+        if not (is_number(self.pose_noise) and self.pose_noise >= 0):
+            raise InvalidArgumentError(f"pose_noise={self.pose_noise} must be a number of at least 0")
         require_at_least(1, noise_draws=self.noise_draws, mlp_width=self.mlp_width, mlp_blocks=self.mlp_blocks)
         if self.diffusion_step_embed_dim < LEAST_EMBED_DIM or self.diffusion_step_embed_dim % 2:
             raise InvalidArgumentError(
@@ -135,7 +158,7 @@ class VisuotactilePolicy(nn.Module):
         normalizers = {POSE: Normalizer(spec.pose_features)}
         normalizers |= {key: Normalizer.of_taxels(spec.taxel_shape) for key in spec.force_fields}
         self.obs_normalizers = nn.ModuleDict({module_name(key): one for key, one in normalizers.items()})
-        shape = (config.pred_horizon, action_dim) if config.action_form == "target" else action_dim
+        shape = (config.pred_horizon, action_dim) if config.predicts_targets else action_dim
         self.action_normalizer = ActionNormalizer(shape, config.action_scale == "root", self.action_pairs())
 
     def make_networks(self) -> tuple[nn.Module, nn.Module]:

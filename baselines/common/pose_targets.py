@@ -1,10 +1,10 @@
 """Actions as targets: the pose that the hand is to have at each step of a prediction, instead of how far it moves.
 
-A target is relative to the tool's position at the last observation, in m, and its orientation is that relative to a hand that
-points down, as a rotation vector in rad, both along the axes of the robot's base. A hand that is to be upright thus has the
-same orientation as its target wherever it is, and the sum of many small predicted motions need not be exact. Diffusion Policy
-(Chi et al. 2023) learns positions better than velocities, and UMI (Chi et al. 2024) predicts poses relative to the present one.
-docs/training.md has the trials.
+The position of a target is relative to the tool's at the last observation, in m. Its orientation is the rotation from a hand
+that points down, as a rotation vector in rad. Both are along the axes of the robot's base. A hand that is to be upright thus
+has the same orientation as its target wherever it is, and the sum of many small predicted motions need not be exact. Diffusion
+Policy (Chi et al. 2023) learns positions better than velocities, and UMI (Chi et al. 2024) predicts poses relative to the
+present one. docs/training.md has the trials.
 
 The environment's actions stay motions. A `Command` follows the controller's own target, and so turns one into the other.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.agents.controllers import LimitedLeadEEPoseControllerConfig as Controller
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, LOCKED_AXES
 
 from .observation import MIDDLE_QUATERNION, POSE_FEATURES
 
@@ -40,10 +40,12 @@ class Command:
         position: Position (3,) of the tool at the start of the episode, in m; the controller's own target may be some tenths of
             a millimetre beside it there.
         rotation: Orientation of the tool there.
+        control_mode: Control mode of the actions, one of `CONTROL_MODES`.
     """
 
-    def __init__(self, position: np.ndarray, rotation: Rotation):
+    def __init__(self, position: np.ndarray, rotation: Rotation, control_mode: str):
         self._position, self._rotation = position, rotation
+        self._locked = list(LOCKED_AXES.get(control_mode, ()))
 
     def follow(self, position: np.ndarray, rotation: Rotation) -> None:
         """Limit the lead of the command over the tool, before an action is added.
@@ -57,9 +59,12 @@ class Command:
         self._rotation = Rotation.from_rotvec(turn * _shortening(turn, Controller.target_lead_limit_rot)) * rotation
 
     def move(self, action: np.ndarray) -> None:
-        """Add an action (A,)."""
-        self._position = self._position + Controller.pos_upper * action[POSITION]
-        self._rotation = Rotation.from_rotvec(Controller.rot_upper * action[ROTATION]) * self._rotation
+        """Add an action (A,), whose components the controller limits to [-1, 1]."""
+        motion = np.clip(action, -1.0, 1.0)
+        turn = Controller.rot_upper * motion[ROTATION]
+        turn[self._locked] = 0.0
+        self._position = self._position + Controller.pos_upper * motion[POSITION]
+        self._rotation = Rotation.from_rotvec(turn) * self._rotation
 
     def as_target(self) -> np.ndarray:
         """The command as a target (6,), with its position in the base frame."""
@@ -81,15 +86,16 @@ def _shortening(vector: np.ndarray, limit: float) -> float:
     return limit / max(float(np.linalg.norm(vector)), limit)
 
 
-def as_targets(poses: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def as_targets(poses: np.ndarray, actions: np.ndarray, control_mode: str) -> np.ndarray:
     """Targets (T, A) of an episode's actions, with their positions in the base frame.
 
     Args:
         poses: Poses of the tool (T + 1, 7) or (T + 1, 9), in the form in which policies take them.
-        actions: Actions (T, A) of a control mode in `CONTROL_MODES`.
+        actions: Actions (T, A).
+        control_mode: Control mode of the actions, one of `CONTROL_MODES`.
     """
     positions, rotations, targets = poses[:, POSITION].astype(float), rotations_of(poses), actions.astype(np.float32)
-    command = Command(positions[0], rotations[0])
+    command = Command(positions[0], rotations[0], control_mode)
     for step in range(len(actions)):
         command.follow(positions[step], rotations[step])
         command.move(actions[step])

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import torch
 from tyro.conf import arg
 
-from manifeel_ms3.arguments import is_number, require_not_negative, require_positive
+from manifeel_ms3.arguments import flag_of, is_number, require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode, check_seed
@@ -175,8 +175,10 @@ def check_run(args: TrainArgs) -> None:
     check_seed(args.seed)
     if args.lr is not None and not (is_number(args.lr) and args.lr >= 0):
         raise InvalidArgumentError(f"--lr {args.lr} must be a number of at least 0")
-    if args.inference_steps < (least := args.policy.least_inference_steps):
-        raise InvalidArgumentError(f"--inference-steps {args.inference_steps}: this policy needs at least {least} to generate")
+    if not args.policy.can_generate_in(args.inference_steps):
+        raise InvalidArgumentError(
+            f"--inference-steps {args.inference_steps}: this policy needs {args.policy.step_range} to generate"
+        )
     if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):
         raise InvalidArgumentError(
             "--resume needs --run-dir or --exp-name, the folder or the name of the run to continue, and excludes --overwrite"
@@ -197,13 +199,18 @@ def check_evaluation(args: TrainArgs) -> None:
 
     Raises:
         InvalidArgumentError: They are not a json object, the task does not take one of them, or they ask for other observations
-            than those of the policy.
+            than those of the policy; or nothing is evaluated.
         MissingExtraError: The extra that videos need is not installed.
     """
     assert args.env_id is not None
     given = json_object("--eval-env-kwargs", args.eval_env_kwargs)
     check_argument_names(task_spec(args.env_id).env_class, given.keys() - {"max_episode_steps"})  # which gym.make takes
     check_obs_mode("--eval-env-kwargs", given, args.obs_mode)
+    for_evaluations = dict(eval_freq=args.eval_freq, eval_env_kwargs=given, capture_video=args.capture_video)
+    if not args.num_eval_episodes and (unused := [flag_of(name) for name, value in for_evaluations.items() if value]):
+        raise InvalidArgumentError(
+            f"{', '.join(unused)} without --num-eval-episodes: no checkpoint is evaluated; give a number of episodes, too"
+        )
     if args.num_eval_episodes and args.capture_video:
         with missing_extras_named():
             import manifeel_ms3.evaluation.video  # noqa: F401

@@ -120,11 +120,11 @@ class Trainer:
         seed_everything(args.seed)
 
         spec = spec_of(vars(args))
-        env_kwargs = learnable_task(args, policy_class)
+        env_kwargs, mode = learnable_task(args, policy_class)
         episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)
         spec = with_taxel_shape(spec, episodes[0])
         horizons = (args.policy.obs_horizon, args.policy.pred_horizon, args.policy.action_horizon)
-        self.dataset = SequenceDataset(episodes, spec, *horizons, self.device, args.policy.action_form == "target")
+        self.dataset = SequenceDataset(episodes, spec, *horizons, self.device, mode if args.policy.predicts_targets else None)
         self.batch_size = args.batch_size * self.processes.count
         self.total_steps = planned_steps(args, self.dataset.num_episodes, len(self.dataset), self.batch_size)
         amount = dict(total_steps=self.total_steps, num_processes=processes.count)
@@ -358,8 +358,8 @@ def with_taxel_shape(spec: ObservationSpec, episode: Demonstration) -> Observati
     return replace(spec, taxel_shape=shapes.pop()) if shapes else spec
 
 
-def learnable_task(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> dict:
-    """The arguments of the task with which the demonstrations were recorded.
+def learnable_task(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> tuple[dict, str]:
+    """The arguments of the task with which the demonstrations were recorded, and the control mode of their actions.
 
     Raises:
         InvalidArgumentError: The policy cannot learn actions of their control mode.
@@ -367,16 +367,16 @@ def learnable_task(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> d
     """
     assert args.env_id is not None
     env_kwargs = recorded_env_kwargs(args.demos)
-    mode = env_kwargs.get("control_mode") or task_spec(args.env_id).env_class.default_control_mode
+    mode = task_spec(args.env_id).control_mode(env_kwargs)
     known, learner = policy_class.control_modes, f"the policy {policy_class.name!r}"
-    if args.policy.action_form == "target":
+    if args.policy.predicts_targets:
         known, learner = CONTROL_MODES, "a policy with the action_form 'target'"
     if known is not None and mode not in known:
         raise InvalidArgumentError(
             f"the actions of {', '.join(map(str, args.demos))} are of the control mode {mode!r}, which {learner} cannot learn; "
             f"record them in one of {list(known)}, or train another"
         )
-    return env_kwargs
+    return env_kwargs, mode
 
 
 def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset: SequenceDataset, env_kwargs: dict) -> dict:

@@ -26,6 +26,10 @@ class DiffusionConfig(PolicyConfig):
         super().__post_init__()
         require_at_least(1, diffusion_steps=self.diffusion_steps)
 
+    @property
+    def most_inference_steps(self):
+        return self.diffusion_steps
+
 
 class DiffusionPolicy(VisuotactilePolicy):
     """Diffusion Policy (Chi et al. 2023), the CNN version: denoises an action sequence."""
@@ -56,9 +60,9 @@ class DiffusionPolicy(VisuotactilePolicy):
 
     def generate(self, condition, steps, generators):
         actions = self.noise(condition, generators)
-        full = self.config.sampler == "ddpm" and steps >= self.config.diffusion_steps
+        full = self.config.sampler == "ddpm" and steps == self.config.diffusion_steps
         scheduler: Any = self.ddpm if full else self.ddim
-        scheduler.set_timesteps(min(steps, self.config.diffusion_steps), device=condition.device)
+        scheduler.set_timesteps(steps, device=condition.device)
         for step in scheduler.timesteps:
             predicted = self.action_network(actions, step.expand(len(actions)), condition)
             extra = dict(generator=generators) if full else {}

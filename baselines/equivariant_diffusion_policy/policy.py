@@ -39,7 +39,7 @@ class EquivariantConfig(DiffusionConfig):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(1, hidden=self.hidden, action_fields=self.action_fields)
-        if self.action_form == "target":
+        if self.predicts_targets:
             raise InvalidArgumentError(
                 "action_form='target': the orientation of a target does not turn with the scene as a vector does, which the "
                 "networks of equivariant_diffusion_policy need; use 'delta'"

@@ -11,6 +11,7 @@ import torch.nn.functional as F  # noqa: N812
 
 from baselines.common.policy import PolicyConfig, VisuotactilePolicy, draw_rows
 from manifeel_ms3.arguments import require_at_least
+from manifeel_ms3.errors import InvalidArgumentError
 
 TIME_SCALE = 100.0
 """Factor from a time in [0, 1] to the range of diffusion steps for which the U-Net's embedding is made."""
@@ -39,6 +40,8 @@ class FlowConfig(PolicyConfig):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(1, segments=self.segments)
+        if not 0 < self.interval < 1:
+            raise InvalidArgumentError(f"interval={self.interval} must be a time between 0 and 1")
 
     @property
     def least_inference_steps(self):

@@ -54,8 +54,8 @@ class Args:
     """Print the plan and the hours that it will take, without running it."""
     publish: Path | None = None
     """Folder of a submission on the leaderboard, such as leaderboard/cpu, into which the results that are done are copied, with
-    a checkpoint of each row; nothing is run. Other results of the folder stay. Only evaluations with `half_precision: true` are
-    copied."""
+    the checkpoints of training seed 0; nothing is run. Other results of the folder stay. Only evaluations with
+    `half_precision: true` are copied."""
     name: str | None = None
     """Name of that submission; if not given, that which it has, or that of its folder."""
     authors: str | None = None
@@ -176,7 +176,7 @@ def _counts(jobs: list[Job], statuses: dict[str, Status], runs: dict[str, float]
     """
     of_kind = Counter(statuses[job.key] for job in jobs)
     left = [job for job in jobs if statuses[job.key] != "done"]
-    costs = [cost.estimate_from_runs(job, runs, needs.workers) for job in left]
+    costs = [cost.estimate_from_runs(job, runs, needs.workers, needs.gpus) for job in left]
     hours = "?" if None in costs else f"{sum(one.seconds for one in costs if one) / 3600 * needs.cpus:.2f}"
     return [*map(str, (of_kind["done"], of_kind["running"], of_kind["failed"], len(jobs))), hours]
 

@@ -26,7 +26,8 @@ from manifeel_ms3.tasks.registry import all_tasks, make_env, task_spec
 from .command_lines import device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
 from .planning import Job
-from .study import KINDS, OBS_MODE, SIMULATING, Kind
+from .study import KINDS, OBS_MODE, SIMULATING
+from .work import without_amounts, work_of
 
 TRIALS = "trials.json"
 """Name of the file of measured trials, in the folder of all jobs."""
@@ -44,15 +45,6 @@ TRIAL_BATCH = 2
 17 GB there, and 4 samples of its UniT encoder 9 GB."""
 ACTION_SIZE = 7
 """Size of the made-up actions: pose and gripper. The cost of a network does not depend on it measurably."""
-AMOUNTS = ("num", "episodes", "checkpoints", "version", "revision")
-"""Settings on which the cost of one demonstration, gradient step or episode does not depend."""
-AMOUNT_FLAGS = frozenset(
-    {
-        *("seed", "env-id", "cameras", "keep", "save-every", "num-demos", "tacrgb-weights"),
-        *("steps", "epochs", "min-iters"),
-    }
-)
-"""Flags of training on which the cost of one gradient step does not depend; a study's policies have one camera each."""
 
 
 @dataclass(frozen=True)
@@ -114,21 +106,22 @@ def estimate(job: Job, root: Path, workers: int, gpus: float = 0.0) -> CostEstim
         workers: Number of processes that simulate, or of threads that train.
         gpus: Number of GPUs that the study gives the job; trials run on the CPU without one, as the job does.
     """
-    known = estimate_from_runs(job, seconds_of_runs(root), workers)
+    known = estimate_from_runs(job, seconds_of_runs(root), workers, gpus)
     if known or job.kind == "pretrain":
         return known
-    return CostEstimate(_unit_seconds(job, root, workers, gpus) * _units(job) / _parallel(job, workers), "a trial")
+    return CostEstimate(_unit_seconds(job, root, workers, gpus) * _units(job), "a trial")
 
 
-def estimate_from_runs(job: Job, runs: dict[str, float], workers: int) -> CostEstimate | None:
+def estimate_from_runs(job: Job, runs: dict[str, float], workers: int, gpus: float = 0.0) -> CostEstimate | None:
     """How long a job will take if jobs like it were done here; None if there were none.
 
     Args:
         job: The job.
         runs: What `seconds_of_runs` gives.
         workers: Number of processes that simulate.
+        gpus: Number of GPUs that the study gives the job.
     """
-    seconds = runs.get(_work_key(job.kind, job.settings))
+    seconds = runs.get(work_of(job, gpus))
     return None if seconds is None else CostEstimate(seconds * _units(job) / _parallel(job, workers), "runs here")
 
 
@@ -143,35 +136,28 @@ def seconds_of_runs(root: Path) -> dict[str, float]:
     here, seconds = machine(), dict[str, list[float]]()
     for kind in KINDS:
         for path in root.glob(f"{kind}/*/{DONE}"):
-            ran_on, work, took = _run(kind, path, path.stat().st_mtime)
+            ran_on, work, took = _run(path, path.stat().st_mtime)
             if ran_on == here:
                 seconds.setdefault(work, []).append(took)
     return {work: float(np.median(took)) for work, took in seconds.items()}
 
 
 @cache
-def _run(kind: Kind, path: Path, _changed: float) -> tuple[Any, str, float]:
-    """Machine, work and seconds of a unit of a job that was done; no machine if its status file was cut off."""
+def _run(path: Path, _changed: float) -> tuple[Any, str, float]:
+    """Machine, work and seconds of a unit of a job that was done.
+
+    There is no machine if the status file was cut off, or if it is of an older version, which does not tell the work.
+    """
     status = read_status(path)
-    if "machine" not in status:
+    if not {"machine", "work"} <= status.keys():
         return None, "", 0.0
     took = status["seconds"] / max(status["units"], 1) * status["parallel"]
-    return status["machine"], _work_key(kind, status["settings"]), took
+    return status["machine"], status["work"], took
 
 
 def _parallel(job: Job, workers: int) -> int:
     """Number of processes that share the work of a job."""
     return workers if job.kind in SIMULATING else 1
-
-
-def _work_key(kind: Kind, settings: dict[str, Any]) -> str:
-    return json.dumps([kind, _work(settings)], sort_keys=True)
-
-
-def _work(settings: dict[str, Any]) -> dict[str, Any]:
-    """The settings on which the cost of one demonstration, gradient step or episode depends."""
-    flags = {name: value for name, value in settings.get("flags", {}).items() if name not in AMOUNT_FLAGS}
-    return {name: value for name, value in settings.items() if name not in AMOUNTS} | dict(flags=flags)
 
 
 def _units(job: Job) -> int:
@@ -211,26 +197,41 @@ def trials_of(job: Job, threads: int = 1, gpus: float = 0.0) -> tuple[Trial, ...
     if job.kind == "pretrain":
         return ()
     train = job if job.kind == "train" else job.needs[0]
-    device = "cuda" if gpus and torch.cuda.is_available() else "cpu"
-    preset, *flags = train_flags(_work(train.settings))
+    device = _device(gpus)
+    preset, *flags = train_flags(without_amounts(train.settings))
     where = ["--device", "cuda"] if device == "cuda" else device_arguments("train", 0)
     network = train.settings["policy"], preset, *where, *flags
     if job.kind == "train":
         return (Trial(gradient_step, network, threads),)
-    as_evaluated = "--device", device, "--batch-size", str(BATCH_SIZES[device])
+    as_evaluated = "--device", device, "--batch-size", str(_batch_size(gpus))
     return _simulation_trial(train.needs[0], training_args(train).obs_mode), Trial(inference, (*network, *as_evaluated))
 
 
-def _unit_seconds(job: Job, root: Path, threads: int, gpus: float) -> float:
-    """Seconds of one demonstration, gradient step or episode, with one process."""
-    seconds = [trial.seconds(root) for trial in trials_of(job, threads, gpus)]
+def _device(gpus: float) -> str:
+    """Device of the trials of a job to which the study gives so many GPUs."""
+    return "cuda" if gpus and torch.cuda.is_available() else "cpu"
+
+
+def _batch_size(gpus: float) -> int:
+    """Number of episodes that the policy of an evaluation answers together."""
+    return BATCH_SIZES[_device(gpus)]
+
+
+def _unit_seconds(job: Job, root: Path, workers: int, gpus: float) -> float:
+    """Seconds of one demonstration, gradient step or episode.
+
+    In an evaluation, a worker waits for the policy, whose process answers all workers, a batch of them at a time.
+    """
+    trials = trials_of(job, workers, gpus)
+    seconds = [trial.seconds(root) for trial in trials]
     if job.kind == "train":
         return seconds[0]
     env_id = job.settings["env_id"]
     if job.kind == "record":
-        return seconds[0] * _demonstration_steps(env_id)
+        return seconds[0] * _demonstration_steps(env_id) / workers
     limit = json.loads(job.settings["env_kwargs"]).get("max_episode_steps") or task_spec(env_id).max_episode_steps
-    return limit * (seconds[0] + seconds[1] / training_args(job.needs[0]).policy.action_horizon)
+    answer = seconds[1] / training_args(job.needs[0]).policy.action_horizon
+    return limit * max((seconds[0] + answer) / workers, answer / min(_batch_size(gpus), workers))
 
 
 def _simulation_trial(record: Job, obs_mode: str) -> Trial:

@@ -42,6 +42,7 @@ from .command_lines import (
 )
 from .planning import Job
 from .study import SIMULATING, Resources
+from .work import work_of
 
 Status = Literal["waiting", "running", "failed", "done"]
 DONE, STARTED, FAILED = "done.json", "started.json", "failed.json"
@@ -109,7 +110,8 @@ def _perform(job: Job, root: Path, needs: Resources) -> None:
             write_json(folder / FAILED, dict(error=f"{type(error).__name__}: {error}", traceback=traceback.format_exc()))
         raise
     parallel = needs.workers if job.kind in SIMULATING else 1
-    cost = dict(seconds=round(spent + time.time() - begin, 1), units=units, parallel=parallel, machine=machine())
+    cost = dict(seconds=round(spent + time.time() - begin, 1), units=units, parallel=parallel)
+    cost |= dict(machine=machine(), work=work_of(job, needs.gpus))
     write_json(folder / DONE, started | cost)
 
 

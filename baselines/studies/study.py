@@ -32,6 +32,7 @@ OF_THE_STUDY = {
     "env-id": "`tasks`",
     "obs-mode": "`obs_modes`",
     "cameras": "`cameras`",
+    "tactile-sensors": "the right pad, which is the only one in its recordings",
     "policy.encoder.tacrgb": "`encoders`",
     "num-demos": "`num_demos`",
     "seed": "`seeds`",

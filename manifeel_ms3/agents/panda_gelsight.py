@@ -76,6 +76,8 @@ ACTION_AXES = {
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
 """Names of the components of an action, in order, by delta control mode; rotations are about the axes of the base frame."""
+LOCKED_AXES = {"pd_ee_delta_pose_fixed_roll_pitch": (0, 1), "pd_ee_delta_pose_fixed_rotation": (0, 1, 2)}
+"""Axes of the base frame about which an action does not turn the hand, although it has components for them, by control mode."""
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)
 """Position of the wrist camera in the hand frame, in m (public code of the paper)."""
 WRIST_CAMERA_FORWARD = (-0.5, 0.0, np.sqrt(3) / 2)
@@ -172,8 +174,7 @@ class PandaGelSight(BaseAgent):
             target_lead_limit_pos=ABSOLUTE_LEAD_POS,
             target_lead_limit_rot=ABSOLUTE_LEAD_ROT,
         )
-        level = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1))
-        unturned = LimitedLeadEEPoseControllerConfig(**pose, locked_axes=(0, 1, 2))
+        locked = {mode: LimitedLeadEEPoseControllerConfig(**pose, locked_axes=axes) for mode, axes in LOCKED_AXES.items()}
         delta_yaw = LimitedLeadEEPoseControllerConfig(**pose, rotation_axes=(2,))
         joint_delta = drive | dict(lower=-JOINT_DELTA, upper=JOINT_DELTA, use_delta=True)
         arms = dict(  # each of these exists also with a gripper that keeps its grip
@@ -187,11 +188,8 @@ class PandaGelSight(BaseAgent):
         return deepcopy_dict(
             {name: dict(arm=arm, gripper=gripper) for name, arm in arms.items()}
             | {name + FIXED_GRIPPER: dict(arm=arm, gripper=hold) for name, arm in arms.items()}
-            | dict(
-                pd_ee_delta_pose_fixed_roll_pitch=dict(arm=level, gripper=gripper),  # 7-D, of which two do nothing
-                pd_ee_delta_pose_fixed_rotation=dict(arm=unturned, gripper=gripper),  # 7-D, of which three do nothing
-                pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper),  # 5-D
-            )
+            | {mode: dict(arm=arm, gripper=gripper) for mode, arm in locked.items()}  # 7-D, of which two or three do nothing
+            | dict(pd_ee_delta_yaw=dict(arm=delta_yaw, gripper=gripper))  # 5-D
         )
 
     @property

@@ -35,7 +35,7 @@ from .markdown import markdown_table
 from .matching import Found
 from .paper_comparison import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
-from .presets import training_settings_of
+from .presets import FULLEST, training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
 from .success_curves import DPI, PANEL, write_curves
@@ -68,8 +68,8 @@ the time on the clock, so that a job that shared its machine with other work, or
 CHART = """
 ![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})
 
-Success in the tasks of the paper's Table I by what the policy senses; the preset of its training is below each task: `paper` or
-`cpu_long` where all sensings were run with it and as many training seeds, otherwise `cpu`. The thin lines are 95 % intervals,
+Success in the tasks of the paper's Table I by what the policy senses; the preset of its training is below each task: the first
+of {presets} with which all sensings were run with as many training seeds as with any other. The thin lines are 95 % intervals,
 which cover the variation over training only in tasks with several training seeds. Black lines are the paper's rates, which
 come from larger networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the
 numbers.
@@ -245,7 +245,7 @@ def page(
     found = of_the_protocol(collected)
     yield HEAD.format(last=LAST)
     if figures.sensing:
-        yield CHART.format(figure=_address(figures.sensing))
+        yield CHART.format(figure=_address(figures.sensing), presets=", ".join(f"`{name}`" for name in FULLEST))
     yield from tables_of_the_paper(found, files)
     yield from touch_gains(found, results)
     if figures.gentle:

@@ -161,9 +161,11 @@ def _submit(
         if seed is None and pool.num_running > 0:
             return  # running episodes may still succeed
         if seed is None:
+            all_seeds = args.seeds[-1] == FIRST_EVALUATION_SEED - 1
+            more = f"give a --seed below {args.seed}" if all_seeds else f"raise --max-tries {args.max_tries}"
             raise WorkFailedError(
                 f"{len(args.seeds)} seeds were tried and {len(recording.infos)} of {args.num} episodes succeeded; see whether "
-                f"the demonstrator copes with these arguments, or raise --max-tries {args.max_tries}"
+                f"the demonstrator copes with these arguments, or {more}"
             )
         if seed in recording.kept:
             count(recording.accept_kept(seed))

@@ -76,8 +76,9 @@ def make_header(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
     spec = task_spec(env_id)
     split_obs_mode(env_kwargs["obs_mode"])  # before any process is started
     kept = {name: value for name, value in env_kwargs.items() if name != "render_backend"}
+    max_steps = kept.get("max_episode_steps") or spec.max_episode_steps
     return dict(
-        env_info=dict(env_id=spec.gym_id, env_kwargs=kept, max_episode_steps=spec.max_episode_steps),
+        env_info=dict(env_id=spec.gym_id, env_kwargs=kept, max_episode_steps=max_steps),
         source_type="scripted",
         source_desc="manifeel_ms3 demonstrator that acts within the policy's controller and on what the pads feel",
         commit_info=None if (commit := git_commit()) is None else dict(commit_id=commit),
@@ -101,8 +102,7 @@ def trajectory_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
     obs_mode = env_kwargs.get("obs_mode", "none")
     if obs_mode == "none":
         return STATES_FILE
-    control_mode = env_kwargs.get("control_mode") or task_spec(env_id).env_class.default_control_mode
-    return f"trajectory.{obs_mode}.{control_mode}.{env_kwargs.get('sim_backend', 'physx_cpu')}.h5"
+    return f"trajectory.{obs_mode}.{task_spec(env_id).control_mode(env_kwargs)}.{env_kwargs.get('sim_backend', 'physx_cpu')}.h5"
 
 
 def observed_file(folder: Path) -> Path | None:

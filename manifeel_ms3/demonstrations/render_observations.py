@@ -31,7 +31,15 @@ from manifeel_ms3.workers import WorkerPool
 from .convert_actions import converted
 from .episode import run_episode
 from .formats.folder_checks import require_revision
-from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import (
+    DemonstrationError,
+    actions_of,
+    first_episodes,
+    group_of,
+    open_trajectories,
+    read_header,
+    task_of,
+)
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
 from .replay import pose_difference
 
@@ -88,7 +96,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     source_kwargs = None
     if args.control_mode is not None:
         source_kwargs = source["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
-    episodes = _by_seed(args.path, source["episodes"][: args.num])
+    episodes = _by_seed(args.path, first_episodes(args.path, source, args.num))
     with open_recording(args.out, header, list(episodes)) as recording:
         left = [seed for seed in episodes if seed not in recording.infos and seed not in recording.failed]
         if recording.is_complete and not left:

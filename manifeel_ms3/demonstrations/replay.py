@@ -20,7 +20,15 @@ from manifeel_ms3.tasks.registry import make_env
 
 from .formats.folder_checks import require_revision
 from .formats.h5_checks import POSE_SIZE
-from .formats.maniskill_h5 import DemonstrationError, actions_of, group_of, open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import (
+    DemonstrationError,
+    actions_of,
+    first_episodes,
+    group_of,
+    open_trajectories,
+    read_header,
+    task_of,
+)
 
 log = logging.getLogger(__name__)
 POSITION, ROTATION = slice(0, 3), slice(3, POSE_SIZE)
@@ -65,7 +73,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     results = []
     with closing(_recorded_env(path, header)) as env, progress_bar() as bar:
         base: Any = env.unwrapped
-        for info in bar.track(header["episodes"][:num], description="replaying"):
+        for info in bar.track(first_episodes(path, header, num), description="replaying"):
             actions, ends = _recorded(path, info)
             env.reset(seed=info["episode_seed"])
             success = False

@@ -176,13 +176,14 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
 
 
 def action_names(control_mode: str, size: int) -> list[str]:
-    """Names of the entries of an action; numbers where the control mode is another robot's.
+    """Names of the entries of an action; numbers where the control mode, or its number of entries, is another robot's.
 
     Args:
         control_mode: Name of the controller, such as "pd_ee_delta_pose".
         size: Number of entries.
     """
-    return list((ACTION_AXES | JOINT_AXES).get(control_mode, map(str, range(size))))
+    names = list((ACTION_AXES | JOINT_AXES).get(control_mode, ()))
+    return names if len(names) == size else list(map(str, range(size)))
 
 
 def _blueprint(streams: EpisodeStreams) -> Any:

@@ -170,8 +170,8 @@ def _like_entry(args: Args, entry: Entry) -> Args:
         checkpoint=entry.checkpoint,
         out=args.out or Path("evaluation.json"),
         device=args.device or inference["device"],
-        batch_size=args.batch_size or inference["batch_size"],
-        inference_steps=args.inference_steps or made["config"].get(INFERENCE_STEPS),
+        batch_size=inference["batch_size"] if args.batch_size is None else args.batch_size,
+        inference_steps=made["config"].get(INFERENCE_STEPS) if args.inference_steps is None else args.inference_steps,
         stop_at_success=args.stop_at_success or made["stop_at_success"],
         env_kwargs=json.dumps(made["env_kwargs"] | json_object("--env-kwargs", args.env_kwargs)),
     )

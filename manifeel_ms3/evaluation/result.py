@@ -31,6 +31,8 @@ PATHS = ("demos", "run_dir", "tacrgb_weights")
 """Entries of a policy's configuration that are paths on the machine where it was trained."""
 PRIVATE = ("policy_name", "policy_kwargs")
 """Entries of a policy's configuration that come from the command line, and may hold passwords and tokens."""
+RATES = ("success_once", "success_at_end", "success_paper", "fail_once", "fail_at_end", "gentle_success")
+"""Rates that a result can hold."""
 MEANS = ("return", "reward", "episode_len")
 """Numbers of an episode whose means a result holds."""
 RATE_DECIMALS = 4

@@ -109,7 +109,7 @@ def record_episode(
 
 
 def encode_video(frames: list[Frame]) -> bytes:
-    """An MP4 file with the images of each step side by side, as fast as the steps are.
+    """An MP4 file with the images of each step side by side, at the tasks' own control rate.
 
     Args:
         frames: Images of every step.

@@ -156,10 +156,13 @@ class InsertionExpert:
     def actions(self) -> Actions:
         """Actions of an episode, without end: once the plug is inserted, the demonstrator keeps holding it down."""
         for action in self._undisturbed():
-            yield np.clip(action + self._disturb(), -1.0, 1.0)
+            push = self.skills.of_controlled_axes(self._disturb())
+            action[: len(push)] += push
+            yield np.clip(action, -1.0, 1.0)
 
     def _undisturbed(self) -> Actions:
-        yield np.zeros(6)
+        self.skills.keep_grip()
+        yield self.skills.with_grip(self.skills.of_controlled_axes(np.zeros(6)))
         self.skills.tare()
         while True:
             yield from self._enter()

@@ -135,8 +135,20 @@ class Skills:
         here, facing = self.commanded
         twist = np.r_[position - here, (rotation * facing.inv()).as_rotvec()]
         twist[[3 + axis for axis in self.arm.config.locked_axes]] = 0.0
-        action = np.clip(twist / self._scale, -1.0, 1.0)[[0, 1, 2, *(3 + axis for axis in self.arm.config.rotation_axes)]]
-        return action if self.gripper is None else np.r_[action, self.gripper]
+        return self.with_grip(self.of_controlled_axes(np.clip(twist / self._scale, -1.0, 1.0)))
+
+    def of_controlled_axes(self, motion: np.ndarray) -> np.ndarray:
+        """The components of a motion (6,) for which the controller has actions."""
+        return motion[[0, 1, 2, *(3 + axis for axis in self.arm.config.rotation_axes)]]
+
+    def with_grip(self, motion: np.ndarray) -> np.ndarray:
+        """An action that consists of a motion of the tool and the gripper command, if there is one."""
+        return motion if self.gripper is None else np.r_[motion, self.gripper]
+
+    def keep_grip(self) -> None:
+        """Command the gripper to keep its present grip, where the controller does not hold it fixed."""
+        if self.agent.controller.controllers["gripper"].single_action_space.shape[0]:
+            self.gripper = self.present_grip
 
     def towards(self, rotation: Rotation, rate: float) -> Rotation:
         """The commanded orientation, turned towards another one by at most `rate`, in rad."""

@@ -53,6 +53,8 @@ class TaskSpec:
     """The task as one plain English sentence that tells a robot what to do, for policies that take language; "" if none."""
     goal_instructions: Mapping[str, str] = field(default_factory=dict)
     """Such sentences for the values of the task's argument `goal` that change what is to be done."""
+    start_control_modes: Mapping[str, str] = field(default_factory=dict)
+    """Control modes of the values of the task's argument `start` that have another one than the task's own."""
     paper_tables: tuple[str, ...] = ()
     """Tables of the paper that report the task: "I", "II", "III"."""
     revision: int = 1
@@ -72,6 +74,11 @@ class TaskSpec:
     def instruction_for(self, env_kwargs: Mapping[str, Any]) -> str:
         """The sentence for the task with these arguments; "" if there is none."""
         return self.goal_instructions.get(env_kwargs.get("goal", ""), self.instruction)
+
+    def control_mode(self, env_kwargs: Mapping[str, Any]) -> str:
+        """The control mode of the task with these arguments."""
+        own = self.start_control_modes.get(env_kwargs.get("start", ""), self.env_class.default_control_mode)
+        return env_kwargs.get("control_mode") or own
 
     @property
     def name(self) -> str:

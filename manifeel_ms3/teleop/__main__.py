@@ -41,7 +41,7 @@ class Args:
     tactile_sensors: tuple[str, ...] = ("right",)
     """Sides of the tactile sensors to show and record."""
     seed: int = 0
-    """Seed of the first episode."""
+    """Seed of the first episode; if the file holds a seed that is not smaller, the one after the largest in the file."""
     env_kwargs: str = "{}"
     """Further arguments of the task as json, such as '{"fit": "tight"}'."""
     device: Literal["spacemouse", "gamepad"] | None = None

@@ -68,10 +68,17 @@ class Session:
                 self._recording.accept_kept(kept)
             self._held = stack.pop_all()
         self._seed = max([seed, *(saved + 1 for saved in self._recording.infos)])
+        if self._seed != seed:
+            log.info("%s holds episodes up to the seed %d; the next has the seed %d", out, self._seed - 1, self._seed)
 
     def run(self, screen: Screen) -> None:
-        """Run episodes until the operator ends the session."""
+        """Run episodes until the operator ends the session.
+
+        Raises:
+            InvalidArgumentError: The seeds for demonstrations are used up.
+        """
         while self.operator.mode is not Mode.CLOSED:
+            require_demonstration_seeds(self._seed, 1, f"the next episode would have the seed {self._seed}; ")
             self.operator.begin()
             screen.set_message(f"seed {self._seed}, {len(self._recording.infos)} saved")
             episode = run_episode(self.env, self._seed, self._actions, screen.show)

@@ -14,8 +14,10 @@ from baselines.diffusion_policy.policy import DiffusionPolicy
 from baselines.registry import all_policies
 from baselines.studies import __main__ as study_command
 from baselines.studies import cost, jobs
+from baselines.studies.command_lines import training_args
 from baselines.studies.planning import jobs_of
 from baselines.studies.study import Resources, read_study
+from baselines.studies.work import work_of
 from manifeel_ms3.provenance import machine
 from tests.tiny_study import TINY
 
@@ -81,6 +83,31 @@ def test_trials_run_where_their_jobs_do(monkeypatch):
         assert training.arguments[2:4] == ("--device", device)
 
 
+def test_another_policy_sensing_or_device_is_other_work():
+    """Else the hours of the paper's networks would be foretold from runs of small ones."""
+    evaluations = [job for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml")) if job.kind == "evaluate"]
+    of_a_task = [job for job in evaluations if job.settings["env_id"] == evaluations[0].settings["env_id"]]
+    works = [work_of(job, 0) for job in of_a_task]
+    assert len(set(works)) == 4  # three sensings, of which TacFF has two units
+    assert len(works) > 4  # several training seeds of each
+    (train,) = of_a_task[0].needs
+    other = replace(of_a_task[0], needs=(replace(train, settings=train.settings | dict(preset="cpu")),))
+    assert work_of(other, 0) != work_of(of_a_task[0], 0) != work_of(of_a_task[0], 1)
+
+
+def test_one_policy_answers_all_workers(monkeypatch, tmp_path):
+    """More workers simulate faster, but do not make the policy's process faster."""
+    evaluate = next(job for job in jobs_of(read_study(REPOSITORY / "configs/modality.yaml")) if job.kind == "evaluate")
+    monkeypatch.setattr(cost.Trial, "seconds", lambda trial, root: 8.0 if trial.measure is cost.inference else 1.0)
+    chunk = training_args(evaluate.needs[0]).policy.action_horizon
+    assert chunk == 8
+    one, two, sixteen = (cost.estimate(evaluate, tmp_path, workers).seconds for workers in (1, 2, 16))
+    assert one == pytest.approx(2 * two)  # a step of the simulation takes as long as an answer's share in it
+    assert two == sixteen  # the policy is never idle
+    monkeypatch.setattr(cost, "_device", lambda gpus: "cuda")
+    assert cost.estimate(evaluate, tmp_path, 16, gpus=1).seconds == pytest.approx(one / 16)  # answers come in batches of 16
+
+
 @pytest.mark.parametrize("num_seeds", [10, 40])
 def test_a_table_of_progress_reads_each_job_once(num_seeds, tmp_path, monkeypatch):
     """It is made every few seconds by the process that also hands out the jobs."""
@@ -92,10 +119,10 @@ def test_a_table_of_progress_reads_each_job_once(num_seeds, tmp_path, monkeypatc
     for job, seconds in [(record, 1.0), *((job, 36.0 + 3.6 * k) for k, job in enumerate(trained[:5]))]:
         folder = job.folder(tmp_path)
         folder.mkdir(parents=True)
-        done = dict(settings=job.settings, seconds=seconds, units=12, parallel=1, machine=machine())
+        done = dict(work=work_of(job, 0), seconds=seconds, units=12, parallel=1, machine=machine())
         (folder / jobs.DONE).write_text(json.dumps(done))
     calls = Counter()
-    for module, name in ((jobs, "read_status"), (cost, "_work"), (cost, "_units")):
+    for module, name in ((jobs, "read_status"), (cost, "work_of"), (cost, "_units")):
         original = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *given, of=original, name=name: calls.update([name]) or of(*given))
     columns = [list(column.cells) for column in study_command.progress(study, planned, tmp_path).renderables[0].columns]
@@ -108,7 +135,7 @@ def test_a_table_of_progress_reads_each_job_once(num_seeds, tmp_path, monkeypatc
     ]
     assert columns[5] == ["0.00", f"{0.012 * (num_seeds - 5):.2f}", "?"]  # the median of those that were done: 43.2 s
     assert calls["read_status"] <= 2 * len(planned)
-    assert calls["_work"] <= len(planned) + 6
+    assert calls["work_of"] <= len(planned) + 6
     assert calls["_units"] <= len(planned)
 
 

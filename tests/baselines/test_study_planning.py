@@ -23,6 +23,7 @@ from baselines.studies.checks import require_valid_flags
 from baselines.studies.command_lines import shell_command, training_args
 from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import OF_THE_STUDY, Resources, StudyError, read_study
+from baselines.studies.work import AMOUNT_FLAGS
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis.condition import Condition, condition_of
@@ -303,7 +304,7 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
     with pytest.raises(SystemExit):
         preset_cli(policy_spec("diffusion_policy"), ["cpu", "--help"])
     known = set(re.findall(r"--[\w.-]+", capsys.readouterr().out))
-    assert known >= {f"--{name}" for name in (*OF_THE_STUDY, *cost.AMOUNT_FLAGS)}
+    assert known >= {f"--{name}" for name in (*OF_THE_STUDY, *AMOUNT_FLAGS)}
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from baselines.common.processes import Processes
 from baselines.common.train_args import FREE_ON_RESUME, PAPER_EPOCHS, TrainArgs, check_evaluation, check_run, planned_steps
 from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
+from baselines.diffusion_policy.policy import DiffusionConfig
 from baselines.flow_matching.policy import FlowConfig
 from baselines.registry import PolicySpec, require_distinct
 from baselines.studies.planning import OF_THE_MACHINE
@@ -74,6 +75,10 @@ def test_a_length_in_epochs_counts_unless_that_is_fewer_steps_than_wanted_or_ste
             dict(policy=FlowConfig(consistency=True, segments=2), inference_steps=1),  # would stop short of the actions
             "--inference-steps 1: this policy needs at least 2 to generate",
         ),
+        (
+            dict(policy=DiffusionConfig(diffusion_steps=50), inference_steps=51),  # would be cut to 50, which no result says
+            "--inference-steps 51: this policy needs at least 1 and at most 50 to generate",
+        ),
         (dict(env_id=PEG), "no demonstrations are given; give --demo-path"),
     ],
 )
@@ -89,6 +94,8 @@ def test_numbers_that_no_run_can_meet_are_refused(settings, said):
         (dict(eval_env_kwargs="[1]"), InvalidArgumentError, r"--eval-env-kwargs '\[1\]' is not a json object"),
         (dict(eval_env_kwargs='{"obs_mode": "rgb"}'), InvalidArgumentError, "have obs_mode 'rgb', but the policy observes"),
         (dict(eval_env_kwargs='{"fits": "tight"}'), InvalidArgumentError, r"has no arguments \['fits'\]; choose from"),
+        (dict(eval_env_kwargs='{"fit": "tight"}'), InvalidArgumentError, "--eval-env-kwargs without --num-eval-episodes"),
+        (dict(eval_freq=7000, capture_video=True), InvalidArgumentError, "--eval-freq, --capture-video without --num-eval-ep"),
         (dict(device="gpu"), InvalidArgumentError, "--device 'gpu' is no device of torch"),
         (dict(device="cuda:99"), MachineError, "--device cuda:99 is not there"),
     ],

@@ -325,6 +325,18 @@ def test_an_evaluation_that_fails_does_not_stop_training(evaluation, tmp_path, c
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_a_video_that_fails_does_not_hide_the_rates(evaluation, tmp_path, caplog):
+    checkpoint, result = tmp_path / "checkpoints/00000001", tmp_path / "evaluations/00000001.json"
+    evaluation._arguments += ["--videos", "0"]
+    (tmp_path / "evaluations").mkdir()
+    (tmp_path / "evaluations/videos").write_text("a file where the folder of the videos would be")
+    evaluation.submit(checkpoint)
+    (rates,) = evaluation.finished(wait=True)
+    assert rates["eval/success_once"] == json.loads(result.read_text())["success_once"]["rate"]
+    assert "the video of" in caplog.text
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
 def test_two_processes_train_one_policy(run, tmp_path):
     arguments = ["cpu", "--demos", str(run.args.demos[0]), "--obs-mode", "tacff", "--steps", "60", "--batch-size", "16"]
     arguments += ["--save-freq", "60", "--log-freq", "20", "--run-dir", str(tmp_path)]

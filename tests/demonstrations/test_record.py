@@ -16,18 +16,26 @@ import psutil
 import pytest
 from rich.console import Console
 
-from manifeel_ms3.demonstrations import DemonstrationError, dataset, read_demonstrations, record, replay, view
+from manifeel_ms3.demonstrations import (
+    DemonstrationError,
+    dataset,
+    read_demonstrations,
+    record,
+    render_observations,
+    replay,
+    view,
+)
 from manifeel_ms3.demonstrations.formats.lerobot_card import card
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import ORIGIN, observation_keys, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5_writing import RecordedEpisode, episode_folder, write_episode
-from manifeel_ms3.demonstrations.recording import make_header, open_recording
+from manifeel_ms3.demonstrations.recording import make_header, open_recording, trajectory_name
 from manifeel_ms3.demonstrations.summary import summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, WorkFailedError
 from manifeel_ms3.provenance import git_commit
 from manifeel_ms3.tasks import registry
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, TaskSpec, task_spec
-from tests.sample import states_sample
+from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG
 from tests.trajectories import bytes_of, renumbered
 from tests.trust.kills import worker_processes
@@ -101,6 +109,22 @@ def test_names_of_files_say_what_is_in_them():
     assert name("none") == f"{PEG}/trajectory.h5"
     assert name("rgb+tacff") == f"{PEG}/trajectory.rgb+tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
     assert name("state", control_mode="pd_ee_delta_pose") == f"{PEG}/trajectory.state.pd_ee_delta_pose.physx_cpu.h5"
+    in_holder = dict(obs_mode="state", start="holder")
+    assert trajectory_name("ManiFeel-BulbInstallation-v1", in_holder) == "trajectory.state.pd_ee_delta_yaw.physx_cpu.h5"
+
+
+def test_more_episodes_than_a_file_holds_are_refused(tmp_path):
+    with pytest.raises(DemonstrationError, match="holds 2 episodes, 99 are wanted"):
+        replay.replay(observed_sample(PEG), 99)
+    with pytest.raises(DemonstrationError, match="holds 2 episodes, 99 are wanted"):
+        render_observations.main(render_observations.Args(observed_sample(PEG), tmp_path / "o.h5", num=99))
+
+
+def test_a_file_says_the_time_limit_of_its_episodes():
+    def limit(**kwargs) -> int:
+        return make_header(PEG, dict(obs_mode="none") | kwargs)["env_info"]["max_episode_steps"]
+
+    assert (limit(), limit(max_episode_steps=400)) == (task_spec(PEG).max_episode_steps, 400)
 
 
 def wait_for_an_episode(path: Path) -> None:

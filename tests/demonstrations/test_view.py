@@ -129,3 +129,4 @@ def test_actions_of_a_file_without_a_control_mode_are_numbered(tmp_path):
 
 def test_actions_of_another_robot_are_numbered():
     assert view.action_names("pd_joint_delta_pos_of_another_robot", 2) == ["0", "1"]
+    assert view.action_names("pd_joint_pos", 2) == ["0", "1"]  # another robot's controller may have the same name

@@ -98,6 +98,14 @@ def test_variants_of_the_real_robot_are_demonstrated(make_env, task, variant, ac
     assert env.action_space.shape == (action_dim,)
 
 
+@pytest.mark.parametrize(("control_mode", "action_dim"), [("pd_ee_delta_pose", 7), ("pd_ee_delta_yaw", 5)])
+def test_insertion_is_demonstrated_with_controllers_that_take_other_actions(make_env, control_mode, action_dim):
+    """Those with a gripper keep the grip; one that only turns about the vertical leaves the peg's lean to the socket."""
+    env = make_env(obs_mode="none", render_backend="none", control_mode=control_mode)
+    gentle_success(env, PEG, 0)
+    assert env.action_space.shape == (action_dim,)
+
+
 def test_reorientation_turns_the_peg_in_the_hand(make_env):
     """The hand goes upright and stays so, but for the lean that feels for the hole; the peg turns in it."""
     task = "ManiFeel-PegReorientation-v1"

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ import tyro
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, open_trajectories, read_header
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED
 from manifeel_ms3.teleop import __main__ as teleop
 from manifeel_ms3.teleop import session as module
 from manifeel_ms3.teleop.operator import HOLD, EpisodeCommand, Mode, Operator, steerable_axes
@@ -20,8 +22,21 @@ from manifeel_ms3.teleop.session import Session
 from tests.browser import wait_until
 from tests.tasks_and_marks import PEG
 from tests.teleop.axes import AXES
+from tests.trust.made_up_recordings import made_up
 
 KWARGS = dict(obs_mode="tacff", render_backend="none", sim_backend="physx_cpu", cameras=[], tactile_sensors=["right"])
+
+
+def test_the_seeds_of_evaluations_are_not_recorded(make_env, tmp_path):
+    """A file may end at the last seed for demonstrations."""
+    env, last = make_env(**KWARGS), FIRST_EVALUATION_SEED - 1
+    session = Session(env, PEG, KWARGS, tmp_path / "t.h5", last, Operator(("x",)))
+    assert session._save(Notes(), replace(made_up(0), seed=last))
+    session.finish()
+    session = Session(env, PEG, KWARGS, tmp_path / "t.h5", 0, Operator(("x",)))
+    with pytest.raises(InvalidArgumentError, match=f"the next episode would have the seed {FIRST_EVALUATION_SEED}"):
+        session.run(Notes())
+    session.finish()
 
 
 class Notes:

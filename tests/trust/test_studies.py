@@ -229,13 +229,14 @@ from pathlib import Path
 from baselines.studies import cost
 from baselines.studies.planning import jobs_of
 from baselines.studies.study import read_study
+from baselines.studies.work import work_of
 from manifeel_ms3.provenance import machine
 
 study = read_study(Path("study.yaml"))
 jobs = jobs_of(study)
 first, second = (job for job in jobs if job.kind == "train")
 first.folder(Path()).mkdir(parents=True)
-status = dict(seconds=5.0, units=10, parallel=1, machine=machine(), settings=first.settings)
+status = dict(seconds=5.0, units=10, parallel=1, machine=machine(), work=work_of(first, 0))
 (first.folder(Path()) / "done.json").write_text(json.dumps(status))
 print(cost.__file__, cost.estimate(second, Path(), 1).seconds)
 """

@@ -63,5 +63,5 @@ class DemonstrationFormat:
     """Function that returns the arguments of the environment with which the episodes were recorded, or None if a file does not
     hold them. The field itself is None for a format that never holds them."""
     env_id: Callable[[Path], str | None] | None = None
-    """Function that returns the id of the task of which a file says that its episodes are, or None if it does not say it. The
-    field itself is None for a format that never does."""
+    """Function that returns the id of the task that a file names, or None if it names none. The field itself is None for a
+    format that never does."""

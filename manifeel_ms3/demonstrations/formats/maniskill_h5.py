@@ -246,17 +246,31 @@ def read_trajectories(
     path = Path(path)
     header = read_header(path)
     require_task(path, about_task(header), env_id)
-    count = len(header["episodes"]) if num is None else num
-    if not 0 < count <= len(header["episodes"]):
-        raise DemonstrationError(
-            f"{path} holds {len(header['episodes'])} episodes, {count} are wanted; record more, or ask for fewer"
-        )
+    entries = first_episodes(path, header, num)
     with open_trajectories(path) as file:
-        for entry in header["episodes"][:count]:
+        for entry in entries:
             group_of(file, entry)  # an episode that is missing is said before any is read
-        for i in progress(range(count)):
-            entry = header["episodes"][i]
+        for i in progress(range(len(entries))):
+            entry = entries[i]
             yield _read_episode(file, entry, keys, path, header) | _outcomes(group_of(file, entry), outcomes)
+
+
+def first_episodes(path: Path, header: dict[str, Any], num: int | None) -> list[dict[str, Any]]:
+    """The first entries of episodes in a file's json.
+
+    Args:
+        path: The trajectory file.
+        header: Its json.
+        num: Number of episodes; all of them if None.
+
+    Raises:
+        DemonstrationError: The file has fewer episodes, or none.
+    """
+    held = header["episodes"]
+    count = len(held) if num is None else num
+    if not 0 < count <= len(held):
+        raise DemonstrationError(f"{path} holds {len(held)} episodes, {count} are wanted; record more, or ask for fewer")
+    return held[:count]
 
 
 def observation_keys(path: Path) -> list[str]:

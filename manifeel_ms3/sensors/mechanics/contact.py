@@ -74,7 +74,7 @@ def solve_indentation(
         max_tilt: Largest tilt along each axis, rad.
     """
     plane = torch.empty(len(height), 3, dtype=torch.float64, device=height.device)
-    _launch(_indent, grid, height, [height, wrench, stiffness, grid.x, grid.y, grid.area, max_tilt], [plane])
+    _launch(_indent, height, [height, wrench, stiffness, grid.x, grid.y, grid.area, max_tilt], [plane])
     return plane
 
 
@@ -111,11 +111,11 @@ def solve_shear(
         friction: (N,) float64, mu.
     """
     shear = torch.empty_like(bristle)
-    _launch(_slide, grid, bristle, [bristle, cell_force, wrench, stiffness, friction, grid.x, grid.y, grid.area], [shear])
+    _launch(_slide, bristle, [bristle, cell_force, wrench, stiffness, friction, grid.x, grid.y, grid.area], [shear])
     return shear
 
 
-def _launch(kernel, grid: ContactGrid, like: torch.Tensor, inputs: list, outputs: list[torch.Tensor]) -> None:
+def _launch(kernel, like: torch.Tensor, inputs: list, outputs: list[torch.Tensor]) -> None:
     device = warp_device(like.device)
     arguments = [wp.from_torch(a.contiguous()) if isinstance(a, torch.Tensor) else a for a in inputs]
     wp.launch_tiled(

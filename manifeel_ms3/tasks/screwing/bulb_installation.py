@@ -23,6 +23,8 @@ TIGHT = 0.1
 """Smallest torque of the hand on the bulb, in N m, at success. Our choice."""
 STARTS = ("hand", "holder")
 """Where the bulb can be at the start: between the fingers, or in the holder."""
+IN_HOLDER_CONTROL_MODE = "pd_ee_delta_yaw"
+"""Control mode of a bulb that starts in the holder."""
 SCREWED_IN = 0.0015
 """Mean depth of a bulb that starts in the holder below the first contact of the threads, in m. Our choice."""
 SUNK = 2.2e-4
@@ -52,6 +54,7 @@ class BulbRandomization(ScrewingRandomization):
     demo_steps=419,
     revision=4,
     force_limit=36.0,
+    start_control_modes={"holder": IN_HOLDER_CONTROL_MODE},
 )
 class BulbInstallationEnv(ScrewingEnv):
     """Screw a light bulb into its holder.
@@ -89,7 +92,7 @@ class BulbInstallationEnv(ScrewingEnv):
         self.start = one_of("start", start, STARTS)
         if start == "holder":
             self.grips_round_parts = False  # its demonstrator was tuned with one contact point a pad, and fails with five
-            control_mode = control_mode or "pd_ee_delta_yaw"
+            control_mode = control_mode or IN_HOLDER_CONTROL_MODE
         super().__init__(*args, control_mode=control_mode, **kwargs)
 
     def _largest_ranges(self):
