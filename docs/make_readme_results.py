@@ -20,7 +20,7 @@ from manifeel_ms3.files import write_text
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-RESULTS = [ROOT / folder for folder in ("leaderboard/cpu", "docs/cpu", "docs/cpu_long")]
+RESULTS = [ROOT / folder for folder in ("leaderboard/cpu", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")]
 BLOCK = re.compile(r"(<!-- --8<-- \[start:results\] -->\n).*(?=<!-- --8<-- \[end:results\] -->)", re.DOTALL)
 """README's part between the marks with which the home page of the documentation includes it."""
 ROWS = {

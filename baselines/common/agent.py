@@ -122,7 +122,7 @@ class PolicyAgent(PolicyOfPart):
             self.policy.spec,
             settings.obs_horizon,
             limit=self.policy.action_normalizer.limit,
-            targets_of=_control_mode(self.config) if settings.predicts_targets else None,
+            targets_of=_control_mode(self.config, checkpoint) if settings.predicts_targets else None,
         )
         self._part = self.make_episode_part(lambda request: self.answer([request])[0])
         self._compiled = False
@@ -184,9 +184,19 @@ class PolicyAgent(PolicyOfPart):
             self.policy.action_network = network
 
 
-def _control_mode(config: dict[str, Any]) -> str:
-    """The control mode of the demonstrations that a checkpoint was trained on."""
-    return task_spec(config["env_id"]).control_mode(config["env_kwargs"])
+def _control_mode(config: dict[str, Any], checkpoint: Path) -> str:
+    """The control mode of the demonstrations that a checkpoint was trained on.
+
+    Raises:
+        CheckpointError: Its config does not say it.
+    """
+    env_id, env_kwargs = config.get("env_id"), config.get("env_kwargs")
+    if not (isinstance(env_id, str) and isinstance(env_kwargs, dict)):
+        raise CheckpointError(
+            f"{checkpoint}: the config of a policy that predicts targets must say env_id and env_kwargs, and says {env_id!r} and "
+            f"{env_kwargs!r}; the checkpoint is broken, use another one"
+        )
+    return task_spec(env_id).control_mode(env_kwargs)
 
 
 def _generator_of(*numbers: int) -> torch.Generator:

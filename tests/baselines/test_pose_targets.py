@@ -20,6 +20,7 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.policy import PolicyRequest
 from manifeel_ms3.tasks.registry import task_spec
 from tests.sample import observed_sample
@@ -129,10 +130,17 @@ def test_ranges_of_targets_grow_with_the_step_of_the_prediction(tmp_path):
     """Each step has its own, so that the next ones, which are near, are as large for the network as those far ahead."""
     args = tiny_args(tmp_path, steps=2)
     checkpoint = train(replace(args, policy=replace(args.policy, action_form="target")))
-    normalizer = diffusion.SPEC.load(checkpoint).policy.action_normalizer
+    policy = diffusion.SPEC.load(checkpoint)
+    assert policy.make_episode_part.keywords["targets_of"] == FREE
+    normalizer = policy.policy.action_normalizer
     half = (normalizer.high - normalizer.low)[:, POSITION] / 2
     assert half.shape == (16, 3)
     assert all(after > before for before, after in pairwise(half.norm(dim=1)[:8].tolist()))
+    config = json.loads((checkpoint / "config.json").read_text())
+    config.pop("env_kwargs")
+    (checkpoint / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match="must say env_id and env_kwargs, and says 'ManiFeel-PegInsertion-v1' and None"):
+        diffusion.SPEC.load(checkpoint)
 
 
 def test_other_actions_than_motions_of_the_tool_cannot_be_targets(tmp_path):
