@@ -193,8 +193,8 @@ def _control_mode(config: dict[str, Any], checkpoint: Path) -> str:
     env_id, env_kwargs = config.get("env_id"), config.get("env_kwargs")
     if not (isinstance(env_id, str) and isinstance(env_kwargs, dict)):
         raise CheckpointError(
-            f"{checkpoint}: the config of a policy that predicts targets must say env_id and env_kwargs, and says {env_id!r} and "
-            f"{env_kwargs!r}; the checkpoint is broken, use another one"
+            f"{checkpoint}: the config of a policy that predicts targets must say env_id and env_kwargs, and says {env_id!r} "
+            f"and {env_kwargs!r}; the checkpoint is broken, use another one"
         )
     return task_spec(env_id).control_mode(env_kwargs)
 
