@@ -10,7 +10,8 @@ channels of `rgb`, in the size of the cameras' images, and force fields become a
 ManiSkill's loader takes the last component of an action for the gripper's and repeats it after an episode's end. Record with
 `--env-kwargs '{"control_mode": "pd_ee_delta_pose"}'`, whose actions have one, to train with it.
 
-Without `--maniskill`, the same windows are made by the class `DiffusionPolicyDataset` below.
+Without `--maniskill`, similar windows are made by the class `DiffusionPolicyDataset` below, which
+repeats the whole last action after an episode's end.
 """
 
 import importlib

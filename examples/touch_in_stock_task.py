@@ -25,7 +25,7 @@ class TouchPickCubeEnv(PickCubeEnv):
         self.touch.reset(env_idx)
 
     def _get_obs_extra(self, info):
-        self.touch.capture()
+        self.touch.capture()  # of all environments: docs/sensor.md says what is needed where some of several are reset
         touch = self.touch.get_obs()
         if self.obs_mode == "state":  # this mode needs vectors
             touch = dict(force_field=touch["force_field"].flatten(1))

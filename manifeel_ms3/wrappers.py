@@ -1,5 +1,6 @@
 """Wrappers that give visuotactile observations the forms that ManiSkill's scripts and wrappers expect."""
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -89,10 +90,15 @@ class FlattenVisuotactileObservationWrapper(_ObservationWrapper):
         if "pointcloud" in observation:
             raise InvalidArgumentError("a pointcloud cannot be flattened; join other textures, such as 'rgb+depth', with touch")
         rest = {name: data for name, data in observation.items() if name not in ("sensor_data", "sensor_param")}
-        flat: Observation = dict(state=common.flatten_state_dict(rest, use_torch=True, device=self.base_env.device))
-        flat |= dict(rgb=self._images(cameras), depth=_joined(cameras, "depth"))
-        flat |= dict(tacrgb=self._images(pads), tacff=_joined(pads, "force_field"))
-        flat = {name: data for name, data in flat.items() if self._included[name] and data is not None}
+        parts: Mapping[str, Callable[[], Any]] = dict(
+            state=lambda: common.flatten_state_dict(rest, use_torch=True, device=self.base_env.device),
+            rgb=lambda: self._images(cameras),
+            depth=lambda: _joined(cameras, "depth", "leave depth out, or give the cameras one size"),
+            tacrgb=lambda: self._images(pads),
+            tacff=lambda: _joined(pads, "force_field", "give the pads one number of taxels"),
+        )
+        included = {name: part() for name, part in parts.items() if self._included[name]}
+        flat: Observation = {name: data for name, data in included.items() if data is not None}
         if self._flat_tacff and "tacff" in flat:
             flat["tacff"] = flat["tacff"].flatten(1)
         if not self._sep_tacrgb and "tacrgb" in flat:
@@ -154,14 +160,14 @@ def resized(images: torch.Tensor, size: tuple[int, int] | None) -> torch.Tensor:
     return smaller.round().to(images.dtype) if images.dtype == torch.uint8 else smaller.to(images.dtype)
 
 
-def _joined(sensors: Observation, kind: str) -> torch.Tensor | None:
+def _joined(sensors: Observation, kind: str, mend: str) -> torch.Tensor | None:
     """What each sensor observes of one kind, joined along channels; None if no sensor has it."""
     found = [data[kind] for data in sensors.values() if kind in data]
-    return _channels(found, f"{kind} of {list(sensors)}") if found else None
+    return _channels(found, f"{kind} of {list(sensors)}", mend) if found else None
 
 
-def _channels(images: list[torch.Tensor], what: str) -> torch.Tensor:
+def _channels(images: list[torch.Tensor], what: str, mend: str = "give image_size, such as 128") -> torch.Tensor:
     sizes = {tuple(image.shape[1:3]) for image in images}
     if len(sizes) > 1:
-        raise InvalidArgumentError(f"{what} have the sizes {sorted(sizes)} and cannot be joined; give image_size, such as 128")
+        raise InvalidArgumentError(f"{what} have the sizes {sorted(sizes)} and cannot be joined; {mend}")
     return torch.cat(images, dim=-1)

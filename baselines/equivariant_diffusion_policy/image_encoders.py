@@ -9,7 +9,7 @@ import torch.nn as nn
 from .groups import ORDER, FieldNorm, GroupConv, halve, pooled, representation
 
 CHANNELS_PER_GROUP = 16
-"""Number of regular channels that a block of the small network normalises together; set once, not tuned."""
+"""Number of regular channels, or a few more, that a block of the small network normalises together; set once, not tuned."""
 LIFT_KERNEL = 5
 """Kernel size of the first convolution, as in the paper's public code."""
 LAST_POOLING = 3
@@ -34,7 +34,8 @@ class GroupBlock(nn.Module):
         super().__init__()
 
         def norm() -> nn.Module:
-            return FieldNorm(max(outputs // CHANNELS_PER_GROUP, 1), outputs) if normalised else nn.Identity()
+            groups = next(n for n in range(max(outputs // CHANNELS_PER_GROUP, 1), 0, -1) if outputs % n == 0)
+            return FieldNorm(groups, outputs) if normalised else nn.Identity()
 
         first, second = GroupConv(inputs, outputs, 3), GroupConv(outputs, outputs, 3)
         if not normalised:  # the sums of many blocks would otherwise grow a hundredfold before training (Goyal et al. 2017)

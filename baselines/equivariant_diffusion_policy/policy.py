@@ -39,6 +39,10 @@ class EquivariantConfig(DiffusionConfig):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(1, hidden=self.hidden, action_fields=self.action_fields)
+        if self.encoder.image == "small_cnn" and self.hidden % 2:
+            raise InvalidArgumentError(
+                f"hidden={self.hidden} must be even with encoder.image='small_cnn': each key point has two fields"
+            )
         if self.predicts_targets:
             raise InvalidArgumentError(
                 "action_form='target': the orientation of a target does not turn with the scene as a vector does, which the "

@@ -63,7 +63,10 @@ class Sparsh(TokenRepresentation):
         self.register_buffer("untouched", upright(flat), persistent=False)
 
     def prepare(self, image):
-        """The difference from the untouched sensor, upright, in [0, 1] and in whole grey levels, as the authors store it."""
+        """The difference from the untouched sensor, upright, in [0, 1] and in whole grey levels, as the authors store it.
+
+        The untouched image is that of the default sensor, so that images of other sensors differ from it everywhere.
+        """
         levels = upright((image + 1) * 127.5)
         untouched = F.interpolate(self.untouched, levels.shape[2:], mode="bilinear", antialias=True).round()
         return (levels - untouched + 255 * OFFSET).clamp(0, 255).floor() / 255

@@ -69,14 +69,19 @@ def film_env(
     Raises:
         MachineError: This machine has no renderer.
     """
-    seen = env_kwargs.get("cameras") or [task_spec(env_id).policy_camera]
+    seen = _names(env_kwargs.get("cameras")) or (task_spec(env_id).policy_camera,)
     added: dict[str, Any] = dict(
         obs_mode="rgb+tacrgb+tacff",
         cameras=tuple(dict.fromkeys([*seen, *cameras])),
-        tactile_sensors=tuple(dict.fromkeys([*env_kwargs.get("tactile_sensors", ()), *pads])) or ("right",),
+        tactile_sensors=tuple(dict.fromkeys([*_names(env_kwargs.get("tactile_sensors")), *pads])) or ("right",),
         render_backend="auto",
     )
     return make_env(env_id, **dict(env_kwargs) | added | others)
+
+
+def _names(given: Iterable[str] | str | None) -> tuple[str, ...]:
+    """The names in an argument that is one name, several names, or None."""
+    return (given,) if isinstance(given, str) else tuple(given or ())
 
 
 def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:

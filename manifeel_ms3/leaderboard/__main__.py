@@ -24,7 +24,7 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import PolicySource
 from manifeel_ms3.files import write_json
 
-from .adding import take
+from .adding import free_place, take
 from .checks import check, check_is_new
 from .page import rows_on, write_page
 from .rerun import about_with_checkpoints, checkpoint_sources, name_checkpoints, policy_sources, run_again
@@ -107,6 +107,8 @@ def main(args: Hash | Submit | Build) -> Path:
         return args.folder / ABOUT
     check(submission)
     check_is_new(submission, args.board)
+    if not args.check_only:
+        free_place(submission, args.board)  # before episodes are run again
     rerun = None
     if args.rerun != 0:
         rerun = run_again(submission, _sources(submission, args), args.rerun, args.seed, args.workers)

@@ -30,19 +30,30 @@ def take(submission: Submission, board: Path, rerun: Rerun | None = None) -> Pat
         InUseError: Another process copies a submission of the same name.
         SubmissionError: The name of the folder has characters that are not allowed, or is too long.
     """
-    name = submission.folder.resolve().name
-    if not NAME.fullmatch(name):
-        raise SubmissionError(submission.folder, ["its name may have letters, digits, ., _ and - only; rename the folder"])
-    target = board / name
+    target = free_place(submission, board)
     contents = submission.files | ({RERUN: rerun.to_json()} if rerun else {})
     with owned(target):
-        if os.path.lexists(target):
-            raise FileExistsAlreadyError(
-                f"{target} exists already; rename the folder of the new submission, or delete the old one"
-            )
+        free_place(submission, board)
         with atomic_folder(target) as partial:
             for path, content in contents.items():
                 file = partial / path
                 file.parent.mkdir(parents=True, exist_ok=True)
                 file.write_bytes(content)
     return target
+
+
+def free_place(submission: Submission, board: Path) -> Path:
+    """The folder that a submission comes into, which must not exist.
+
+    Raises:
+        FileExistsAlreadyError: The leaderboard has a submission of the same name.
+        SubmissionError: The name of the folder has characters that are not allowed, or is too long.
+    """
+    name = submission.folder.resolve().name
+    if not NAME.fullmatch(name):
+        raise SubmissionError(submission.folder, ["its name may have letters, digits, ., _ and - only; rename the folder"])
+    if os.path.lexists(board / name):
+        raise FileExistsAlreadyError(
+            f"{board / name} exists already; rename the folder of the new submission, or delete the old one"
+        )
+    return board / name

@@ -40,9 +40,10 @@ def available_render_backend(asked: str = "auto") -> str:
     if asked == "none" or renderer_lost():
         return "none"
     backend = (_renders_on or _first_that_works()) if asked == "auto" else asked
-    if backend != "none":
-        _renders_in, _renders_on = os.getpid(), backend
-        _keep_inherited_objects_after_fork()
+    if backend == "none" or not _works(backend):
+        return "none"
+    _renders_in, _renders_on = os.getpid(), backend
+    _keep_inherited_objects_after_fork()
     return backend
 
 
@@ -76,9 +77,16 @@ def restrict_torch_after_fork() -> None:
 def _first_that_works() -> str:
     candidates = ["gpu"] * torch.cuda.is_available() + ["cpu"]
     for backend in candidates:
-        try:
-            sapien.render.RenderSystem(sapien.Device("cuda" if backend == "gpu" else "cpu"))
+        if _works(backend):
             return backend
-        except RuntimeError:
-            continue
     return "none"
+
+
+@functools.cache
+def _works(backend: str) -> bool:
+    """Whether SAPIEN can render on "gpu" or "cpu" in this process."""
+    try:
+        sapien.render.RenderSystem(sapien.Device("cuda" if backend == "gpu" else "cpu"))
+        return True
+    except RuntimeError:
+        return False

@@ -8,6 +8,9 @@ import torch
 from mani_skill.render import ShaderConfig
 from torch.nn.functional import avg_pool2d
 
+from manifeel_ms3.arguments import by_name
+from manifeel_ms3.errors import InvalidArgumentError
+
 from .lights import PRESENTATION_SHADOW, Lamp, Shadow, cast_shadow
 from .shader_pack import camera_shader
 
@@ -34,7 +37,16 @@ def drawn_sizes(configs: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         configs: The argument `human_render_camera_configs` of ManiSkill's environments: fields of all cameras, and dicts of
             fields by a camera's name. Where shaders are given, too, images are not drawn larger.
+
+    Raises:
+        InvalidArgumentError: It is no dict, or a size is no whole number.
     """
+    configs = by_name("human_render_camera_configs", configs, '{"width": 512, "height": 512}')
+    for name in ("width", "height"):
+        if not isinstance(configs.get(name, SIZE), int):
+            raise InvalidArgumentError(
+                f"human_render_camera_configs: {name}={configs[name]!r} must be a whole number of pixels"
+            )
     if "shader_pack" in configs or "shader_config" in configs:
         return dict(width=SIZE, height=SIZE) | dict(configs)
     drawn = {name: SUPERSAMPLING * size for name, size in configs.items() if name in ("width", "height")}

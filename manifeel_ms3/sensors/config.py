@@ -41,6 +41,10 @@ class GelConfig:
     curvature: tuple[float, float] = within((0.0, 0.0), 0.0, 1000.0)
     """Curvature of the untouched face across and along the finger, 1/m: 0 is flat, 20 a dome with a radius of 50 mm."""
 
+    def __post_init__(self):
+        if isinstance(self.curvature, list):  # would not do as a key of the cached images
+            self.curvature = tuple(self.curvature)
+
     @property
     def normal_stiffness(self) -> float:
         """Pressure per penetration of the thin bonded layer (Winkler), N/m^3: E (1-nu) / ((1+nu) (1-2nu) h)."""

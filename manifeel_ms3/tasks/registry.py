@@ -73,11 +73,11 @@ class TaskSpec:
 
     def instruction_for(self, env_kwargs: Mapping[str, Any]) -> str:
         """The sentence for the task with these arguments; "" if there is none."""
-        return self.goal_instructions.get(env_kwargs.get("goal", ""), self.instruction)
+        return self.goal_instructions.get(str(env_kwargs.get("goal")), self.instruction)
 
     def control_mode(self, env_kwargs: Mapping[str, Any]) -> str:
         """The control mode of the task with these arguments."""
-        own = self.start_control_modes.get(env_kwargs.get("start", ""), self.env_class.default_control_mode)
+        own = self.start_control_modes.get(str(env_kwargs.get("start")), self.env_class.default_control_mode)
         return env_kwargs.get("control_mode") or own
 
     @property

@@ -5,9 +5,10 @@ Needs the extra `teleop`.
 
 import logging
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium as gym
 import tyro
@@ -20,6 +21,9 @@ from manifeel_ms3.tasks.registry import make_env, task_spec
 from .devices import DEVICES, follow
 from .operator import Operator, steerable_axes
 from .session import Session
+
+if TYPE_CHECKING:
+    from .page import Page
 
 log = logging.getLogger(__name__)
 LAST_PORT = 2**16 - 1
@@ -78,8 +82,18 @@ def main(args: Args) -> Path:
     if args.device:
         follow(DEVICES[args.device](), operator)
     out = args.out or Path("data/demos") / args.env_id / "human.h5"
-    session = Session(env, args.env_id, kwargs, out, args.seed, operator)
-    page = Page(operator, args.env_id, args.host, args.port, base.touch_full_scales)
+    with ExitStack() as stack:
+        stack.callback(env.close)
+        page = Page(operator, args.env_id, args.host, args.port, base.touch_full_scales)
+        stack.callback(page.stop)
+        session = Session(env, args.env_id, kwargs, out, args.seed, operator)  # takes the file apart until it is finished
+        stack.callback(session.finish)
+        _record(session, page, args, out)
+    return out
+
+
+def _record(session: Session, page: "Page", args: Args, out: Path) -> None:
+    """Say where the page is, and record until interrupted."""
     if args.host not in LOOPBACK_NAMES:
         log.warning(
             "--host %s: other machines reach the page. Whoever has the address below can watch and steer the robot, and "
@@ -91,11 +105,6 @@ def main(args: Args) -> Path:
         session.run(page)
     except KeyboardInterrupt:
         log.info("ended; what was saved is in %s", out)
-    finally:
-        session.finish()
-        page.stop()
-        env.close()
-    return out
 
 
 def _require_images(env: gym.Env, obs_mode: str) -> None:

@@ -104,14 +104,20 @@ def follow(readings: Iterator[Reading], operator: Operator) -> threading.Thread:
 
     def read() -> None:
         was_down = first.gripper
-        for reading in readings:
-            for axis, value in reading.axes.items():
-                if abs(value) > DEAD_ZONE:
-                    operator.push(axis, value)
-            if reading.gripper and not was_down:
-                operator.toggle_gripper()
-            was_down = reading.gripper
-            time.sleep(1.0 / RATE)
+        try:
+            for reading in readings:
+                for axis, value in reading.axes.items():
+                    if abs(value) > DEAD_ZONE:
+                        operator.push(axis, value)
+                if reading.gripper and not was_down:
+                    operator.toggle_gripper()
+                was_down = reading.gripper
+                time.sleep(1.0 / RATE)
+        except Exception as error:  # of a device's library, whatever it raises when the device is unplugged
+            operator.pause()
+            log.warning(
+                "the device is lost (%s), and the robot waits; go on with the page, or plug it in and start again", error
+            )
 
     thread = threading.Thread(target=read, daemon=True)
     thread.start()

@@ -111,15 +111,17 @@ class Session:
         """Wait for the command that saves, discards or repeats an episode that is over; None if the session ends before it."""
         command = self.operator.take_command(0.0)
         self.operator.end()
-        result = "success" if episode.info["success"] else "no success"
+        result, refused = "success" if episode.info["success"] else "no success", False
         while self.operator.mode is not Mode.CLOSED:
             if command in (EpisodeCommand.RETRY, EpisodeCommand.DISCARD):
                 return command
             if episode.info["elapsed_steps"] == 0:
                 return EpisodeCommand.RETRY  # there is nothing to save
-            if command is EpisodeCommand.SAVE and self._save(screen, episode):
-                return command
-            if command is None or command is EpisodeCommand.STOP:
+            if command is EpisodeCommand.SAVE:
+                if self._save(screen, episode):
+                    return command
+                refused = True  # the screen keeps the reason
+            elif not refused:
                 screen.set_message(f"seed {self._seed}: {result} after {episode.info['elapsed_steps']} steps; save or discard")
             command = self.operator.take_command(PATIENCE)
         return None

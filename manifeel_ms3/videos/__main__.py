@@ -24,7 +24,7 @@ import numpy as np
 import tyro
 
 from manifeel_ms3.arguments import one_of
-from manifeel_ms3.command_line import missing_extras_named, run
+from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.folder_checks import require_revision
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
@@ -125,6 +125,12 @@ def main(args: Args) -> Path:
     check_video_path(args.out)
     _check(args)
     sources = [read_source(path, args.episode) for path in args.files]
+    of_a_policy = {"--checkpoint": args.checkpoint, "--policy": args.policy, "--policy-kwargs": args.policy_kwargs != "{}"}
+    given = [flag for flag, value in of_a_policy.items() if value]
+    if given and not any(source.is_result for source in sources):
+        raise InvalidArgumentError(
+            f"{', '.join(given)} without a result of an evaluation: trajectory files hold their own actions; leave it out"
+        )
     takes = [_take(source, args) for source in sources]
     write_video([list(video_frames(take)) for take in takes], args.out, args.fps, args.width)
     return args.out
@@ -139,6 +145,9 @@ def _check(args: Args) -> None:
     if not args.files:
         raise InvalidArgumentError("no file is given; give a trajectory file (.h5) or a result of `manifeel eval` (.json)")
     one_of("--pad", args.pad, SIDES)
+    json_object("--policy-kwargs", args.policy_kwargs)
+    if args.checkpoint and args.policy:
+        raise InvalidArgumentError("give either --checkpoint or --policy, by which a result's episode is acted again")
     for name, least in SMALLEST.items():
         value = getattr(args, name)
         if value is not None and value < least:

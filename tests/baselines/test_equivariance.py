@@ -97,14 +97,19 @@ def test_the_papers_encoder_has_the_depth_and_fields_of_the_public_code():
     assert (len(hooks), sides) == (6, [226, 113, 56, 28, 14, 7])
 
 
-@pytest.mark.parametrize("make", [EquivariantKeyPoints, EquivariantResNet])
-@pytest.mark.parametrize("g", range(1, ORDER))
-def test_image_features_turn_with_the_picture(g, make):
+@pytest.fixture(scope="module", params=[EquivariantKeyPoints, EquivariantResNet])
+def encoded(request):
+    """An encoder, pictures, and their features."""
     torch.manual_seed(0)
-    encoder = make(64).eval()
-    pictures = [smooth_picture(96, seed) for seed in PICTURES]
+    encoder, pictures = request.param(64).eval(), [smooth_picture(96, seed) for seed in PICTURES]
     with torch.no_grad():
-        plain = encoder(torch.cat([as_batch(picture) for picture in pictures]))
+        return encoder, pictures, encoder(torch.cat([as_batch(picture) for picture in pictures]))
+
+
+@pytest.mark.parametrize("g", range(1, ORDER))
+def test_image_features_turn_with_the_picture(g, encoded):
+    encoder, pictures, plain = encoded
+    with torch.no_grad():
         moved = encoder(torch.cat([as_batch(turned_picture(picture, g)) for picture in pictures]))
     error = (moved - plain.roll(g, dims=2)).norm() / plain.norm()
     assert error < (1e-4 if g % 2 == 0 else 0.25)  # at 45 degrees every layer's grid is interpolated

@@ -144,6 +144,8 @@ def test_a_full_disk_loses_nothing(desk, tmp_path, monkeypatch):
 
     monkeypatch.setattr(module, "write_episode", no_room)
     full.command(EpisodeCommand.SAVE, "No space left on device")
+    time.sleep(3 * module.PATIENCE)
+    assert "No space left on device" in full.screen.lines[-1]  # until the person has done something
     monkeypatch.setattr(module, "write_episode", write)
     full.command(EpisodeCommand.SAVE, "1 saved")
     full.close()

@@ -184,7 +184,8 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Background, images and circles of a folder, in the form that `fit_presses` expects.
 
     Raises:
-        InvalidFileError: A file is missing or cannot be read, or the list of presses lacks columns, presses or numbers.
+        InvalidFileError: A file is missing, cannot be read or has another size than the background, or the list of presses
+            lacks columns, presses or numbers.
     """
     listing = folder / "presses.csv"
     if not listing.is_file():
@@ -194,7 +195,14 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     if not presses or not {"file", "row", "col", "radius"} <= set(presses[0]):
         raise InvalidFileError(f"{listing} must have the columns file, row, col, radius and at least one press")
     circles = np.array([_circle_of(press, listing) for press in presses])
-    return _read_image(folder / "background.png"), np.stack([_read_image(folder / p["file"]) for p in presses]), circles
+    background, images = _read_image(folder / "background.png"), [_read_image(folder / press["file"]) for press in presses]
+    for press, image in zip(presses, images, strict=True):
+        if image.shape != background.shape:
+            raise InvalidFileError(
+                f"{folder / press['file']} has {image.shape[1]} x {image.shape[0]} pixels, background.png "
+                f"{background.shape[1]} x {background.shape[0]}; give images of one size"
+            )
+    return background, np.stack(images), circles
 
 
 def _circle_of(press: dict[str, str | None], listing: Path) -> list[float]:
