@@ -111,6 +111,9 @@ def test_a_file_of_states_alone_is_rendered_anew_from_the_camera_and_the_pad_tha
         (["--camera", "top"], "--camera='top' is unknown; choose from"),
         (["--pad", "both"], "--pad='both' is unknown; choose from"),
         (["--max-frames", "1"], "--max-frames 1 is too small; give 2 or more"),
+        (["--checkpoint", "last"], "--checkpoint without a result of an evaluation"),
+        (["--policy", "a:B", "--checkpoint", "last"], "give either --checkpoint or --policy"),
+        (["--policy-kwargs", "{x"], "--policy-kwargs '{x' is not json"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused_in_one_line(arguments, said, capsys):

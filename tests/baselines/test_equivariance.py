@@ -273,6 +273,14 @@ def test_a_pose_that_does_not_turn_as_a_vector_is_refused(policy):
         EquivariantDiffusionPolicy(policy.config, replace(SPEC, pose="quaternion"), action_dim=6)
 
 
+@pytest.mark.parametrize("fields", [2, 40, 200])
+def test_the_small_network_takes_any_even_number_of_fields(fields):
+    with torch.no_grad():
+        assert EquivariantKeyPoints(fields)(torch.rand(1, 3, 48, 48)).shape == (1, fields, ORDER)
+    with pytest.raises(InvalidArgumentError, match=f"hidden={fields + 1} must be even"):
+        EquivariantConfig(encoder=EncoderConfig("small_cnn"), hidden=fields + 1)
+
+
 def test_an_image_network_that_does_not_turn_is_refused(policy):
     encoder = replace(policy.config.encoder, image="resnet18_keypoints")
     with pytest.raises(UnknownNameError, match=r"choose from \['resnet18', 'small_cnn'\]"):

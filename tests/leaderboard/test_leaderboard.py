@@ -14,6 +14,7 @@ from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.floors import highest_floor
 from manifeel_ms3.evaluation.result import read_result, summary_of
+from manifeel_ms3.leaderboard import __main__ as leaderboard
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.page import rows_of, rows_on
@@ -50,12 +51,13 @@ def submit(folder: Path, board: Path, **changes) -> Path:
     return main(Submit(folder, policy=POLICY, board=board, **changes))
 
 
-def test_a_submission_is_run_again_and_accepted(submission, tmp_path):
+def test_a_submission_is_run_again_and_accepted(submission, tmp_path, monkeypatch):
     board = tmp_path / "board"
     taken = submit(submission, board, rerun=2)
     assert read_result(taken / "00000000.json")["policy"] == POLICY
     main(Build(board))
     assert "| 2 of 50 | [Still](https://example.org) |" in (board / "README.md").read_text()
+    monkeypatch.setattr(leaderboard, "run_again", lambda *_: pytest.fail("episodes are run again for nothing"))
     with pytest.raises(FileExistsAlreadyError, match="rename"):
         submit(submission, board, rerun=1)
 
