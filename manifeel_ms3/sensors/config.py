@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 import sapien
@@ -43,7 +43,7 @@ class GelConfig:
 
     def __post_init__(self):
         if isinstance(self.curvature, list):  # would not do as a key of the cached images
-            self.curvature = tuple(self.curvature)
+            self.curvature = cast("tuple[float, float]", tuple(self.curvature))
 
     @property
     def normal_stiffness(self) -> float:
