@@ -40,8 +40,8 @@ class FlowConfig(PolicyConfig):
     def __post_init__(self):
         super().__post_init__()
         require_at_least(1, segments=self.segments)
-        if not 0 < self.interval < 1:
-            raise InvalidArgumentError(f"interval={self.interval} must be a time between 0 and 1")
+        if not 0 < self.interval <= 1:
+            raise InvalidArgumentError(f"interval={self.interval} must be a time above 0 and at most 1")
 
     @property
     def least_inference_steps(self):
