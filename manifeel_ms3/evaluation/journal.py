@@ -130,8 +130,8 @@ class Journal:
         now, before = json.loads(self._first_line), evaluation if isinstance(evaluation, dict) else {}
         if different := [name for name, _, _ in differing(before, now)]:
             raise OtherEvaluationError(
-                f"{self.path} holds {episodes} episodes of an unfinished evaluation that differs in {', '.join(different)}; "
-                "run the command that began it, give another --out, or discard these episodes with --overwrite"
+                f"{self.path} holds {episodes} episodes of an unfinished evaluation with another {', '.join(different)}; run "
+                "the command that began it, give another --out, or discard these episodes with --overwrite"
             )
 
 
