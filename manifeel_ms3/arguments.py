@@ -58,6 +58,20 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def require_amount(name: str, value: Any) -> None:
+    """Check that a value is a finite number of at least 0.
+
+    Args:
+        name: What the message begins with, such as "--lr " or "pose_noise=".
+        value: The value.
+
+    Raises:
+        InvalidArgumentError: It is not.
+    """
+    if not (is_number(value) and value >= 0):
+        raise InvalidArgumentError(f"{name}{value} must be a number of at least 0")
+
+
 def require_at_least(least: int, **settings: int) -> None:
     """Check numbers among the settings of an object.
 

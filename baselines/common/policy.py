@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, cast
 import torch
 import torch.nn as nn
 
-from manifeel_ms3.arguments import is_number, require_at_least
+from manifeel_ms3.arguments import require_amount, require_at_least
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
@@ -103,8 +103,7 @@ class PolicyConfig:
                 f"first of obs_horizon={self.obs_horizon} observations, and action_horizon={self.action_horizon} actions are "
                 "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
             )
-        if not (is_number(self.pose_noise) and self.pose_noise >= 0):
-            raise InvalidArgumentError(f"pose_noise={self.pose_noise} must be a number of at least 0")
+        require_amount("pose_noise=", self.pose_noise)
         require_at_least(1, noise_draws=self.noise_draws, mlp_width=self.mlp_width, mlp_blocks=self.mlp_blocks)
         if self.diffusion_step_embed_dim < LEAST_EMBED_DIM or self.diffusion_step_embed_dim % 2:
             raise InvalidArgumentError(

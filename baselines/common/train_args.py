@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import torch
 from tyro.conf import arg
 
-from manifeel_ms3.arguments import flag_of, is_number, require_not_negative, require_positive
+from manifeel_ms3.arguments import flag_of, require_amount, require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode, check_seed
@@ -173,8 +173,8 @@ def check_run(args: TrainArgs) -> None:
     )
     require_not_negative(seed=args.seed, warmup_steps=args.warmup_steps)
     check_seed(args.seed)
-    if args.lr is not None and not (is_number(args.lr) and args.lr >= 0):
-        raise InvalidArgumentError(f"--lr {args.lr} must be a number of at least 0")
+    if args.lr is not None:
+        require_amount("--lr ", args.lr)
     if not args.policy.can_generate_in(args.inference_steps):
         raise InvalidArgumentError(
             f"--inference-steps {args.inference_steps}: this policy needs {args.policy.step_range} to generate"

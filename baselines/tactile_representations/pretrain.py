@@ -24,12 +24,11 @@ from tyro.conf import arg
 from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
-from manifeel_ms3.arguments import is_number, require_file, require_positive
+from manifeel_ms3.arguments import require_amount, require_file, require_positive
 from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.folder_checks import require_task
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import about_task, group_of, open_trajectories, read_header
-from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
@@ -100,8 +99,7 @@ def main(args: Args) -> list[float]:
         InUseError: Another process trains into the same file.
     """
     require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
-    if not (is_number(args.lr) and args.lr >= 0):
-        raise InvalidArgumentError(f"--lr {args.lr} must be a number of at least 0")
+    require_amount("--lr ", args.lr)
     require_file("--out", args.out, str(Args.out))
     with owned(args.out):
         return _pretrain(args)
