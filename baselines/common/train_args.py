@@ -152,8 +152,8 @@ def check_run(args: TrainArgs) -> None:
     """Check that the numbers of a run can be met, and that its settings do not contradict each other.
 
     Raises:
-        InvalidArgumentError: A number is too small, the run to resume is not named, or is to be overwritten, evaluations fall
-            between checkpoints, or no demonstrations are given.
+        InvalidArgumentError: A number is out of its range, the run to resume is not named, or is to be overwritten, evaluations
+            fall between checkpoints, or no demonstrations are given.
     """
     require_positive(
         num_demos=args.num_demos,
@@ -173,8 +173,11 @@ def check_run(args: TrainArgs) -> None:
     )
     require_not_negative(seed=args.seed, warmup_steps=args.warmup_steps)
     check_seed(args.seed)
-    if args.lr is not None:
-        require_amount("--lr ", args.lr)
+    for flag, amount in (("--lr ", args.lr or 0.0), ("--weight-decay ", args.weight_decay), ("--ema-power ", args.ema_power)):
+        require_amount(flag, amount)
+    for flag, rate in (*(("--betas", beta) for beta in args.betas), ("--ema-max-decay", args.ema_max_decay)):
+        if not 0 <= rate < 1:  # also where it is NaN
+            raise InvalidArgumentError(f"{flag} {rate}: a decay rate must be at least 0 and below 1")
     if not args.policy.can_generate_in(args.inference_steps):
         raise InvalidArgumentError(
             f"--inference-steps {args.inference_steps}: this policy needs {args.policy.step_range} to generate"

@@ -71,6 +71,10 @@ def test_a_length_in_epochs_counts_unless_that_is_fewer_steps_than_wanted_or_ste
         (dict(seed=-1), "--seed -1 must be at least 0"),
         (dict(lr=-0.1), "--lr -0.1 must be a number of at least 0"),
         (dict(lr=float("nan")), "--lr nan must be a number of at least 0"),
+        (dict(weight_decay=-1e-6), "--weight-decay -1e-06 must be a number of at least 0"),
+        (dict(ema_power=float("inf")), "--ema-power inf must be a number of at least 0"),
+        (dict(betas=(0.9, 1.0)), "--betas 1.0: a decay rate must be at least 0 and below 1"),
+        (dict(ema_max_decay=float("nan")), "--ema-max-decay nan: a decay rate must be at least 0 and below 1"),
         (
             dict(policy=FlowConfig(consistency=True, segments=2), inference_steps=1),  # would stop short of the actions
             "--inference-steps 1: this policy needs at least 2 to generate",
