@@ -120,6 +120,25 @@ def test_a_process_keeps_its_renderer(monkeypatch):
     ]
 
 
+@pytest.mark.parametrize(
+    ("asked", "device"),
+    [
+        ("gpu", "cuda"),
+        ("cuda", "cuda"),
+        ("sapien_cuda:1", "cuda:1"),
+        ("cpu", "cpu"),
+        ("sapien_cpu", "cpu"),
+        ("pci:01:00", "pci:01:00"),
+    ],
+)
+def test_the_device_that_is_tried_is_the_one_that_maniskill_would_render_on(monkeypatch, asked, device):
+    tried = []
+    monkeypatch.setattr(backend.sapien, "Device", lambda name: tried.append(name) or name)
+    monkeypatch.setattr(backend.sapien.render, "RenderSystem", lambda _device: None)
+    assert backend._works.__wrapped__(asked)
+    assert tried == [device]
+
+
 @needs_renderer
 def test_a_renderer_does_not_come_along_with_a_fork(make_env):
     make_env(obs_mode="rgb").reset(seed=0)

@@ -6,6 +6,7 @@ import os
 
 import sapien
 import torch
+from mani_skill.envs.utils.system.backend import render_backend_name_mapping
 
 NO_RENDERER = (
     "no Vulkan renderer was found, and {wanted} needs one. Without a GPU, install Mesa 24.3 or newer (Debian 12: "
@@ -25,16 +26,17 @@ _IMPORTED_IN = os.getpid()
 _renders_in: int | None = None
 """Id of the process that has a renderer, None if none has; a fork copies this number, but not the renderer."""
 _renders_on: str | None = None
-"""Where this process renders, "gpu" or "cpu"; None if it has no renderer. SAPIEN renders on one device per process."""
+"""Where this process renders, such as "gpu" or "cpu"; None if it has no renderer. SAPIEN renders on one device per process."""
 
 
 def available_render_backend(asked: str = "auto") -> str:
-    """The `render_backend` to use: "gpu", "cpu" or "none".
+    """The `render_backend` to use: "gpu", "cpu", "none", or what is asked for.
 
     A process that was forked from one with a renderer has none.
 
     Args:
-        asked: "gpu", "cpu" or "none", or "auto" for the one that this process uses already, or else the first that works.
+        asked: A name of ManiSkill's, such as "gpu", "cuda:1" or "cpu"; "none", or "auto" for the one that this process uses
+            already, or else the first that works.
     """
     global _renders_in, _renders_on
     if asked == "none" or renderer_lost():
@@ -84,9 +86,11 @@ def _first_that_works() -> str:
 
 @functools.cache
 def _works(backend: str) -> bool:
-    """Whether SAPIEN can render on "gpu" or "cpu" in this process."""
+    """Whether SAPIEN can render in this process on the device that ManiSkill calls `backend`, such as "gpu" or "cuda:1"."""
+    name, *address = backend.split(":")
+    kind = render_backend_name_mapping.get(name, name).removeprefix("sapien_")
     try:
-        sapien.render.RenderSystem(sapien.Device("cuda" if backend == "gpu" else "cpu"))
+        sapien.render.RenderSystem(sapien.Device(":".join([kind, *address])))
         return True
     except RuntimeError:
         return False
