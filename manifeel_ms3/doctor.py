@@ -17,6 +17,7 @@ import tyro
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from .command_line import PACKAGE, run
 from .errors import MachineError
@@ -187,7 +188,7 @@ def table(findings: list[Finding]) -> Table:
     marks = {True: "[green]ok[/]", False: "[red]wrong[/]", None: ""}
     out = Table("", "what", "found", "how to repair it")
     for finding in findings:
-        out.add_row(marks[finding.ok], finding.what, finding.found, finding.remedy)
+        out.add_row(marks[finding.ok], finding.what, Text(finding.found), Text(finding.remedy))
     return out
 
 

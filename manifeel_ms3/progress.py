@@ -20,7 +20,7 @@ def progress_bar(disable: bool = False) -> Progress:
     """
     in_bare_notebook = rich.get_console().is_jupyter and find_spec("ipywidgets") is None
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),  # it may hold the name of a file
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),

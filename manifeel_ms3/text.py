@@ -1,14 +1,9 @@
-"""Texts and links from submissions, made safe to show on the page and in the table."""
-
-import re
-from urllib.parse import urlsplit
+"""Texts from files of other people, made safe to show in a terminal and on a page."""
 
 LONGEST_SHOWN = 200
 """Largest number of characters of a text that is shown."""
 CUT = "..."
 """End of a text that was cut off."""
-LINK = re.compile(r"https?://[A-Za-z0-9\-._~:/?#!$&'*+,;=%]+")
-"""A web address without a user name, and without the characters that end a link in Markdown; the rest is percent-encoded."""
 ENTITIES = {character: f"&#{ord(character)};" for character in "&<>\"'|~$@^"}
 ESCAPES = {character: f"\\{character}" for character in "\\`*_{}[]#!"}
 """Characters that HTML entities replace in Markdown, and those that a backslash escapes."""
@@ -23,12 +18,3 @@ def one_line(text: str) -> str:
 def markdown_text(text: str) -> str:
     """The text in one line of Markdown that shows its characters as they are, and not as markup, HTML or a border of a cell."""
     return "".join(ENTITIES.get(letter) or ESCAPES.get(letter, letter) for letter in one_line(text))
-
-
-def is_safe_link(link: str) -> bool:
-    """Whether the text is an address of the web, with a host and without a user name."""
-    try:
-        parts = urlsplit(link)
-        return bool(LINK.fullmatch(link) and parts.hostname and parts.username is None) and (parts.port or 0) >= 0
-    except ValueError:  # the port is not a number
-        return False

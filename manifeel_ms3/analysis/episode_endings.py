@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .condition import Condition, by_condition
-from .markdown import markdown_table
+from .markdown import markdown_table, shown
 
 CENSUS = """
 ## How episodes end
@@ -42,9 +42,9 @@ def census_table(results: Results, conditions: list[Condition]) -> str:
     rows, of_condition = [], by_condition(results)
     for condition in conditions:
         if endings := endings_of(of_condition.get(condition, [])):
-            missed = ", ".join(f"{count} {name}" for name, count in endings.missed)
+            missed = ", ".join(f"{count} {shown(name)}" for name, count in endings.missed)
             counts = (endings.episodes, endings.succeeded, missed, endings.pressed_too_hard)
-            rows.append((condition.task, condition.sensing, condition.policy, f"`{condition.key}`", *counts))
+            rows.append((*map(shown, (condition.task, condition.sensing, condition.policy)), f"`{condition.key}`", *counts))
     names = ("task", "sensing", "policy", "id", "episodes", "success", "how the others end", "pressed too hard")
     return f"{CENSUS}{markdown_table(names, rows)}" if rows else ""
 

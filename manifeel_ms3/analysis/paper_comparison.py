@@ -9,7 +9,7 @@ from manifeel_ms3.evaluation.checkpoint_config import samples_per_step
 from manifeel_ms3.files import read_json
 
 from .condition import condition_of
-from .markdown import markdown_table
+from .markdown import markdown_table, shown
 from .paper import DP, RUNTIME, RUNTIME_DEMOS, SIMILARITY, TACRGB
 
 SECONDS_PER_MINUTE = 60
@@ -64,7 +64,7 @@ def _is_of_runtime(result: dict[str, Any], encoder: str) -> bool:
     condition, config = condition_of(result), result["config"]
     asked = (condition.task in RUNTIME_TASKS, condition.policy == DP, condition.obs_mode == TACRGB)
     known = all(config.get(name) for name in ("training_seconds", "step", "num_samples", "trained_on"))
-    known = known and samples_per_step(config) is not None
+    known = known and samples_per_step(config) is not None and type(config["num_samples"]) is int and config["num_samples"] > 0
     return all(asked) and known and condition.encoder == encoder and condition.num_demos == RUNTIME_DEMOS
 
 
@@ -75,7 +75,7 @@ def _timed(result: dict[str, Any]) -> tuple[float, float, str]:
     assert samples, "results of unknown batch size are left out"
     step_seconds = config["training_seconds"] / config["step"]
     epoch = step_seconds * math.ceil(config["num_samples"] / samples)
-    return epoch, samples / step_seconds, config["trained_on"]["gpu"] or config["trained_on"]["cpu"]
+    return epoch, samples / step_seconds, shown(config["trained_on"]["gpu"] or config["trained_on"]["cpu"])
 
 
 def similarity_table(files: Sequence[Path]) -> str:
@@ -89,7 +89,7 @@ def similarity_table(files: Sequence[Path]) -> str:
     for modality, objects in SIMILARITY.items():
         for name, (fid, kid) in objects.items():
             here = [one for one in measured if (one["modality"], one["object"]) == (modality, name)]
-            cells = [(_interval(one["fid"]), _interval(one["kid"]), one["features"]) for one in here]
+            cells = [(_interval(one["fid"]), _interval(one["kid"]), shown(one["features"])) for one in here]
             rows += [(modality, name, fid, kid, *one) for one in cells] or [
                 (modality, name, fid, kid, "not measured", None, None)
             ]

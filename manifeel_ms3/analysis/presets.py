@@ -11,6 +11,7 @@ from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.nested_settings import as_json
 
 from .condition import ENCODER, Condition, Settings, settings_of
+from .markdown import shown
 
 PAPER = "paper"
 """Name of the preset that has the paper's settings, in every policy that the paper reports."""
@@ -51,7 +52,8 @@ class TrainingSettings:
         return self.preset != PAPER, len(self.changes), str(self)
 
     def __str__(self) -> str:
-        changes = [f"{name} {value.strip(chr(34))}" for name, value in self.changes]
+        """The settings in words, as Markdown."""
+        changes = [shown(f"{name} {value.strip(chr(34))}") for name, value in self.changes]
         return ", ".join(filter(None, (self.preset, *changes))) or NOT_RECORDED
 
 

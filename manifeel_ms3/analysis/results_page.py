@@ -31,7 +31,7 @@ from .episode_endings import census_table
 from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
-from .markdown import markdown_table
+from .markdown import markdown_table, shown
 from .matching import Found
 from .paper_comparison import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
@@ -211,7 +211,7 @@ def training_curves(folders: tuple[Path, ...], out: Path) -> bool:
             continue
         config = checkpoint_config(last)
         entries = [entry for entry in read_json_lines(path) if TRAINING_LOSS in entry]
-        name = f"{config['policy_name']}, {config['obs_mode']}, seed {config['seed']}"
+        name = f"{config['policy_name']}, {config['obs_mode']}, seed {config.get('seed')}"
         runs.setdefault(config["env_id"], []).append((name, entries))
     if not runs:
         return False
@@ -287,8 +287,9 @@ def _table_of_conditions(found: dict[Condition, ConditionResults], results: list
             here.size,
             note,
         )
-        of = (condition.policy, condition.encoder, condition.num_demos, training_settings_of(condition), f"`{condition.key}`")
-        rows.append((_task(condition), condition.sensing, *measured, *of, cost, machines))
+        network = shown(condition.policy), shown(condition.encoder)
+        of = (*network, condition.num_demos, training_settings_of(condition), f"`{condition.key}`")
+        rows.append((_task(condition), shown(condition.sensing), *measured, *of, cost, machines))
     measures = ("success", "at the end", "floor", "gentle success", "by the paper's threshold", "std", "of", "note")
     settings = ("policy", "TacRGB encoder", "demonstrations", "settings", "id")
     return markdown_table(("task", "sensing", *measures, *settings, "cost", "on"), rows)
@@ -327,7 +328,9 @@ def _sorted(found: dict[Condition, ConditionResults]) -> list[tuple[Condition, C
 
 def _task(condition: Condition) -> str:
     revision = f"revision {condition.revision}" if condition.revision > 1 else ""
-    return " ".join(filter(None, (condition.task, f"`{condition.variant}`" if condition.variant else "", revision)))
+    variant = shown(condition.variant)
+    code = f"`{variant}`" if variant and variant == condition.variant else variant
+    return " ".join(filter(None, (shown(condition.task), code, revision)))
 
 
 def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator[tuple[str, ...]]:
@@ -340,7 +343,7 @@ def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator
                 cells = gain.signed, p_text(p_value) or ""
             except ResultError:
                 cells = "other initial states", ""
-            yield _task(condition), condition.sensing, condition.policy, other.policy, *cells
+            yield _task(condition), *map(shown, (condition.sensing, condition.policy, other.policy)), *cells
 
 
 def _claims(found: dict[Condition, ConditionResults]) -> str:
@@ -360,7 +363,7 @@ def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
         seed = result["training_seed"]
         longest[seed] = max(longest.get(seed, 0.0), config.get("training_seconds", 0.0))
         if trained_on := config.get("trained_on"):
-            machines.add(trained_on["gpu"] or f"{trained_on['cores']} cores of an {trained_on['cpu']}")
+            machines.add(shown(trained_on["gpu"] or f"{trained_on['cores']} cores of an {trained_on['cpu']}"))
     hours = sum(longest.values()) / SECONDS_PER_HOUR
     return f"{hours:.2f} h" if hours else None, ", ".join(sorted(machines)) or None
 

@@ -12,7 +12,7 @@ from manifeel_ms3.evaluation.result import ResultError
 from .condition import Condition, by_condition
 from .episode_endings import Results, endings_of
 from .estimates import SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
-from .markdown import markdown_table
+from .markdown import markdown_table, shown
 from .matching import Found, answering
 from .paper import MODES, TABLE_I, VISION, Rate, paper_condition, tasks_in_table
 from .presets import TrainingSettings
@@ -135,5 +135,5 @@ def _endings(mode: str, results: Results) -> str:
     endings = endings_of(results)
     if endings is None:
         return ""
-    missed = ", ".join(f"{count} {name}" for name, count in endings.missed) or "none"
+    missed = ", ".join(f"{count} {shown(name)}" for name, count in endings.missed) or "none"
     return f"With {NAMES[mode]}, {endings.episodes - endings.succeeded} of {endings.episodes} episodes fail: {missed}."

@@ -3,15 +3,18 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import tyro
 from rich.console import Console, Group
 from rich.table import Table
+from rich.text import Text
 
 from manifeel_ms3.arguments import require_not_negative
 from manifeel_ms3.command_line import as_typed, run
+from manifeel_ms3.text import one_line
 
 from .formats.maniskill_h5 import group_of, open_trajectories, origins, read_header, task_of, versions_of
 
@@ -90,12 +93,13 @@ def _file_table(path: Path, header: dict) -> Table:
     episodes, env = header["episodes"], header["env_info"]
     lengths = np.array([episode["elapsed_steps"] for episode in episodes] or [0])
     successes = sum(bool(episode["success"]) for episode in episodes)
-    table = Table(title=str(path), show_header=False)
-    table.add_row("task", f"{task_of(header)}, revision {header.get('revision', 'not known')}")
-    table.add_row("observations", str(env["env_kwargs"].get("obs_mode")))
-    table.add_row("source", ", ".join(map(str, origins(header, "source_type"))))
+    table = Table(title=_shown(path), show_header=False)
+    table.add_row("task", _shown(f"{task_of(header)}, revision {header.get('revision', 'not known')}"))
+    table.add_row("observations", _shown(env["env_kwargs"].get("obs_mode")))
+    table.add_row("source", _shown(", ".join(map(str, origins(header, "source_type")))))
     versions = versions_of(header) or {}
-    table.add_row("recorded with", ", ".join(f"{name} {number}" for name, number in versions.items()) or "not known")
+    recorded_with = ", ".join(f"{name} {number}" for name, number in versions.items())
+    table.add_row("recorded with", _shown(recorded_with or "not known"))
     table.add_row(
         "episodes", f"{len(episodes)}, {successes} successes, {len(header.get('failed_seeds', []))} seeds that failed"
     )
@@ -124,18 +128,22 @@ def _episode_table(episodes: list[dict], forces: list[np.ndarray] | None) -> Tab
         table.add_column(column)
     top = max((force.max(initial=0) for force in forces or []), default=0.0)
     for i, episode in enumerate(episodes):
-        cells = [str(episode[name]) for name in ("episode_id", "episode_seed", "elapsed_steps")]
-        cells += ["yes" if episode["success"] else "no"]
-        cells += [] if forces is None else [f"{forces[i].max(initial=0):.1f}", sparkline(forces[i], top)]
-        table.add_row(*cells)
+        cells = [_shown(episode[name]) for name in ("episode_id", "episode_seed", "elapsed_steps")]
+        measured = [] if forces is None else [f"{forces[i].max(initial=0):.1f}", sparkline(forces[i], top)]
+        table.add_row(*cells, "yes" if episode["success"] else "no", *measured)
     return table
 
 
 def _size_table(sizes: dict[str, int], episodes: int) -> Table:
     table = Table("array", "MB", "kB per episode", title="sizes of the arrays")
     for name, size in sorted(sizes.items(), key=lambda item: -item[1])[:NUM_SHOWN]:
-        table.add_row(name, f"{size / 1e6:.2f}", f"{size / 1e3 / max(episodes, 1):.1f}")
+        table.add_row(_shown(name), f"{size / 1e6:.2f}", f"{size / 1e3 / max(episodes, 1):.1f}")
     return table
+
+
+def _shown(text: Any) -> Text:
+    """A text of the file in one line, without colours, links or other codes that a terminal would obey."""
+    return Text(one_line(str(text)))
 
 
 def next_step(args: Args, _answer: None) -> str:

@@ -66,10 +66,11 @@ def samples_per_step(config: dict[str, Any]) -> int | None:
         config: Configuration of the policy.
 
     Returns:
-        None if the configuration does not name them.
+        None if the configuration does not give them as whole numbers of at least 1.
     """
     of_each, processes = config.get("batch_size"), with_implied(config)["num_processes"]
-    return of_each * processes if isinstance(of_each, int) and isinstance(processes, int) else None
+    are_counts = all(type(number) is int and number > 0 for number in (of_each, processes))
+    return of_each * processes if are_counts else None  # pyright: ignore[reportOptionalOperand]
 
 
 def hash_of_all_files(checkpoint: Path) -> str:

@@ -21,11 +21,11 @@ from manifeel_ms3.evaluation.floors import Floor, highest_floor
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.text import markdown_text, one_line
 
 from .checks import EPISODES, submissions_on
 from .rerun import episodes_to_run_again, rerun_of
 from .submission import Submission
-from .text import markdown_text, one_line
 
 with missing_extras_named():
     import jinja2

@@ -17,7 +17,7 @@ from manifeel_ms3.evaluation.result import check_result
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.paths import data_dir
 
-from .text import is_safe_link
+from .links import is_safe_link
 from .untrusted import FolderReader, UntrustedFileError, parse_json, quoted
 
 ABOUT, RERUN = Path(ABOUT_NAME), Path("rerun.json")

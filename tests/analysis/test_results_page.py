@@ -49,6 +49,29 @@ def test_links_lead_to_files_whose_names_have_spaces_and_parentheses(tmp_path):
     assert all(path.is_file() for path in linked)
 
 
+def test_texts_of_a_result_are_shown_as_texts(tmp_path):
+    """Neither Markdown nor HTML, nor a further cell of a table, comes from a stranger's result."""
+    nasty = "<img src=x onerror=alert(1)> | b ![c](javascript:d) `e`"
+    write_run(tmp_path, VISION, 0.2, checkpoints=1)
+    (path,) = tmp_path.rglob("evaluations/*.json")
+    result = json.loads(path.read_text())
+    result["config"] |= {
+        "note": nasty,
+        "batch_size": 0,
+        "num_samples": "many",
+        "trained_on": dict(cpu=nasty, cores=1, gpu=None),
+    }
+    result["env_kwargs"] |= {"fit": nasty}
+    for episode in result["episodes"]:
+        episode["ending"] = nasty
+    path.write_text(json.dumps(result | dict(policy=f"a:{nasty}")))
+    page = page_of(tmp_path)
+    assert "<img" not in page
+    assert "![c]" not in page
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({row.count("|") for row in table.splitlines()}) == 1
+
+
 def test_a_folder_in_the_place_of_the_page_or_the_table_is_refused_before_anything_is_drawn(tmp_path):
     write_run(tmp_path / "run", VISION, 0.5)
     before = sorted(tmp_path.rglob("*"))

@@ -1,6 +1,8 @@
 """What the summary of a file says is what the file holds."""
 
 import io
+import json
+import re
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.demonstrations.view import read_streams
-from tests.sample import observed_sample
+from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG
 from tests.trajectories import renumbered
 
@@ -35,6 +37,21 @@ def test_it_counts_what_is_there():
     between = sum(((force >= 10) & (force < 20)).sum() for force in forces)
     assert f"│ 10 to 20         │ {between} " in told
     assert "obs/sensor_data/wrist/rgb" in told
+
+
+def test_texts_of_the_file_are_shown_as_texts(tmp_path):
+    """They neither end the command as broken markup nor reach the terminal as links, colours or titles."""
+    path = renumbered(states_sample(PEG), tmp_path)
+    header = read_header(path)
+    nasty = "x [/] [red]y[/red] [link=https://a.b]z \x1b[31m \x1b]0;title\x07 \u202e"
+    header |= dict(source_type=nasty, versions={nasty: nasty})
+    header["env_info"]["env_kwargs"]["obs_mode"] = nasty
+    path.with_suffix(".json").write_text(json.dumps(header))
+    page = io.StringIO()
+    Console(width=400, file=page, force_terminal=True, color_system="truecolor").print(summary(path))
+    told = page.getvalue()
+    assert told.count("x [/] [red]y[/red] [link=https://a.b]z [31m ]0;title") == 4
+    assert not re.search("\x1b\\[31m|\x1b]|\x07|\u202e", told)
 
 
 def test_a_sparkline_shows_where_it_is_high():

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
+from manifeel_ms3.leaderboard.links import is_safe_link
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
-from manifeel_ms3.leaderboard.text import is_safe_link, markdown_text
+from manifeel_ms3.text import markdown_text
 
 from .files_of_strangers import rewrite_json
 from .submissions import NASTY
