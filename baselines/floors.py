@@ -108,7 +108,7 @@ def _observed_demonstrations(folder: Path) -> Path:
     Raises:
         DemonstrationError: There is none.
     """
-    path = observed_file(folder)
+    path = observed_file(folder, OBS_MODE)
     modes = read_header(path)["env_info"]["env_kwargs"]["obs_mode"].split("+") if path else ()
     if path and set(OBS_MODE.split("+")) <= set(modes):
         return path

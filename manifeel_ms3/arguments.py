@@ -42,6 +42,13 @@ def several_of(name: str, given: Any, allowed: Iterable[str]) -> tuple[str, ...]
     return tuple(one_of(name, value, allowed) for value in values)
 
 
+def names_in(given: Any) -> tuple[str, ...]:
+    """The names in an argument, such as `cameras`, that is one name, several names, or None; () for anything else."""
+    if isinstance(given, str):
+        return (given,)
+    return tuple(map(str, given)) if isinstance(given, (list, tuple)) else ()
+
+
 def by_name(name: str, given: Any, example: str) -> Mapping[str, Any]:
     """Return `given` if it is a mapping with strings as keys.
 

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from manifeel_ms3.arguments import names_in
 from manifeel_ms3.evaluation.checkpoint_config import IMPLIED
 from manifeel_ms3.evaluation.variant import SENSING, variant_of
 from manifeel_ms3.tasks.obs_modes import in_usual_order
@@ -122,8 +123,8 @@ def condition_of(result: dict[str, Any]) -> Condition:
         obs_mode,
         result["policy"].rpartition(":")[2],
         str(json.loads(dict(settings).get(ENCODER, '""'))),
-        _names(result["env_kwargs"].get("cameras")) if "rgb" in modes else (),
-        (_names(result["env_kwargs"].get("tactile_sensors")) or ("right",)) if {"tacrgb", "tacff"} & set(modes) else (),
+        names_in(result["env_kwargs"].get("cameras")) if "rgb" in modes else (),
+        (names_in(result["env_kwargs"].get("tactile_sensors")) or ("right",)) if {"tacrgb", "tacff"} & set(modes) else (),
         num_demos if isinstance(num_demos, int) else None,
         variant,
         result["revision"],
@@ -141,10 +142,6 @@ def by_condition(results: Iterable[dict[str, Any]]) -> dict[Condition, list[dict
     for result in results:
         found.setdefault(condition_of(result), []).append(result)
     return found
-
-
-def _names(given: Any) -> tuple[str, ...]:
-    return tuple(map(str, given)) if isinstance(given, (list, tuple)) else ()
 
 
 def settings_of(config: dict[str, Any], obs_mode: str) -> Settings:

@@ -81,7 +81,7 @@ def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     if args.to == "npz":
         return f"{made} holds one file for each episode; `numpy.load` opens them"
-    return f"{made} is a data set of the format {args.to}; `{train_command(made, read_header(args.file))}` trains on it"
+    return f"{made} is a data set of the format {args.to}; {train_command(made, read_header(args.file))} trains on it"
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Common parts of all commands that record: a trajectory file to which episodes are added, its json, the state of a worker."""
 
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,6 +9,7 @@ from uuid import uuid4
 
 import gymnasium as gym
 
+from manifeel_ms3.arguments import names_in
 from manifeel_ms3.command_line import as_typed
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import FileWriteError, move, read_json, remove_folder, write_json
@@ -105,15 +105,19 @@ def trajectory_name(env_id: str, env_kwargs: dict[str, Any]) -> str:
     return f"trajectory.{obs_mode}.{task_spec(env_id).control_mode(env_kwargs)}.{env_kwargs.get('sim_backend', 'physx_cpu')}.h5"
 
 
-def observed_file(folder: Path) -> Path | None:
-    """The first trajectory file with observations in a folder, in the order of names; None if there is none.
+def observed_file(folder: Path, obs_mode: str = "") -> Path | None:
+    """A trajectory file with observations in a folder, the first in the order of names; None if there is none.
 
     Files of earlier versions are found, too: there, `trajectory.h5` held observations.
+
+    Args:
+        folder: The folder.
+        obs_mode: Observations, joined by "+", of which a file that has all of them is preferred.
     """
-    for path in [*sorted(folder.glob("trajectory.*.h5")), folder / STATES_FILE]:
-        if path.is_file() and read_header(path)["env_info"]["env_kwargs"].get("obs_mode", "none") != "none":
-            return path
-    return None
+    files = [path for path in [*sorted(folder.glob("trajectory.*.h5")), folder / STATES_FILE] if path.is_file()]
+    held = {path: read_header(path)["env_info"]["env_kwargs"].get("obs_mode", "none").split("+") for path in files}
+    observed = [path for path in files if held[path] != ["none"]]
+    return max(observed, key=lambda path: set(obs_mode.split("+")) <= set(held[path]), default=None)
 
 
 @contextmanager
@@ -357,11 +361,11 @@ def next_step(_args: Any, path: Path) -> str:
     if not _learnable(seen["obs_mode"]):
         rendered = f"{rendering} makes a file with cameras and touch instead"
         return f"{held}; no policy is trained on the obs_mode {seen['obs_mode']}: {rendered}"
-    return f"{held}; {as_typed('manifeel', 'view', path)} shows them, `{train_command(path, header)}` trains a policy"
+    return f"{held}; {as_typed('manifeel', 'view', path)} shows them, {train_command(path, header)} trains a policy"
 
 
 def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
-    """The command that trains a policy on what was recorded.
+    """The command that trains a policy on what was recorded, in backquotes and quoted for a shell.
 
     Args:
         demonstrations: Path of the trajectory file, or of what was exported from it.
@@ -370,13 +374,15 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
     seen = header["env_info"]["env_kwargs"]
     with_module = header["env_info"]["env_id"]
     typed = with_module.rpartition(":")[0] in imported()  # without its module, another command would not find the task
-    mode = _learnable(seen["obs_mode"]) or seen["obs_mode"]
-    sensing = f"--env-id {with_module if typed else task_of(header)} --obs-mode {mode}"
-    if "cameras" in seen:  # other programs name them only where they are not the task's policy camera
-        sensing += f" --cameras {' '.join(seen['cameras'])}"
-    if (pads := seen.get("tactile_sensors")) and "right" not in pads:  # policies observe the right one unless told otherwise
-        sensing += f" --tactile-sensors {' '.join(pads)}"
-    return f"manifeel train diffusion_policy cpu --demo-path {shlex.quote(str(demonstrations))} {sensing}"
+    held = str(seen.get("obs_mode", "none"))
+    words = ["manifeel", "train", "diffusion_policy", "cpu", "--demo-path", demonstrations]
+    words += ["--env-id", with_module if typed else task_of(header), "--obs-mode", _learnable(held) or held]
+    if cameras := names_in(seen.get("cameras")):  # other programs name them only where they are not the task's policy camera
+        words += ["--cameras", *cameras]
+    pads = names_in(seen.get("tactile_sensors"))
+    if pads and "right" not in pads:  # policies observe the right one unless told otherwise
+        words += ["--tactile-sensors", *pads]
+    return as_typed(*words)
 
 
 def _learnable(obs_mode: str) -> str:

@@ -12,6 +12,7 @@ import imageio.v2 as imageio
 import numpy as np
 import torch
 
+from manifeel_ms3.arguments import names_in
 from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
@@ -69,19 +70,14 @@ def film_env(
     Raises:
         MachineError: This machine has no renderer.
     """
-    seen = _names(env_kwargs.get("cameras")) or (task_spec(env_id).policy_camera,)
+    seen = names_in(env_kwargs.get("cameras")) or (task_spec(env_id).policy_camera,)
     added: dict[str, Any] = dict(
         obs_mode="rgb+tacrgb+tacff",
         cameras=tuple(dict.fromkeys([*seen, *cameras])),
-        tactile_sensors=tuple(dict.fromkeys([*_names(env_kwargs.get("tactile_sensors")), *pads])) or ("right",),
+        tactile_sensors=tuple(dict.fromkeys([*names_in(env_kwargs.get("tactile_sensors")), *pads])) or ("right",),
         render_backend="auto",
     )
     return make_env(env_id, **dict(env_kwargs) | added | others)
-
-
-def _names(given: Iterable[str] | str | None) -> tuple[str, ...]:
-    """The names in an argument that is one name, several names, or None."""
-    return (given,) if isinstance(given, str) else tuple(given or ())
 
 
 def replayed(env: gym.Env, actions: Iterable[np.ndarray], seed: int) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:

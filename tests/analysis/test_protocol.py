@@ -103,6 +103,15 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     assert len({plain.key, changed.key, *(condition_of(result).key for result in results)}) == 5
 
 
+def test_one_camera_and_one_pad_may_be_given_by_their_names():
+    config = dict(policy_name="diffusion_policy", obs_mode="rgb+tacff")
+    by_name, in_lists = (
+        condition_of(result_of(PEG, dict(cameras=cameras, tactile_sensors=pads), config, [made_up(1, True)]))
+        for cameras, pads in (("wrist", "left"), (["wrist"], ["left"]))
+    )
+    assert (by_name.cameras, by_name.pads) == (in_lists.cameras, in_lists.pads) == (("wrist",), ("left",))
+
+
 def test_demonstrations_of_another_variant_make_another_policy():
     def trained_on(**recorded) -> Condition:
         config = dict(policy_name="diffusion_policy", obs_mode="rgb", env_kwargs=recorded)
