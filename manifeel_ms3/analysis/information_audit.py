@@ -37,6 +37,8 @@ from .probes import EpisodeGroup, Probe
 log = logging.getLogger(__name__)
 MODALITIES = {"camera": "camera", "tacrgb": "TacRGB", "tacff": "TacFF"}
 """Names of the modalities, and their titles in the table and the figure."""
+OBSERVED = "rgb+tacrgb+tacff"
+"""Observations that a recording must have."""
 FOLDS = 5
 """Number of parts that the episodes are split into; each part is predicted from a fit to the others."""
 FEWEST_EPISODES = 2 * FOLDS
@@ -151,7 +153,10 @@ def run_probe(probe: Probe, env_id: str, path: Path, camera: str | None = None) 
     chance = _score(data.truth, np.full_like(data.truth, constant), data.episodes, numeric)[0]
     results = []
     for modality, features in data.features.items():
-        predicted = cross_validated(features, data.truth, data.episodes, numeric)
+        try:
+            predicted = cross_validated(features, data.truth, data.episodes, numeric)
+        except DemonstrationError as error:
+            raise DemonstrationError(f"{path}: of {probe.question!r}, {error}; record more episodes") from error
         score, low, high = _score(data.truth, predicted, data.episodes, numeric)
         counts = (len(set(data.episodes)), len(data.truth), sensors[modality])
         results.append(ProbeResult(probe.question, env_id, modality, probe.unit, score, (low, high), chance, *counts))
@@ -176,7 +181,7 @@ def _read(probe: Probe, path: Path, sensors: dict[str, str]) -> _Data:
                         rows.append(_features(group, sensor, modality, t))
                     except KeyError as error:
                         raise DemonstrationError(
-                            f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode rgb+tacrgb+tacff, this "
+                            f"{path} lacks {modality} of {sensor} ({error}); record it with obs_mode {OBSERVED}, this "
                             "camera and the right pad"
                         ) from error
     if len(set(episodes)) < FEWEST_EPISODES:
@@ -204,6 +209,7 @@ def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarra
         numeric: Whether the answers are numbers; otherwise they are two classes.
 
     Raises:
+        DemonstrationError: One of two classes occurs in too few episodes.
         MissingExtraError: The extra `audit`, which brings scikit-learn, is not installed.
     """
     with missing_extras_named():
@@ -219,6 +225,9 @@ def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarra
     features = features[:, features.std(0) > 0]
     if not features.size:  # the sensor observes the same at all times
         features = np.zeros((len(truth), 1))
+    folds = list(GroupKFold(FOLDS).split(features, truth, episodes))
+    if not numeric and any(len(set(truth[learnt])) < 2 for learnt, _ in folds):
+        raise DemonstrationError("one of the two answers occurs in too few episodes to predict any of them from the others")
     components = PCA(min(COMPONENTS, features.shape[1], len(truth) // 2), random_state=0)
     if numeric:
         kernel = ConstantKernel(1.0) * RBF(LENGTH_SCALE) + WhiteKernel(NOISE)
@@ -228,7 +237,7 @@ def cross_validated(features: np.ndarray, truth: np.ndarray, episodes: np.ndarra
     # neither warning is a fault: images without change have no variance, and a fit may end at the bounds of its kernel
     with np.errstate(invalid="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return np.asarray(cross_val_predict(pipeline, features, truth, groups=episodes, cv=GroupKFold(FOLDS)))
+        return np.asarray(cross_val_predict(pipeline, features, truth, cv=folds))
 
 
 def _score(truth: np.ndarray, predicted: np.ndarray, episodes: np.ndarray, numeric: bool) -> tuple[float, float, float]:
@@ -350,7 +359,7 @@ def _recorded_tasks(demos: Path) -> Iterator[tuple[Path, TaskSpec]]:
     """Trajectory files of the tasks that have questions and were recorded; the others are named in the log."""
     for spec in all_tasks().values():
         folder = demos / spec.env_id
-        if spec.probes and (path := observed_file(folder)):
+        if spec.probes and (path := observed_file(folder, OBSERVED)):
             yield path, spec
         elif spec.probes:
             log.warning("%s is left out: %s holds no recording with observations", spec.env_id, folder)

@@ -25,9 +25,9 @@ from manifeel_ms3.arguments import require_positive
 from manifeel_ms3.command_line import as_typed, missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories, read_header
 from manifeel_ms3.demonstrations.formats.touch_units import recorded_sensor
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.evaluation.policy import import_name
-from manifeel_ms3.files import NOT_NPZ, atomic_write, write_json
+from manifeel_ms3.files import NOT_NPZ, atomic_write, read_npz, write_json
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.sensors.imperfection_config import FULL_SCALE_FORCE
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -109,10 +109,14 @@ def main(args: Args) -> Similarity:
 
     Raises:
         SimilarityError: A set has too few images, one is broken, or the features are not available.
-        InvalidArgumentError: A number is less than 1.
+        InvalidArgumentError: A number is too small.
         MissingExtraError: An extra that the features need is not installed.
     """
     require_positive(limit=args.limit, resamples=args.resamples)
+    if args.limit < FEWEST:
+        raise InvalidArgumentError(
+            f"--limit {args.limit} is too small; a comparison needs at least {FEWEST} images of each set"
+        )
     sim_images, real_images = (images_of(folder, args) for folder in (args.sim, args.real))
     sim, real = _features_of([sim_images, real_images], features_by_name(args.features))
     result = Similarity(
@@ -221,16 +225,14 @@ def images_of(source: Path, args: Args) -> list[np.ndarray]:
     """
     suffixes = IMAGES if args.modality == "tacrgb" else FIELDS
     if source.suffix in RECORDINGS:
-        found = _recorded(source, args)
+        found, kind = _recorded(source, args), f"moments at which the {args.pad} pad is in contact"
     else:
         files = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes)
         if len(files) > args.limit:
             files = [files[k] for k in np.random.default_rng(0).choice(len(files), args.limit, replace=False)]
-        found = [_image(path) for path in files]
+        found, kind = [_image(path) for path in files], f"of {suffixes}"
     if len(found) < FEWEST:
-        raise SimilarityError(
-            f"{source} holds {len(found)} of {suffixes}; --modality {args.modality} needs at least {FEWEST} of them"
-        )
+        raise SimilarityError(f"{source} holds {len(found)} {kind}; --modality {args.modality} needs at least {FEWEST} of them")
     height, width = found[0].shape[:2]
     return [cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in found]
 
@@ -242,9 +244,11 @@ def _image(path: Path) -> np.ndarray:
             raise SimilarityError(f"{path} cannot be read as an image; repair or remove it")
         return image[..., ::-1]
     try:
-        loaded = np.load(path)
-        field = loaded if isinstance(loaded, np.ndarray) else loaded[loaded.files[0]]
-    except NOT_NPZ as error:
+        if path.suffix.lower() == ".npz":
+            field = next(iter(read_npz(path, "a force field").values()), np.zeros(0))
+        else:
+            field = np.load(path)
+    except (*NOT_NPZ, InvalidFileError) as error:
         raise SimilarityError(f"{path} cannot be read as a force field ({error}); repair or remove it") from error
     if field.ndim != 3 or field.shape[-1] != 3:
         raise SimilarityError(f"{path} holds an array {field.shape}; a force field is (rows, columns, 3), in N")

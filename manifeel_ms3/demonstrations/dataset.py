@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import tyro
 
 from manifeel_ms3.arguments import require_positive
-from manifeel_ms3.command_line import run
+from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import file_hash, read_json, write_json
 from manifeel_ms3.ownership import owned
@@ -35,8 +35,8 @@ DEMONSTRATIONS_SCHEMA = "manifeel-demonstrations-1"
 MANIFEST_FILE = "manifest.json"
 """Name of the manifest in its folder."""
 SMALLEST_SHARE = 0.2
-"""Smallest share of a demonstration's full size that is expected where images are smaller, because touch and states do not
-shrink with them; set once, not tuned."""
+"""Smallest share of a demonstration's full size that is expected where images are fewer or smaller, because force fields and
+states do not shrink with them; set once, not tuned."""
 MANIFEST = {
     "type": "object",
     "required": ["schema", "files"],
@@ -130,9 +130,12 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
         MachineError: The disk has too little room.
     """
     free = shutil.disk_usage(args.out).free
-    pixels = ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2
+    modes = args.obs_mode.split("+")
+    cameras = len(args.cameras) * ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2 * ("rgb" in modes)
+    images = cameras + len(args.tactile_sensors) * ("tacrgb" in modes)
+    share = images / (len(CAMERAS) + len(SIDES))  # all are counted as images of one size
     full = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
-    if (needed := full * max(pixels, SMALLEST_SHARE)) > free:
+    if (needed := full * max(share, SMALLEST_SHARE)) > free:
         raise MachineError(
             f"{args.out} has {free / 1e9:.1f} GB free, {sum(counts.values())} more episodes take up to {needed / 1e9:.1f} GB; "
             "give another --out, fewer --tasks or --cameras, or --obs-mode none (finished episodes are kept)"
@@ -188,7 +191,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
-    return f"{made} lists the files; `manifeel validate {args.out}/*/*.h5` checks them, `manifeel summary FILE` describes one"
+    check = as_typed("manifeel", "validate", args.out)
+    return f"{made} lists the files; {check} checks them, `manifeel summary FILE` describes one"
 
 
 if __name__ == "__main__":

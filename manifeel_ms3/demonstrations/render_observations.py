@@ -23,7 +23,7 @@ import tyro
 
 from manifeel_ms3.arguments import by_name, require_positive
 from manifeel_ms3.command_line import run
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 from manifeel_ms3.workers import WorkerPool
@@ -41,7 +41,7 @@ from .formats.maniskill_h5 import (
     task_of,
 )
 from .recording import Recorder, Recording, make_header, make_recorder, next_step, open_recording
-from .replay import pose_difference
+from .replay import pose_difference, without_images
 
 log = logging.getLogger(__name__)
 DEVIATION = "replay_deviation"
@@ -84,7 +84,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         DemonstrationError: A trajectory file is missing or broken, was recorded with other arguments or with another revision
             of the task, or holds a seed twice.
         InUseError: Another process writes the file.
-        WorkFailedError: A worker process died.
+        WorkFailedError: A worker process died, or no episode succeeds in the replay.
     """
     require_positive(num_demos=args.num, num_procs=args.workers, image_size=args.image_size)
     source = read_header(args.path)
@@ -95,7 +95,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     header = make_header(env_id, env_kwargs) | _origin(source) | dict(failed_seeds=[])
     source_kwargs = None
     if args.control_mode is not None:
-        source_kwargs = source["env_info"]["env_kwargs"] | dict(obs_mode="none", render_backend="none")
+        source_kwargs = without_images(source["env_info"]["env_kwargs"])
     episodes = _by_seed(args.path, first_episodes(args.path, source, args.num))
     with open_recording(args.out, header, list(episodes)) as recording:
         left = [seed for seed in episodes if seed not in recording.infos and seed not in recording.failed]
@@ -117,6 +117,11 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
                 count(recording.reject(seed) if info is None else recording.accept(seed, info))
         _warn(recording)
         recording.finish()
+        if not recording.infos:
+            raise WorkFailedError(
+                f"none of the {len(episodes)} episodes of {args.path} succeeds in this replay; use the versions that its json "
+                "names, or record demonstrations of your own"
+            )
     return args.out
 
 

@@ -2,6 +2,7 @@
 
 import logging
 import sys
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,6 +102,15 @@ def pose_difference(recorded: np.ndarray, replayed: np.ndarray) -> float:
     return max(float(np.abs(difference).max()) for difference in differences)
 
 
+def without_images(env_kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of a recording's environment, changed so that it observes and renders nothing.
+
+    ManiSkill's tools record with a `render_mode`, which needs a renderer.
+    """
+    kept = {name: value for name, value in env_kwargs.items() if name not in ("render_mode", "human_render_camera_configs")}
+    return kept | dict(obs_mode="none", render_backend="none")
+
+
 def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
     """The environment that a file's header describes, without rendering; only a registered task is made.
 
@@ -110,7 +120,7 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
     """
     env_id, kwargs = header["env_info"]["env_id"], header["env_info"]["env_kwargs"]
     try:
-        return make_env(env_id, **kwargs | dict(obs_mode="none", render_backend="none"))
+        return make_env(env_id, **without_images(kwargs))
     except UnknownNameError:
         raise
     except InvalidArgumentError as error:

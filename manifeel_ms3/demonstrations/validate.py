@@ -33,7 +33,7 @@ class Args:
     path: tyro.conf.Positional[Path]
     """Folder that holds a manifest.json, or one trajectory file."""
     replay: int = 0
-    """Number of episodes of each file to replay from their actions."""
+    """Number of episodes of each file to replay from their actions; all of a file that has fewer."""
 
 
 def validate(path: Path, num_replays: int = 0) -> list[str]:
@@ -41,7 +41,7 @@ def validate(path: Path, num_replays: int = 0) -> list[str]:
 
     Args:
         path: Folder that holds the manifest, or a trajectory file.
-        num_replays: Number of episodes of each file to replay from their actions.
+        num_replays: Number of episodes of each file to replay from their actions; all of a file that has fewer.
 
     Raises:
         DemonstrationError: The folder has no manifest that can be read.
@@ -67,15 +67,12 @@ def _problems(folder: Path, name: str, entry: dict[str, Any], num_replays: int) 
 
 def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
     """Faults of one trajectory file, given what a manifest says of it."""
-    replays = []
     try:
         episodes = read_header(path)["episodes"]
         problems = _manifest_problems(describe(path), entry) if entry else []
         with open_trajectories(path) as file:
             for episode in episodes:
                 problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
-        if num_replays:
-            replays = replay(path, num_replays)
     except (ManifeelError, OSError) as error:
         return [str(error)]
     seeds = [episode["episode_seed"] for episode in episodes]
@@ -83,8 +80,19 @@ def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> li
         problems.append(f"seeds {sorted(shared)} are evaluation seeds; demonstrations use seeds below {FIRST_EVALUATION_SEED}")
     if len(set(seeds)) < len(seeds):
         problems.append("a seed occurs twice")
+    if num := min(num_replays, len(episodes)):
+        problems += _replay_problems(path, num)
+    return problems
+
+
+def _replay_problems(path: Path, num: int) -> list[str]:
+    """Which of the first `num` episodes of a file do not come out as they were recorded, or why they cannot be replayed."""
+    try:
+        replays = replay(path, num)
+    except (ManifeelError, OSError) as error:
+        return [str(error)]
     moved = [replayed for replayed in replays if replayed.deviation > 0]
-    return problems + [f"seed {other.seed} does not come out as recorded (off by {other.deviation})" for other in moved]
+    return [f"seed {other.seed} does not come out as recorded (off by {other.deviation})" for other in moved]
 
 
 def _manifest_problems(found: dict[str, Any], entry: dict[str, Any]) -> list[str]:

@@ -20,8 +20,10 @@ import torch
 import tyro
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, PandaGelSight
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
-from manifeel_ms3.errors import MachineError
+from manifeel_ms3.errors import InvalidArgumentError, MachineError
+from manifeel_ms3.files import atomic_write
 from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.sensors.visualisation import force_field_images
@@ -75,12 +77,21 @@ def main(args: Args) -> None:
 
     Raises:
         DemonstrationError: The file is missing or broken, or has no such episode.
+        InvalidArgumentError: The path to write is that of a folder, or a browser is asked for as well.
         MachineError: The viewer does not start, for example because there is no screen.
         MissingExtraError: Rerun is not installed.
     """
+    if args.save and args.web:
+        raise InvalidArgumentError(
+            f"--save {args.save} writes a file, and --web shows the episode in a browser; give one of them"
+        )
+    if args.save:
+        require_file("--save", args.save, "episode.rrd")
     recording = rerun_recording(args.file, args.episode)
     if args.save:
-        recording.save(args.save)
+        with atomic_write(args.save) as partial:
+            recording.save(partial)
+            recording.disconnect()
         log.info("%s; `rerun %s` opens it", args.save, args.save)
         return
     with TemporaryDirectory(prefix="manifeel-view-") as folder:

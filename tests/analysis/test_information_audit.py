@@ -1,6 +1,7 @@
 """The information audit finds information that is there, and none where there is none."""
 
 import json
+import shutil
 
 import h5py
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from manifeel_ms3.analysis import information_audit
 from manifeel_ms3.analysis.probes import register_probe
 from manifeel_ms3.demonstrations import DemonstrationError
+from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
@@ -180,6 +182,26 @@ def test_audit_refuses_a_question_with_one_answer(recorded, tmp_path):
             episode["env_states/actors/battery"][:, 0] = 0.425
     with pytest.raises(DemonstrationError, match='before contact" is 0 at all 72 moments'):
         information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+
+
+def test_audit_refuses_an_answer_that_too_few_episodes_have(recorded, tmp_path):
+    with h5py.File(recorded / "ManiFeel-ObjectSearch-v1/trajectory.h5", "r+") as file:
+        for name, episode in file.items():
+            episode["env_states/actors/battery"][:, 0] = 0.575 if name == "traj_3" else 0.425
+    with pytest.raises(DemonstrationError, match="one of the two answers occurs in too few episodes"):
+        information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+
+
+def test_audit_asks_the_file_of_a_task_that_has_all_observations(recorded):
+    task = recorded / "ManiFeel-ObjectSearch-v1"
+    modes = ("rgb+tacff", "rgb+tacrgb+tacff")
+    for mode in modes:
+        header = json.loads((task / "trajectory.json").read_text())
+        header["env_info"]["env_kwargs"]["obs_mode"] = mode
+        (task / f"trajectory.{mode}.json").write_text(json.dumps(header))
+        shutil.copy(task / "trajectory.h5", task / f"trajectory.{mode}.h5")
+    assert observed_file(task, modes[1]) == task / f"trajectory.{modes[1]}.h5"
+    assert observed_file(task) == task / f"trajectory.{modes[0]}.h5"
 
 
 def test_audit_says_what_is_missing(recorded, tmp_path):

@@ -59,7 +59,7 @@ def test_same_command_again_does_nothing(folder):
 
 
 def test_only_episodes_that_are_not_there_yet_need_room(folder, monkeypatch):
-    room = 1.5e6 * task_spec(PEG).demo_megabytes  # for one more episode
+    room = 1.5e6 * task_spec(PEG).demo_megabytes * dataset.SMALLEST_SHARE  # for one more episode without images
     monkeypatch.setattr(dataset.shutil, "disk_usage", lambda path: type("Usage", (), dict(free=room)))
     sensing = dict(obs_mode="tacff", cameras=(), tactile_sensors=("right",))
     dataset.main(dataset.Args(folder, (PEG,), num=2, **sensing))
@@ -281,6 +281,47 @@ def test_a_set_may_hold_files_that_do_not_say_versions_and_forces(folder, tmp_pa
     entry = json.loads((copy / "manifest.json").read_text())["files"][f"{PEG}/{STATES}"]
     assert (entry["versions"], entry["peak_contact_force"]) == (None, None)
     assert validate.validate(copy) == []
+
+
+def test_faults_are_said_beside_a_replay_that_is_not_possible(folder, tmp_path):
+    assert validate.validate(folder / PEG / STATES, num_replays=10) == []  # the file has two episodes
+    copy = copy_of_the_sample(tmp_path)
+    header = json.loads(copy.with_suffix(".json").read_text())
+    copy.with_suffix(".json").write_text(json.dumps(header | dict(revision=1)))
+    with h5py.File(copy, "r+") as file:
+        first_array(file, "success", lambda values: values & False)
+    found, not_replayed = validate.validate(copy, num_replays=1)
+    assert found == "seed 0: it does not end in success"
+    assert "revision 1" in not_replayed
+
+
+def test_a_file_of_maniskills_tools_is_replayed_without_their_renderer(tmp_path):
+    copy = copy_of_the_sample(tmp_path)
+    header = json.loads(copy.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"] |= dict(render_mode="rgb_array", human_render_camera_configs=dict(width=32))
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    assert [replayed.success for replayed in replay.replay(copy, 1)] == [True]
+
+
+@pytest.mark.parametrize(
+    ("asked", "megabytes"),
+    [
+        (dict(), 1.0),
+        (dict(cameras=("wrist",), tactile_sensors=("right",)), 0.4),
+        (dict(obs_mode="tacrgb"), 0.4),
+        (dict(obs_mode="tacff"), 0.2),
+        (dict(image_size=128), 0.55),
+    ],
+)
+def test_the_room_that_is_needed_follows_from_the_images_that_are_asked_for(tmp_path, monkeypatch, asked, megabytes):
+    needed = 100 * megabytes * task_spec(PEG).demo_megabytes * 1e6
+    args = dataset.Args(tmp_path, (PEG,), **asked)
+    free = [0.99 * needed, 1.01 * needed]
+    monkeypatch.setattr(dataset.shutil, "disk_usage", lambda path: type("Usage", (), dict(free=free[0])))
+    with pytest.raises(MachineError, match="GB free"):
+        dataset._check_room(args, {PEG: 100})
+    free.pop(0)
+    dataset._check_room(args, {PEG: 100})
 
 
 def test_set_without_manifest_says_what_writes_one(tmp_path):

@@ -4,6 +4,8 @@ import json
 from typing import Any
 
 from manifeel_ms3.sensors.config import Units
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
+from manifeel_ms3.tasks.obs_modes import PAD
 
 from .lerobot_layout import feature_name
 from .maniskill_h5 import origins, task_of, versions_of
@@ -34,9 +36,8 @@ The dataset has LeRobot's format {form}.
 |---|---|---|---|
 """
 BACK = """
-`observation.state` is the pose of the tool in the robot's base frame (m, quaternion wxyz). `observation.images.tactile_*` are
-what a GelSight pad's camera sees. {touch}Actions are in [-1, 1] in the
-control modes with `delta` in their names, which the default is one of. `next.reward`, `next.success` and `next.done` are those
+`observation.state` is the pose of the tool in the robot's base frame (m, quaternion wxyz). {images}{touch}Actions are those
+of the control mode `{control_mode}`. `next.reward`, `next.success` and `next.done` are those
 after the frame's action.
 
 The task was made with these arguments:
@@ -76,8 +77,20 @@ def card(header: dict[str, Any], keys: list[str], task: str, info: dict[str, Any
         for name, feature in info["features"].items()
     ]
     env_kwargs = header["env_info"]["env_kwargs"]
-    back = BACK.format(env_kwargs=json.dumps(env_kwargs, indent=2), touch=_touch(recorded_units(env_kwargs, keys)))
+    back = BACK.format(
+        env_kwargs=json.dumps(env_kwargs, indent=2),
+        images=_images(header, info),
+        touch=_touch(recorded_units(env_kwargs, keys)),
+        control_mode=", ".join(sorted({episode.get("control_mode", "not named") for episode in header["episodes"]})),
+    )
     return FRONT.format(**about) + "".join(rows) + back
+
+
+def _images(header: dict[str, Any], info: dict[str, Any]) -> str:
+    """A sentence that says what the tactile images are; "" if there are none."""
+    sensor = header["env_info"]["env_kwargs"].get("sensor", DEFAULT_SENSOR)
+    named = ", ".join(f"`{name}`" for name in info["features"] if name.startswith(feature_name(f"sensor_data/{PAD}/rgb")))
+    return f"{named}: images of the gel of the sensor `{sensor}`, as one sees its face from outside.\n" if named else ""
 
 
 def _touch(units: dict[str, Units]) -> str:
