@@ -176,8 +176,8 @@ def task_rows() -> Iterator[Row]:
 def limit_rows() -> Iterator[Row]:
     """A row on the time limit of each task."""
     why = (
-        "At least twice the mean length of a demonstration, and 1.5 times the longest: the code's limit would leave no margin "
-        "in the longest tasks, and rewards waiting in the others."
+        "At least twice the mean length of the paper's number of demonstrations, and 1.5 times the longest of them: the code's "
+        "limit would leave no margin in the longest tasks, and rewards waiting in the others."
     )
     for spec in paper_tasks():
         yield _row(spec.name, "", f"{CODE_LIMIT} steps", f"{spec.max_episode_steps} steps", why)

@@ -36,13 +36,13 @@ ROWS = {
 }
 """First cells of the rows, in the order of the table."""
 TEXT = """
-**What touch adds, in numbers:** success rates of Diffusion Policy with small networks (of the presets `cpu`, `cpu_long` and
-`cpu_targets` the last that was run with as many seeds), each trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU
-core, with the paper's number of demonstrations, over {episodes} initial states that no demonstration has. The number after
-± is the standard deviation over {seeds} training seeds; rows without it have one seed, so that their differences of less
-than about 35 points may be chance. Rates in bold letters are significantly above those of vision alone (p < {p}, corrected
-for the table's {tests} comparisons of rates with three seeds). The paper's rates, in brackets, come from much larger
-networks.
+**What touch adds, in numbers:** success rates of Diffusion Policy with small networks. Each task has, of the presets `cpu`,
+`cpu_long` and `cpu_targets`, the last of those with which all sensings were run with most training seeds. Each policy was
+trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the paper's number of demonstrations, and evaluated on
+{episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds;
+rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are
+significantly above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates with three seeds).
+The paper's rates, in brackets, come from much larger networks.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""

@@ -65,7 +65,7 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
             raise
         sys.stderr.write(f"error: {error}\nmore: {troubleshooting()}, or {TRACEBACK}=1 for the place where it was raised\n")
         return 1
-    return min(answer, 1) if isinstance(answer, int) else 0
+    return int(bool(answer)) if isinstance(answer, int) else 0
 
 
 @contextmanager

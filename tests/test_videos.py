@@ -107,6 +107,7 @@ def test_a_file_of_states_alone_is_rendered_anew_from_the_camera_and_the_pad_tha
     ("arguments", "said"),
     [
         (["--out", "peg.avi"], "peg.avi is not a path of a video; give a file that ends in .mp4, .webp, .gif"),
+        (["--out", "peg.gif", "--fps", "30"], "--fps 30 is not possible in a GIF, which has [1, 2, 4, 5, 10, 20, 25, 50]"),
         (["--episode", "7"], "has the episodes 0 to 1"),
         (["--camera", "top"], "--camera='top' is unknown; choose from"),
         (["--pad", "both"], "--pad='both' is unknown; choose from"),

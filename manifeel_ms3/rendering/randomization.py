@@ -35,7 +35,7 @@ class VisualRandomization:
     """Change of each channel of a part's colour, in linear RGB in [0, 1]; every part has its own."""
     table_colour: float = 0.0
     """Change of each channel of the table's colour, as a share of it."""
-    table_texture: float = 0.0
+    table_texture: int = 0
     """Number of other textures that the table may have, besides the usual one; all are equally likely."""
     camera_position: float = 0.0
     """Displacement of each camera along each of its axes, in m."""
@@ -95,7 +95,7 @@ class RandomLooks:
             return half_range * stream(name).uniform(-1, 1, size)
 
         slant = np.append(uniform("light_direction", ranges.light_direction, 2), 0.0)
-        textures = int(ranges.table_texture) + 1
+        textures = ranges.table_texture + 1
         drawn = dict(
             light_direction=np.array(KEY_DIRECTION) + slant,
             light_level=1 + uniform("light_level", ranges.light_level, 1)[0],

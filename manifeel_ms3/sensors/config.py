@@ -162,7 +162,8 @@ class OpticsConfig:
 class TouchRandomization:
     """Differences between pads and episodes, as half widths of uniform distributions around the config's values.
 
-    All are 0 by default, which switches them off. The draws of an episode depend on its seed alone.
+    All are 0 by default, which switches them off. The draws depend on the seed of the reset, the name of the pad, and how many
+    earlier episodes had this seed (`draws.pad_seeds`).
     """
 
     gain: float = within(0.0, 0.0, 1.0)

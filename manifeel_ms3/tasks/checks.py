@@ -41,6 +41,8 @@ def checked_randomization(
             raise InvalidArgumentError(f"{argument}[{name!r}] is unknown for {env_name}; known: {list(known)}")
         if not (is_number(value) and value >= 0):
             raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} must be a finite number >= 0")
+        if known[name].type in (int, "int") and value != int(value):
+            raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} must be a whole number")
         limit, reason = limits.get(name, (np.inf, ""))
         if value > limit:
             raise InvalidArgumentError(f"{argument}[{name!r}]={value!r} is too large, at most {_rounded_down(limit)}: {reason}")

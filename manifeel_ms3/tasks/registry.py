@@ -45,8 +45,8 @@ class TaskSpec:
     category: str
     """Category of the paper: "insertion", "screwing" or "exploration"."""
     max_episode_steps: int
-    """Time limit of an episode, in control steps: about twice the mean length of demonstrations, and at least 1.5 times that of
-    the longest."""
+    """Time limit of an episode, in control steps: at least twice the mean length of the paper's number of demonstrations, and
+    1.5 times that of the longest of them."""
     paper_demos: int
     """Number of demonstrations in the paper; `manifeel dataset` records as many."""
     instruction: str = ""

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.utils import common
 
@@ -123,6 +124,14 @@ def _require_bodies_of(state: Tree, present: Tree) -> None:
             f"the state in the option reset_to_env_states holds {unknown or 'no body'}; this environment has "
             f"{[f'{part}/{name}' for part, held in bodies.items() for name in held]}: give a state of its get_state_dict"
         )
+    for part, held in given.items():
+        for name, values in held.items():
+            size, wanted = (tuple(np.shape(common.to_numpy(one)))[-1:] for one in (values, bodies[part][name]))
+            if size != wanted:
+                raise InvalidArgumentError(
+                    f"the state of {part}/{name} in the option reset_to_env_states has {size or 'no'} values for each "
+                    f"environment, and not {wanted}: give a state of get_state_dict"
+                )
 
 
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:

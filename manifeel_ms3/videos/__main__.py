@@ -121,9 +121,9 @@ def main(args: Args) -> Path:
     """
     with missing_extras_named():
         from .layout import video_frames
-        from .video_file import check_video_path, write_video
-    check_video_path(args.out)
+        from .video_file import check_video, write_video
     _check(args)
+    check_video(args.out, args.fps)
     sources = [read_source(path, args.episode) for path in args.files]
     of_a_policy = {"--checkpoint": args.checkpoint, "--policy": args.policy, "--policy-kwargs": args.policy_kwargs != "{}"}
     given = [flag for flag, value in of_a_policy.items() if value]

@@ -13,6 +13,8 @@ from manifeel_ms3.files import atomic_write
 
 SUFFIXES = (".mp4", ".webp", ".gif")
 """Suffixes of the formats in which videos are written."""
+GIF_CLOCK = 100
+"""Units of time in a second of a GIF."""
 BLOCK = 2
 """Widths and heights are cut to multiples of this number of pixels, which H.264 needs."""
 WEBP_QUALITY = 70
@@ -23,14 +25,18 @@ END_SECONDS = 1.5
 """Time for which the last frame of each episode is shown, in s (chosen)."""
 
 
-def check_video_path(path: Path) -> None:
-    """Check that a path ends in a known suffix and is not a folder.
+def check_video(path: Path, fps: int) -> None:
+    """Check that a path ends in a known suffix and is not a folder, and that its format has the number of frames per second.
 
     Raises:
-        InvalidArgumentError: The path has another suffix, or is a folder.
+        InvalidArgumentError: The path has another suffix, or is a folder, or the frames of a GIF would not last a whole number,
+            of two or more, of hundredths of a second.
     """
     if path.suffix.lower() not in SUFFIXES or path.is_dir():
         raise InvalidArgumentError(f"--out {path} is not a path of a video; give a file that ends in {', '.join(SUFFIXES)}")
+    if path.suffix.lower() == ".gif" and (GIF_CLOCK % fps or fps > GIF_CLOCK // 2):
+        rates = [rate for rate in range(1, GIF_CLOCK // 2 + 1) if GIF_CLOCK % rate == 0]
+        raise InvalidArgumentError(f"--fps {fps} is not possible in a GIF, which has {rates}; or write a .webp or .mp4")
 
 
 def write_video(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:

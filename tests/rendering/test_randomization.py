@@ -120,6 +120,8 @@ def test_an_unknown_or_impossible_look_is_refused(make_env):
         make_env(obs_mode="none", render_backend="none", visual_randomization=dict(light_level=2.0))
     with pytest.raises(InvalidArgumentError, match="finite number"):
         make_env(obs_mode="none", render_backend="none", visual_randomization=dict(light_level=-0.1))
+    with pytest.raises(InvalidArgumentError, match=r"\['table_texture'\]=2\.5 must be a whole number"):
+        make_env(obs_mode="none", render_backend="none", visual_randomization=dict(table_texture=2.5))
 
 
 @needs_renderer

@@ -147,6 +147,12 @@ def test_imperfections_take_a_number_or_a_range_of_known_names():
         task_sensor("digit", "a", "b", None, {"crosstalk": "much"})
 
 
+@pytest.mark.parametrize("name", ["uid", "link"])
+def test_what_the_robot_sets_is_no_option(name):
+    with pytest.raises(InvalidArgumentError, match=rf"tactile options \['{name}'\] are set by the robot; leave them out"):
+        task_sensor("digit", "a", "b", {name: "c"}, None)
+
+
 @pytest.mark.parametrize("amount", [None, "much", "ab", [0.1], (0.0, 0.1, 0.2), (0.0, None), True, float("nan")])
 def test_an_amount_that_is_no_number_or_pair_is_named_at_once(amount):
     with pytest.raises(InvalidArgumentError, match=r"imperfections\.gain=.*a number, or a pair"):

@@ -10,7 +10,7 @@ import torch
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.sensors import Light, LightsConfig, TouchRandomization, sensor_config
 from manifeel_ms3.sensors.mechanics.contact import ContactGrid
-from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, main, read_pack, refined_circles
+from manifeel_ms3.sensors.optics.fit_shader import Pack, Presses, fit_presses, main, read_pack, read_presses, refined_circles
 from manifeel_ms3.sensors.optics.lights import lamp_shader
 from manifeel_ms3.sensors.optics.shader import Shader, fourier_terms, place_terms, slope_terms
 from manifeel_ms3.sensors.optics.tacrgb import Optics
@@ -341,6 +341,42 @@ def test_a_list_of_presses_that_cannot_be_read_is_named(lines, said, tmp_path):
     (tmp_path / "presses.csv").write_text("\n".join(lines))
     with pytest.raises(InvalidFileError, match=said):
         main(Presses(folder=tmp_path, ball_radius=0.003, pixel_size=CONFIG.pixel_size, out=tmp_path / "x.npz"))
+
+
+@pytest.mark.parametrize(
+    ("circle", "sizes", "said"),
+    [
+        ((20.0, 20.0, 0.0), (0.003, 1e-4), "with a radius of 0 pixels covers nothing"),
+        ((20.0, 300.0, 8.0), (0.003, 1e-4), "row 20 and column 300 .* covers nothing of an image of 40 rows and 40 columns"),
+        ((20.0, 20.0, 8.0), (0.003, -1e-4), r"pixel_size=-0\.0001 are lengths in m, above 0"),
+        ((20.0, 20.0, 8.0), (0.0, 1e-4), r"ball_radius=0\.0 and"),
+    ],
+)
+def test_presses_that_show_nothing_are_refused(circle, sizes, said):
+    picture = np.zeros((40, 40, 3), np.uint8)
+    with pytest.raises(InvalidArgumentError, match=said):
+        fit_presses(picture, picture[None], np.array([circle]), *sizes)
+
+
+def test_a_list_of_presses_may_begin_with_a_byte_order_mark_and_must_be_utf8(tmp_path):
+    listing = tmp_path / "presses.csv"
+    cv2.imwrite(str(tmp_path / "background.png"), np.zeros((40, 40, 3), np.uint8))
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((40, 40, 3), np.uint8))
+    listing.write_text("file,row,col,radius\n0.png,1,2,3\n", encoding="utf-8-sig")
+    assert read_presses(tmp_path)[2].tolist() == [[1, 2, 3]]
+    listing.write_text("file,row,col,radius\nstoß.png,1,2,3\n", encoding="latin-1")
+    with pytest.raises(InvalidFileError, match="is not text in UTF-8"):
+        read_presses(tmp_path)
+
+
+@pytest.mark.parametrize(("f0", "imgs"), [((8, 9), (2, 8, 9)), ((8, 9, 3), (3, 8, 9, 3)), ((8, 9, 3), (2, 8, 8, 3))])
+def test_a_pack_of_other_shapes_is_named(f0, imgs, tmp_path):
+    arrays = dict(
+        f0=np.zeros(f0, np.uint8), imgs=np.zeros(imgs, np.uint8), touch_center=np.zeros((2, 2)), touch_radius=np.ones(2)
+    )
+    np.savez(tmp_path / "dataPack.npz", **arrays)
+    with pytest.raises(InvalidFileError, match=r"f0 must be \(H, W, 3\), and imgs one such image for each circle"):
+        read_pack(tmp_path / "dataPack.npz")
 
 
 def test_one_press_alone_cannot_be_refined():

@@ -192,6 +192,8 @@ def test_a_state_of_other_bodies_does_not_begin_an_episode(make_env):
         (dict(actors={}), "holds no body"),
         (state | dict(goal=body), r"holds \['goal'\]"),
         (dict(actors=dict(cup=body), articulations=state["articulations"]), r"holds \['actors/cup'\]"),
+        (state | dict(actors=dict(peg=torch.zeros(1, 3))), r"actors/peg .* has \(3,\) values .* and not \(13,\)"),
+        (state | dict(actors=dict(peg="x")), r"actors/peg .* has no values"),
         (dict(actors=body), r"env_states\['actors'\]=.* must be a dict"),
     ):
         with pytest.raises(InvalidArgumentError, match=said):

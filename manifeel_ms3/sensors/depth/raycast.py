@@ -15,6 +15,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.geometry.rotation_conversions import quaternion_to_matrix
 from mani_skill.utils.structs import Actor, Link
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.warp_device import launch_split, warp_device
 
 from .surfaces import scene_surfaces
@@ -261,6 +262,9 @@ class RaycastDepth:
         size: Size of the face, m.
         excluded: Names of the links of the pad's robot that are not felt.
         sag: Depth of a domed face's corners under its highest point, m.
+
+    Raises:
+        InvalidArgumentError: The scene has no body that could be felt.
     """
 
     def __init__(
@@ -275,6 +279,11 @@ class RaycastDepth:
         self.pad, self.device = pad, torch.device(scene.device)
         self._pad_pose = pad_pose
         self.surfaces = scene_surfaces(scene, excluded, pad.articulation)
+        if not self.surfaces:
+            raise InvalidArgumentError(
+                "the scene has nothing that this pad could feel; make its sensor after the scene's other bodies, since those "
+                "that are added later are not felt"
+            )
         meshes = [_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces]
         self._rays = MeshRays(meshes, size, self.device, sag)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)

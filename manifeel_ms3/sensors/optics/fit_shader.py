@@ -93,9 +93,12 @@ def fit_presses(
             slope's direction.
 
     Raises:
-        InvalidArgumentError: A contact circle is larger than the ball, or the images have different shapes.
+        InvalidArgumentError: A contact circle is larger than the ball, empty or outside the image, a size is not above 0, or
+            the images have different shapes.
     """
     rows, cols = background.shape[:2]
+    if min(ball_radius, pixel_size) <= 0:
+        raise InvalidArgumentError(f"ball_radius={ball_radius} and pixel_size={pixel_size} are lengths in m, above 0")
     if images.shape[1:] != background.shape:
         raise InvalidArgumentError(
             f"the images have shape {images.shape[1:]} and the background {background.shape}; they must be the same"
@@ -111,6 +114,11 @@ def fit_presses(
     normal, right = np.zeros((columns, columns)), np.zeros((columns, 3))
     for image, (middle_row, middle_col, radius) in zip(images, circles, strict=True):
         inside, slope, phi = _pressed(row - middle_row, col - middle_col, radius, ball_radius, pixel_size)
+        if radius <= 0 or not inside.any():
+            raise InvalidArgumentError(
+                f"the contact circle at row {middle_row:g} and column {middle_col:g} with a radius of {radius:g} pixels covers "
+                f"nothing of an image of {rows} rows and {cols} columns; correct the list of presses"
+            )
         terms = (fourier_terms(phi)[:, first:], slope_terms(slope), place[inside, :used])
         design = np.einsum("nf,nk,nq->nfkq", *terms).reshape(-1, columns)
         normal += design.T @ design
@@ -190,8 +198,10 @@ def read_presses(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     listing = folder / "presses.csv"
     if not listing.is_file():
         raise InvalidFileError(f"{listing} does not exist; it must list file,row,col,radius of every press")
-    with listing.open(newline="") as lines:
-        presses = list(csv.DictReader(lines))
+    try:
+        presses = list(csv.DictReader(listing.read_text(encoding="utf-8-sig").splitlines()))
+    except UnicodeDecodeError as error:
+        raise InvalidFileError(f"{listing} is not text in UTF-8 ({error}); save it in that encoding") from error
     if not presses or not {"file", "row", "col", "radius"} <= set(presses[0]):
         raise InvalidFileError(f"{listing} must have the columns file, row, col, radius and at least one press")
     circles = np.array([_circle_of(press, listing) for press in presses])
@@ -234,6 +244,11 @@ def read_pack(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         circles = np.column_stack([centres[:, ::-1], radii]).astype(float)
     except (ValueError, IndexError) as error:
         raise InvalidFileError(f"{path} is not {kind} ({error})") from error
+    if background.ndim != 3 or images.shape != (len(circles), *background.shape) or background.shape[2] != 3:
+        raise InvalidFileError(
+            f"{path} is not {kind}: f0 has the shape {background.shape}, imgs {images.shape}, and there are {len(circles)} "
+            "circles; f0 must be (H, W, 3), and imgs one such image for each circle"
+        )
     return background[..., ::-1], images[..., ::-1], circles
 
 
