@@ -44,8 +44,8 @@ def read_episodes(files: Iterable[Path], env_id: str, spec: ObservationSpec, num
     with progress_bar() as bar:
         for file, count, known in zip(files, held, formats, strict=True):
             left = min(count, wanted - len(episodes))
-            if left == 0:
-                break
+            if left == 0:  # the file holds no episode, or those before it are enough
+                continue
             track = partial(bar.track, description=f"reading {file.name}")
             recorded = known.read(file, spec.keys, num=left, progress=track, env_id=env_id)
             # unlike a loop, `map` holds no episode while it reads; episodes come first, so that the bar reaches its end

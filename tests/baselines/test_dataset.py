@@ -1,8 +1,10 @@
 """The windows that policies learn from, and the files that they are read from."""
 
+import json
 import tracemalloc
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -42,6 +44,15 @@ def test_windows_do_not_cross_episodes(demos, dataset):
     assert np.array_equal(actions[0, 9:].numpy(), np.repeat(episodes[0]["actions"][-1:], 7, axis=0))
     assert np.array_equal(obs[FIELD][1, 0].numpy(), episodes[1][FIELD][0])
     assert np.array_equal(actions[1, 0].numpy(), episodes[1]["actions"][0])
+
+
+def test_files_without_episodes_hide_no_others(demos, tmp_path):
+    empty = tmp_path / "empty.h5"
+    h5py.File(empty, "w").close()
+    header = json.loads(demos.with_suffix(".json").read_text())
+    empty.with_suffix(".json").write_text(json.dumps(header | dict(episodes=[])))
+    assert [len(read_episodes(files, PEG, SPEC, None)) for files in ([demos, empty, demos], [empty, demos])] == [4, 2]
+    assert len(read_episodes([empty, demos, empty, demos], PEG, SPEC, 3)) == 3
 
 
 def test_no_executed_action_is_padding():
