@@ -28,7 +28,7 @@ from manifeel_ms3.command_line import as_typed, json_object, missing_extras_name
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
 from manifeel_ms3.ownership import owned
-from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
+from manifeel_ms3.paths import CHECKPOINTS, EVALUATION, LAST_LINK
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 from manifeel_ms3.tasks.checks import check_obs_mode
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
@@ -47,6 +47,8 @@ from .variant import BACKENDS, SENSING, default_arguments
 log = logging.getLogger(__name__)
 BACKEND = dict(sim_backend="physx_cpu")
 """Backend of the simulation, the one that demonstrations are recorded with."""
+OF_A_CHECKPOINT: dict[str, type] = dict(env_id=str, env_kwargs=dict, obs_mode=str, cameras=list, tactile_sensors=list)
+"""Types of the entries of a checkpoint's configuration that an evaluation reads; a stranger may have written them."""
 POLICY_PADS = ("right",)
 """Finger pads that a --policy observes if none are given."""
 
@@ -151,7 +153,7 @@ def main(args: Args) -> Path:
 def default_out(checkpoint: Path | None) -> Path:
     """Path of a result for which none is given: in the run folder of a checkpoint, or else in the working folder."""
     folder = checkpoint.resolve().parent.parent if checkpoint else Path()  # a relative path may be as short as `last` or `.`
-    return folder / "evaluation.json"
+    return folder / EVALUATION
 
 
 def _like_entry(args: Args, entry: Entry) -> Args:
@@ -168,7 +170,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
     return replace(
         args,
         checkpoint=entry.checkpoint,
-        out=args.out or Path("evaluation.json"),
+        out=args.out or Path(EVALUATION),
         device=args.device or inference["device"],
         batch_size=inference["batch_size"] if args.batch_size is None else args.batch_size,
         inference_steps=made["config"].get(INFERENCE_STEPS) if args.inference_steps is None else args.inference_steps,
@@ -180,7 +182,7 @@ def _like_entry(args: Args, entry: Entry) -> Args:
 def _comparison(entry: Entry, args: Args, out: Path, outcomes: list[EpisodeOutcome]) -> str:
     """Sentence that compares the outcomes with those of the entry, or says why they cannot be compared."""
     unlike = entry.unlike(read_result(out))
-    if json_object("--policy-kwargs", args.policy_kwargs):  # which the result of a checkpoint does not hold
+    if json_object("--policy-kwargs", args.policy_kwargs):  # they change the policy
         unlike.append("policy_kwargs")
     if not unlike:
         return entry.agreement(outcomes)
@@ -198,7 +200,7 @@ def _check_outputs(args: Args, evaluation: Evaluation, seeds: list[int], out: Pa
         MissingExtraError: Videos are requested, and the extra `report` is not installed.
     """
     try:
-        require_file("--out", out, "evaluation.json")
+        require_file("--out", out, EVALUATION)
         if out.suffix in (".json", ".h5") and (recording := out.with_suffix(".h5")).exists():
             raise InvalidArgumentError(f"--out {out} would replace a file of the recording {recording}; give another path")
     except OSError as error:
@@ -248,10 +250,14 @@ def evaluation_from_args(args: Args) -> Evaluation:
     given = json_object("--env-kwargs", args.env_kwargs)
     policy_kwargs = json_object("--policy-kwargs", args.policy_kwargs)
     if args.checkpoint is not None:
+        if of_flags := [name for name in ("device", "batch_size", INFERENCE_STEPS) if name in policy_kwargs]:
+            raise InvalidArgumentError(
+                f"--policy-kwargs {of_flags} of a --checkpoint have flags of their own: {_flags(of_flags)}"
+            )
         return _of_checkpoint(args, policy_kwargs | {INFERENCE_STEPS: args.inference_steps}, given)
     if args.env_id is None or args.obs_mode is None:
         raise InvalidArgumentError("a --policy of your own needs --env-id and --obs-mode")
-    if unused := [name for name in ("device", "batch_size") if getattr(args, name) is not None]:
+    if unused := [name for name in ("device", "batch_size", INFERENCE_STEPS) if getattr(args, name) is not None]:
         raise InvalidArgumentError(
             f"{_flags(unused)} are for a --checkpoint; give them to a --policy of your own by --policy-kwargs"
         )
@@ -271,8 +277,15 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
     config = checkpoint_config(checkpoint)
     if missing := [name for name in ("env_id", *SENSING) if name not in config]:
         raise CheckpointError(f"{checkpoint}: its config.json lacks {missing}; train the policy again")
+    read = {name: config[name] for name in OF_A_CHECKPOINT if name in config}
+    if wrong := [name for name, value in read.items() if not isinstance(value, OF_A_CHECKPOINT[name])]:
+        raise CheckpointError(
+            f"{checkpoint}: {wrong} in its config.json have another form; the checkpoint is broken, use another"
+        )
     # recorded in the result, because it changes the actions
     config |= {name: value for name, value in kwargs.items() if name == INFERENCE_STEPS and value}
+    if own := {name: value for name, value in kwargs.items() if name != INFERENCE_STEPS}:
+        config |= dict(policy_kwargs=own)
     env_id = task_spec(config["env_id"]).env_id
     _require_own(args, config | dict(env_id=env_id))
     trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
@@ -355,7 +368,7 @@ def _page_of(args: Args, made: Path) -> str:
     if made.stem.isdigit():
         return f"{as_typed('manifeel', 'results', '--results', made.parent)} sets it beside the paper's"
     checkpoints = (made.parent / CHECKPOINTS).resolve()
-    if args.checkpoint is not None and made.name == "evaluation.json" and args.checkpoint.resolve().parent == checkpoints:
+    if args.checkpoint is not None and made.name == EVALUATION and args.checkpoint.resolve().parent == checkpoints:
         return f"{as_typed('manifeel', 'report', '--run-dir', made.parent)} writes a page about the run"
     return "`manifeel results` reads files named by the step, as 00007000.json"
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3 import plugins
+from manifeel_ms3.arguments import by_name
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
 from manifeel_ms3.files import file_hash
 from manifeel_ms3.typed_modules import look_in_working_folder
@@ -192,11 +193,14 @@ class PolicySource:
 
         Raises:
             CheckpointError: The folder is not a checkpoint, or its policy is not registered.
-            PolicyError: The class cannot be found, or its constructor fails.
+            PolicyError: The class cannot be found, its constructor fails, or it does not take one of the arguments.
         """
         kwargs = json.loads(self.kwargs)
         if self.checkpoint is not None:
-            return load_policy(self.checkpoint, device=self.device, batch_size=self.batch_size, **kwargs)
+            try:
+                return load_policy(self.checkpoint, device=self.device, batch_size=self.batch_size, **kwargs)
+            except TypeError as error:  # it does not take one of the arguments
+                raise PolicyError(f"{self.checkpoint} cannot be made with --policy-kwargs {self.kwargs} ({error})") from error
         name = str(self.policy)
         try:
             if self.is_server:
@@ -215,8 +219,8 @@ class PolicySource:
     def as_in(self, result: dict[str, Any]) -> "PolicySource":
         """The policy as it acted in a result.
 
-        A checkpoint's actions depend on its device, the size of its batches and the number of its generation steps; all three
-        are then those of the result. Any other policy stays as it is.
+        A checkpoint's actions depend on its device, the size of its batches, the number of its generation steps and its other
+        arguments; all are then those of the result. Any other policy stays as it is.
 
         Raises:
             MachineError: This machine does not have the device.
@@ -224,6 +228,7 @@ class PolicySource:
         if self.checkpoint is None:
             return self
         recorded = {name: value for name, value in result["config"].items() if name == INFERENCE_STEPS}
+        recorded |= by_name("policy_kwargs", result["config"].get("policy_kwargs", {}), '{"seed": 1}')
         kwargs = json.dumps(recorded | json.loads(self.kwargs))
         inference = result["inference"]
         return replace(self, kwargs=kwargs, device=checked_device(inference["device"]), batch_size=inference["batch_size"])

@@ -12,17 +12,20 @@ import pytest
 import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation import evaluate_episode, rollout
 from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
+from manifeel_ms3.evaluation.evaluate import Args, evaluation_from_args
 from manifeel_ms3.evaluation.gentle import success_under_force
 from manifeel_ms3.evaluation.limits import LONGEST_FACTOR, MEAN_FACTOR, STEPS, Limits, limits_of, limits_of_file
-from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicySource, load_policy, with_defaults
+from manifeel_ms3.evaluation.policy import EpisodePolicy, PolicyError, PolicySource, load_policy, with_defaults
 from manifeel_ms3.evaluation.result import summary_of
 from manifeel_ms3.evaluation.rollout import failed_outcome, outcome_as_json, outcome_from_json
 from manifeel_ms3.evaluation.statistics import wilson_interval
 from manifeel_ms3.experts import make_expert
 from manifeel_ms3.tasks.registry import all_tasks, evaluation_seeds
+from manifeel_ms3.tasks.registry import make_env as make_from_any_arguments
 from tests.evaluation.policies import LetsGo, StandStill
 from tests.outcomes import made_up
 from tests.sample import states_sample
@@ -357,6 +360,42 @@ def test_broken_checkpoints_say_what_is_wrong(tmp_path, config, word):
     with pytest.raises(CheckpointError, match=word) as error:
         load_policy(tmp_path)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("entries", "wrong"),
+    [
+        (dict(env_kwargs=None), "env_kwargs"),
+        (dict(env_id=["x"]), "env_id"),
+        (dict(cameras="wrist", tactile_sensors=3), "cameras', 'tactile_sensors"),
+        (dict(obs_mode=None), "obs_mode"),
+    ],
+)
+def test_the_config_of_a_checkpoint_that_a_stranger_changed_is_refused(tmp_path, entries, wrong):
+    config = dict(env_id=PEG, env_kwargs={}, obs_mode="rgb", cameras=["wrist"], tactile_sensors=["right"]) | entries
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(CheckpointError, match=rf"\['{wrong}'\] in its config.json have another form"):
+        evaluation_from_args(Args(tmp_path))
+
+
+def test_an_argument_that_the_policy_of_a_checkpoint_does_not_take_is_named():
+    checkpoint = Path("leaderboard/cpu/PegInsertion/rgb/seed0/checkpoints/00007000")
+    with pytest.raises(PolicyError, match=r"cannot be made with --policy-kwargs \{\"foo\": 1\} .*'foo'"):
+        PolicySource(checkpoint, kwargs='{"foo": 1}', device="cpu", batch_size=1).make()
+
+
+def test_the_result_of_a_checkpoint_holds_the_arguments_of_its_policy():
+    checkpoint = Path("leaderboard/cpu/PegInsertion/rgb/seed0/checkpoints/00007000")
+    assert "policy_kwargs" not in evaluation_from_args(Args(checkpoint)).config
+    evaluation = evaluation_from_args(Args(checkpoint, policy_kwargs='{"seed": 5}'))
+    assert evaluation.config["policy_kwargs"] == {"seed": 5}
+    again = PolicySource(checkpoint).as_in(dict(config=evaluation.config, inference=dict(device="cpu", batch_size=1)))
+    assert json.loads(again.kwargs)["seed"] == 5
+
+
+def test_a_time_limit_below_one_step_is_refused():
+    with pytest.raises(InvalidArgumentError, match="max_episode_steps=-1 must be at least 1"):  # ManiSkill ends at once
+        make_from_any_arguments(PEG, obs_mode="none", render_backend="none", max_episode_steps=-1)
 
 
 def test_a_policy_is_found_in_the_working_folder(tmp_path, monkeypatch):
