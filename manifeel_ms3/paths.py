@@ -16,6 +16,8 @@ _PACKAGE = Path(__file__).resolve().parent
 
 CHECKPOINTS = "checkpoints"
 """Name of the folder of checkpoints, in the folder of a training run and beside a published result."""
+EVALUATION = "evaluation.json"
+"""Name of the result of the checkpoint that was evaluated last, in the folder of a training run."""
 LAST_LINK = "last"
 """Name of the link, in that folder, to the checkpoint from which training continues; it always leads to a complete one."""
 

@@ -26,7 +26,7 @@ class BackgroundEvaluation:
         workers: Number of processes of an evaluation.
         env_kwargs: Arguments of the task, as a json object.
         device: Device of the policy; if not given, a GPU where there is one.
-        video: Whether the first episode is recorded as a video, videos/<step>.mp4 in the folder.
+        video: Whether the first episode is recorded as a video, videos/step_<step>.mp4 in the folder.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class BackgroundEvaluation:
                 return []
         step, result = int(checkpoint.name), read_result(path)
         if (video := self.folder / "videos" / f"{result['episodes'][0]['seed']}.mp4").is_file():
-            video.replace(video.with_name(f"{step}.mp4"))  # the next evaluation records the same episode
+            video.replace(self._video(step))  # the next evaluation records the same episode
         scalars: dict[str, float] = {name: result[name]["rate"] for name in RATES if name in result} | {
             name: result[name] for name in MEANS
         }
@@ -105,8 +105,12 @@ class BackgroundEvaluation:
 
     def video_of(self, step: int) -> Path | None:
         """The video of a checkpoint's evaluation; None if there is none."""
-        path = self.folder / "videos" / f"{step}.mp4"
+        path = self._video(step)
         return path if path.is_file() else None
+
+    def _video(self, step: int) -> Path:
+        """Path of the video of a checkpoint's evaluation, which no seed has as its name."""
+        return self.folder / "videos" / f"step_{step}.mp4"
 
     def _result(self, checkpoint: Path) -> Path:
         return self.folder / f"{checkpoint.name}.json"

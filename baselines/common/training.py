@@ -20,7 +20,7 @@ from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, TRAINING_ST
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.ownership import owned
-from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
+from manifeel_ms3.paths import CHECKPOINTS, EVALUATION, LAST_LINK
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.tasks.registry import task_spec
@@ -247,9 +247,9 @@ class Trainer:
         for folder in (self.run_dir, self.checkpoints):
             remove_leftovers(folder)
         if self.args.overwrite:
-            for name in (CHECKPOINTS, EVALUATIONS):
-                if (self.run_dir / name).is_dir():
-                    remove_folder(self.run_dir / name)
+            for folder in filter(Path.is_dir, (self.checkpoints, self.run_dir / EVALUATIONS)):
+                remove_folder(folder)
+            (self.run_dir / EVALUATION).unlink(missing_ok=True)
         opened = RunLog(self.run_dir, self.config, self.step, wandb_run_of(self.args, str(self.config["policy_name"])))
         if self.args.resume:
             make_last(newest_checkpoint(self.checkpoints))

@@ -24,7 +24,7 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.policy import PolicyError
-from manifeel_ms3.evaluation.result import PATHS, ResultError, read_result
+from manifeel_ms3.evaluation.result import ResultError, is_of_config, read_result
 from manifeel_ms3.files import FileWriteError, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
@@ -202,11 +202,10 @@ def is_result_of(checkpoint: Path, path: Path) -> bool:
         path: Path of the file, which need not exist.
     """
     try:
-        evaluated = read_result(path)["config"]
+        result = read_result(path)
     except ResultError:
         return False
-    config = checkpoint_config(checkpoint)
-    return all(evaluated.get(name) == value for name, value in config.items() if name not in PATHS)
+    return is_of_config(result, checkpoint_config(checkpoint))
 
 
 WORK = dict(record=_record, pretrain=_pretrain, train=_train, evaluate=_evaluate)

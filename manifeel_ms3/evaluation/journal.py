@@ -37,7 +37,7 @@ class Journal:
         evaluation: Everything that the outcomes depend on, as json. An unfinished evaluation goes on if all of it is the same.
         seeds: Seeds of the episodes.
         overwrite: Discard the episodes of an unfinished evaluation.
-        overwrite_other: Discard the episodes of an unfinished evaluation if it is another one.
+        overwrite_other: Discard the episodes of an unfinished evaluation if it is another one, or if its file is broken.
 
     Raises:
         OtherEvaluationError: There is an unfinished evaluation that is another one, and it is not to be discarded.
@@ -61,7 +61,7 @@ class Journal:
         if self.path.exists() and not overwrite:
             try:
                 self.outcomes = self._read()
-            except OtherEvaluationError as error:
+            except (OtherEvaluationError, InvalidFileError) as error:
                 if not overwrite_other:
                     raise
                 log.info("the evaluation begins again, because %s", error)

@@ -17,14 +17,14 @@ import tyro
 
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import read_json_lines, write_text
-from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
+from manifeel_ms3.paths import CHECKPOINTS, EVALUATION, LAST_LINK
 from manifeel_ms3.tasks.registry import task_spec
 
 from .checkpoint_config import TRAINING_LOSS, CheckpointError, checkpoint_config
 from .floors import floors_of
 from .gentle import success_under_force
-from .policy import PolicySource
-from .result import read_result
+from .policy import INFERENCE_STEPS, PolicySource
+from .result import is_of_config, read_result
 from .variant import variant_of
 
 with missing_extras_named():
@@ -127,15 +127,19 @@ def evaluated_checkpoint(run_dir: Path, result: dict[str, Any]) -> Path:
     """The checkpoint of a run that has the step of a result; training may have gone on to another one since.
 
     Raises:
-        CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted.
+        CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted or is of another
+            training.
     """
     last, step = run_dir / CHECKPOINTS / LAST_LINK, result["config"].get("step")
-    if checkpoint_config(last).get("step") == step:
-        return last
-    if not (found := last.with_name(str(step).zfill(8))).is_dir():
+    found = last if checkpoint_config(last).get("step") == step else last.with_name(str(step).zfill(8))
+    if not found.is_dir():
         raise CheckpointError(
-            f"{run_dir / 'evaluation.json'} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
+            f"{run_dir / EVALUATION} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
             f"another one with `manifeel eval --checkpoint {last}`"
+        )
+    if not is_of_config(result, checkpoint_config(found), but=(INFERENCE_STEPS,)):
+        raise CheckpointError(
+            f"{run_dir / EVALUATION} is of another training than {found}; evaluate it with `manifeel eval --checkpoint {found}`"
         )
     return found
 
@@ -148,7 +152,7 @@ def main(args: Args) -> Path:
         CheckpointError: The checkpoint of the evaluation is missing or broken.
         MachineError: This machine does not have the device of the evaluation.
     """
-    result = read_result(args.run_dir / "evaluation.json")
+    result = read_result(args.run_dir / EVALUATION)
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
     policy = PolicySource(evaluated_checkpoint(args.run_dir, result)).as_in(result).make()

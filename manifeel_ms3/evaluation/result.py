@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,18 @@ def published_config(config: dict[str, Any]) -> dict[str, Any]:
     """A policy's configuration as results hold it: with the last part of its paths only, and without passwords and tokens."""
     config = {name: _last_part(value) if name in PATHS else value for name, value in config.items()}
     return config | {name: redacted(config[name]) for name in PRIVATE if name in config}
+
+
+def is_of_config(result: dict[str, Any], config: dict[str, Any], but: Collection[str] = ()) -> bool:
+    """Whether a result is of a checkpoint with this configuration.
+
+    Args:
+        result: Content of the result file.
+        config: The checkpoint's configuration.
+        but: Entries that may differ, beside paths.
+    """
+    evaluated = result["config"]
+    return all(evaluated.get(name) == value for name, value in config.items() if name not in (*PATHS, *but))
 
 
 def provenance(env_id: str) -> dict[str, Any]:

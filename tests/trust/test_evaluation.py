@@ -181,7 +181,9 @@ def test_a_line_that_broke_off_is_dropped_and_what_is_broken_is_refused(tmp_path
         with pytest.raises(InvalidFileError, match=r"does not hold the episodes of an .*--overwrite"):
             Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3])
         assert journal.path.read_bytes() == broken
-    assert Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3], overwrite=True).remaining == [1, 2, 3]
+    for allowed in (dict(overwrite=True), dict(overwrite_other=True)):  # as a command's user may ask, and a training does
+        journal.path.write_bytes(b"\x00" * 64 + b"\n")
+        assert Journal(tmp_path / "x.json", IDENTITY, [1, 2, 3], **allowed).remaining == [1, 2, 3]
 
 
 def test_another_unfinished_evaluation_is_refused_unless_it_may_be_discarded(tmp_path, caplog):

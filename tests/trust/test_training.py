@@ -153,11 +153,13 @@ def test_a02_a_folder_with_checkpoints_is_refused_and_stays_as_it_is(undisturbed
     assert {path: path.stat().st_mtime_ns for path in run_dir.rglob("*")} == before
     (run_dir / "evaluations").mkdir()
     (run_dir / "evaluations/00000040.json").write_text("{}")
+    (run_dir / "evaluation.json").write_text("{}")
     (run_dir / "notes.txt").write_text("mine")
     assert require_whole(train(tiny_args(run_dir, steps=4, overwrite=True))) == 4
     assert sorted(path.name for path in (run_dir / "checkpoints").iterdir()) == ["00000002", "00000004", "last"]
     assert steps_on_board(run_dir) == [1, 2, 3, 4]
     assert not (run_dir / "evaluations").exists()
+    assert not (run_dir / "evaluation.json").exists()
     assert (run_dir / "notes.txt").read_text() == "mine"
 
 
