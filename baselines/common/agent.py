@@ -165,20 +165,20 @@ class PolicyAgent(PolicyOfPart):
 
         def sample() -> torch.Tensor:
             generators = [_generator_of(self.seed, place) for place in range(self.batch_size)]
-            return self.policy.sample(batch, TRIAL_STEPS, generators)
+            return self.policy.sample(batch, steps, generators)
 
+        steps = TRIAL_STEPS if self.policy.config.can_generate_in(TRIAL_STEPS) else self.inference_steps
         network, given = self.policy.action_network, []
-        handle = network.register_forward_pre_hook(lambda _, inputs: given.append(inputs))
-        expected = sample()
-        handle.remove()
         try:
+            with network.register_forward_pre_hook(lambda _, inputs: given.append(inputs)):
+                expected = sample()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch warns of shapes in Python, which are always the same here
                 traced: Any = torch.jit.trace(network, given[0], check_trace=False)
                 self.policy.action_network = torch.jit.optimize_for_inference(traced)
             # the first calls optimise it further
             same = all(torch.allclose(sample(), expected, rtol=0.0, atol=ROUNDING) for _ in range(TRIAL_STEPS))
-        except (RuntimeError, AttributeError):  # not every network can be traced
+        except (RuntimeError, AttributeError, LookupError):  # not every network can be traced, or is called as a module
             same = False
         if not same:
             self.policy.action_network = network

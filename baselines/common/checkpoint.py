@@ -16,6 +16,8 @@ from manifeel_ms3.paths import LAST_LINK
 
 BROKEN_STATE = "older checkpoints hold no state of training: evaluate one of them, or train anew with --overwrite"
 """What the error about a broken state of training advises, since only the newest checkpoint holds one."""
+HEADER_BEGINS = 8
+"""Number of bytes of a safetensors file before its header, which hold the header's length."""
 
 
 def save_checkpoint(
@@ -143,6 +145,14 @@ def read_tensors(path: Path, mend: str = "the checkpoint is broken, use another"
         return load_file(path)
     except (OSError, SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise CheckpointError(f"{path} cannot be read ({error}); {mend}") from error
+
+
+def holds_safetensors(path: Path) -> bool:
+    """Whether a file has the format safetensors, in which a json header follows its own length, whatever its suffix is."""
+    if not Path(path).is_file():
+        return Path(path).suffix == ".safetensors"
+    with Path(path).open("rb") as file:
+        return file.read(HEADER_BEGINS + 1)[HEADER_BEGINS:] == b"{"
 
 
 def require_fit(module: torch.nn.Module, weights: dict[str, torch.Tensor], source: Path) -> None:

@@ -21,8 +21,9 @@ POSE_FEATURES: dict[PoseForm, int] = {"quaternion": 7, "rotation_6d": 9}
 """Number of features of a pose, by its form."""
 MIDDLE_QUATERNION = np.array([0.0, np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0])
 """Quaternion (wxyz) of the hand pointing down with its wrist joint in the middle of its range, which is a yaw of 45 degrees."""
-MIN_IMAGE_SIZE = 16
-"""Smallest side of an image that policies take, pixels; set once, not tuned."""
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 16, 2048
+"""Smallest and largest side of an image that policies take, pixels; set once, not tuned. Without the second, the config of a
+stranger's checkpoint could ask for images that fill the memory."""
 TAXEL_SHAPE = TactileSensorConfig.taxel_shape
 """Rows and columns of taxels of the default sensor."""
 CameraView = Literal["whole", "work"]
@@ -99,6 +100,8 @@ def observation_spec(
             raise InvalidArgumentError(
                 f"{name}={size}: images need at least {MIN_IMAGE_SIZE} pixels on each side; the paper's have 256"
             )
+        if size > MAX_IMAGE_SIZE:
+            raise InvalidArgumentError(f"{name}={size}: images have at most {MAX_IMAGE_SIZE} pixels on each side")
     if pose not in get_args(PoseForm):
         raise InvalidArgumentError(f"pose={pose!r}: the forms of a pose are {list(get_args(PoseForm))}")
     if camera_view not in get_args(CameraView):

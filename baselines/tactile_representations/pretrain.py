@@ -47,7 +47,7 @@ MAE_BETAS, MAE_WEIGHT_DECAY = (0.9, 0.95), 0.05
 VQGAN_BETAS = (0.5, 0.9)
 """Decay rates of Adam's moments, as in the public code of Esser et al. (2021)."""
 EPOCHS = 50
-"""Number of times that training sees each image unless told otherwise, as in the paper's public code for UniT."""
+"""Number of times that training sees each image on average, unless told otherwise; that of the paper's public code for UniT."""
 ADVERSARY_WEIGHT = 0.1
 """Weight of the discriminator's judgement in the loss; constant, whereas Esser et al. (2021, eq. 7) adapt theirs."""
 REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)

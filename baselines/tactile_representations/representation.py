@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 import torch.nn as nn
 
-from baselines.common.checkpoint import read_tensors
+from baselines.common.checkpoint import holds_safetensors, read_tensors
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 
@@ -85,7 +85,7 @@ class Representation(nn.Module):
         Raises:
             CheckpointError: The file is missing or broken.
         """
-        return read_tensors(path) if path.suffix == ".safetensors" else read_released(path, self.released)
+        return read_tensors(path) if holds_safetensors(path) else read_released(path, self.released)
 
     def _converted(self, weights: dict[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:
         try:

@@ -79,7 +79,7 @@ class T3(TokenRepresentation):
 
     def read(self, path: Path):
         """The weights of the released folder, or of a file that `pretrain.py` wrote."""
-        if path.suffix == ".safetensors":
+        if path.is_file():
             return super().read(path)
         parts = {part: _weights_file(path, stem) for part, stem in (("encoder", f"encoders/{self.sensor}"), ("trunk", "trunk"))}
         return {f"{part}.{name}": t for part, file in parts.items() for name, t in super(T3, self).read(file).items()}

@@ -25,6 +25,8 @@ EPISODES = FEWEST_EPISODES
 """Number of evaluation episodes of a result: that of the paper's protocol."""
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
+NOT_OF_A_SUBMISSION = {"sim_config", "sensor_configs", "num_envs", "render_mode", "human_render_camera_configs"}
+"""Arguments of an environment with which running an episode again could take any time or memory."""
 MOST_FORCE = 500.0
 """Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 90 N."""
 RATE_TOLERANCE = 1e-3
@@ -152,6 +154,8 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
     limit, most = result["env_kwargs"].get("max_episode_steps"), task_spec(env_id).max_episode_steps
     if isinstance(limit, int) and limit > most:  # running episodes again could take for ever
         faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
+    if given := sorted(NOT_OF_A_SUBMISSION & result["env_kwargs"].keys()):
+        faults.append(f"its env_kwargs have {given}, which change the simulator or what is rendered; evaluate without them")
     if fault := other_revision(env_id, result["revision"]):
         faults.append(f"{fault}; evaluate again with manifeel-ms3 {version('manifeel-ms3')}")
     return faults

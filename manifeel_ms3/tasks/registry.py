@@ -21,6 +21,7 @@ import gymnasium as gym
 from mani_skill.utils.registration import register_env
 
 from manifeel_ms3 import plugins
+from manifeel_ms3.arguments import is_number
 from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, PluginError, UnknownNameError
 
 log = logging.getLogger(__name__)
@@ -204,6 +205,9 @@ def make_env(env_id: str, /, **kwargs: Any) -> gym.Env:
         MachineError: The machine lacks what the environment needs.
     """
     spec = task_spec(env_id)
+    limit = kwargs.get("max_episode_steps", 1)
+    if is_number(limit) and limit < 1:  # gymnasium takes -1, ManiSkill then ends at once
+        raise InvalidArgumentError(f"max_episode_steps={limit} must be at least 1; leave it out for the task's own limit")
     try:
         return gym.make(spec.env_id, **kwargs)
     except ManifeelError:

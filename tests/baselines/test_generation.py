@@ -16,7 +16,7 @@ from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.equivariant_diffusion_policy.policy import EquivariantConfig
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.evaluation.policy import PolicyRequest
+from manifeel_ms3.evaluation.policy import PolicyRequest, load_policy
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 SPEC = observation_spec("none", (), (), 16)
@@ -98,6 +98,16 @@ def test_a_prediction_is_asked_for_with_the_last_observations_the_seed_and_the_s
     episode.reset()
     episode.act(dict(extra=dict(tcp_pose=pose_at(0)[None])))
     assert (requests[-1].seed, requests[-1].step) == (0, 0)
+
+
+def test_the_first_request_of_a_policy_with_few_steps_is_answered(tmp_path):
+    """Its network is tried out before it is traced, with no more steps than it has."""
+    agent = load_policy(save_tiny_checkpoint(tmp_path / "1", diffusion_steps=2))
+    field = np.zeros((2, 10, 14, 3), np.float32)
+    request = PolicyRequest(0, 0, {POSE: np.zeros((2, 7), np.float32), "sensor_data/tactile_right/force_field": field})
+    first, second = (agent.answer([request])[0] for _ in range(2))
+    assert np.isfinite(first).all()
+    np.testing.assert_allclose(second, first, atol=1e-4)
 
 
 def test_a_policy_looks_at_the_observations_that_a_prediction_needs_and_at_no_others():

@@ -88,6 +88,12 @@ def test_images_that_are_too_small_are_refused(sizes):
         observation_spec("rgb+tacrgb", ("wrist",), ("right",), *sizes)
 
 
+@pytest.mark.parametrize("sizes", [(60_000, 64), (64, 2049)])
+def test_images_that_would_fill_the_memory_are_refused(sizes):
+    with pytest.raises(InvalidArgumentError, match=r"image_size=.*at most 2048 pixels"):
+        observation_spec("rgb+tacrgb", ("wrist",), ("right",), *sizes)
+
+
 def test_an_unknown_form_of_the_pose_names_the_known_ones():
     with pytest.raises(InvalidArgumentError, match=r"pose='euler'.*quaternion.*rotation_6d"):
         observation_spec("rgb", ("wrist",), (), 64, pose="euler")

@@ -92,6 +92,10 @@ def change(folder: Path, edit) -> None:
         (lambda r: r.update(episode_len=5.0), "episode_len says 5.0"),
         (lambda r: r.update(env_id="ManiFeel-Knitting-v1"), "is no task of this leaderboard"),
         (
+            lambda r: r["env_kwargs"].update(sim_config=dict(sim_freq=10**9), num_envs=1),
+            r"its env_kwargs have \['num_envs', 'sim_config'\], which change the simulator",
+        ),
+        (
             lambda r: r["env_kwargs"].update(max_episode_steps=10**9),
             "a time limit of 1000000000 steps, the task ends after 240",
         ),

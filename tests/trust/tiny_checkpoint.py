@@ -12,20 +12,24 @@ from baselines.diffusion_policy.train import SPEC
 from manifeel_ms3.nested_settings import as_json
 
 
-def save_tiny_checkpoint(folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = (), crop: int = 0) -> Path:
+def save_tiny_checkpoint(
+    folder: Path, obs_mode: str = "tacff", cameras: tuple[str, ...] = (), crop: int = 0, diffusion_steps: int = 20
+) -> Path:
     """Write it, and return its folder; its camera images have 32 pixels, of which crops of `crop` pixels are taken."""
     config = dataclasses.replace(
         SPEC.presets["paper"].args.policy,
         encoder=EncoderConfig(image="small_cnn", force_field="small", crop=crop),
         down_dims=(8, 16),
         diffusion_step_embed_dim=8,
-        diffusion_steps=20,
+        diffusion_steps=diffusion_steps,
     )
     observed = dict(obs_mode=obs_mode, cameras=list(cameras), tactile_sensors=["right"], image_size=32)
     observed |= dict(tactile_image_size=32, pose="quaternion")
     with torch.random.fork_rng():
         torch.manual_seed(0)
         policy = SPEC.policy_class(config, observation_spec(obs_mode, cameras, ("right",), 32), 6)
-    about = dict(policy_name=SPEC.name, policy=as_json(config), action_dim=6, inference_steps=20, step=1) | observed
+    about = (
+        dict(policy_name=SPEC.name, policy=as_json(config), action_dim=6, inference_steps=diffusion_steps, step=1) | observed
+    )
     save_checkpoint(folder, about, policy.state_dict(), {})
     return folder
