@@ -7,6 +7,7 @@ again, and a study that was stopped goes on where it stopped.
 """
 
 import logging
+import re
 import sys
 import time
 from collections import Counter
@@ -34,6 +35,8 @@ from .running import run_jobs
 from .study import KINDS, Kind, Resources, Study, read_study
 
 log = logging.getLogger(__name__)
+SEED = re.compile(r", seed \d+")
+"""The seed in a job's title."""
 SHOWN = 8
 """Largest number of running jobs in the table; set once, not tuned."""
 FILE_WIDTH = 160
@@ -186,7 +189,7 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
     table = Table("job", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
     groups: dict[tuple[Kind, str], list[Job]] = {}
     for job in sorted(jobs, key=lambda job: KINDS.index(job.kind)):
-        groups.setdefault((job.kind, job.title.partition(", seed")[0]), []).append(job)
+        groups.setdefault((job.kind, SEED.sub("", job.title)), []).append(job)
     cpu = gpu = 0.0
     for (kind, title), group in track(groups.items(), "measuring", transient=True):
         needs = study.resources[kind]

@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 
-from baselines.common.train_args import check_run
+from baselines.common.train_args import check_evaluation, check_run
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import make_env
 
@@ -28,7 +28,9 @@ def require_valid_flags(jobs: Iterable[Job]) -> None:
             continue
         checked.add(key)
         try:
-            check_run(training_args(job))
+            args = training_args(job)
+            check_run(args)
+            check_evaluation(args)
         except SystemExit as error:
             policy = f"{job.settings['policy']} {job.settings['preset']}"
             raise StudyError(

@@ -129,6 +129,13 @@ def test_a_flag_that_no_training_takes_is_refused_before_any_job_begins(study, f
     assert flags.partition(":")[0].removeprefix("policy.").replace("-", "_") in capsys.readouterr().err.replace("-", "_")
 
 
+def test_flags_of_evaluations_that_a_study_does_itself_are_refused_before_any_job_begins(study, tmp_path):
+    study.write_text(TINY.replace("batch-size: 4", "capture-video: true"))
+    with pytest.raises(StudyError, match="--capture-video without --num-eval-episodes"):
+        study_command.main(study_command.Args(study, root=tmp_path / "root"))
+    assert not list(tmp_path.glob("root/*/*"))
+
+
 def test_numbers_that_no_training_can_meet_are_refused_before_any_job_begins(study, tmp_path):
     study.write_text(TINY.replace("batch-size: 4", "image-size: 0"))
     with pytest.raises(StudyError, match=r"seed 0: --image-size 0 must be at least 1.*correct `train` or `encoder_flags`"):
