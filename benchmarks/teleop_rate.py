@@ -36,7 +36,7 @@ def main(args: Args) -> float:
         args.task, obs_mode="rgb+tacrgb+tacff", cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors)
     )
     operator = Operator(steerable_axes(env.unwrapped.control_mode))
-    page = Page(operator, args.task, "localhost", args.port)
+    page = Page(operator, args.task, "localhost", args.port, env.unwrapped.touch_full_scales)
     env.reset(seed=0)
     took = []
     for step in range(args.steps):

@@ -20,7 +20,6 @@ from rich.console import Console
 from rich.table import Table
 from torch.utils.data import DataLoader, Dataset
 
-from baselines import tactile_representations as tactile_representations  # registers its encoders
 from baselines.common.dataset import Demonstration, SequenceDataset
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig
 from baselines.common.memory import keep_freed_memory, lay_out_channels_last
@@ -29,6 +28,7 @@ from baselines.common.train_args import ON_GPU, TrainArgs
 from baselines.common.unet import SequenceConv
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.diffusion_policy.train import LR
+from baselines.tactile_representations.pretrain import REPRESENTATIONS
 
 RNG = np.random.default_rng(0)
 WARM_UP = 2
@@ -126,7 +126,7 @@ def our_loop(args: Args, policy: DiffusionPolicy, data: SequenceDataset) -> Iter
 
 def seconds_a_step(args: Args, loop: Callable, tacrgb: str, plain_data: bool) -> float:
     torch.manual_seed(0)
-    size = args.image_size if tacrgb == "resnet18" else 224
+    size = getattr(REPRESENTATIONS.get(tacrgb), "size", args.image_size)
     spec = observation_spec(*SPEC_SENSORS, args.image_size, size)
     data = SequenceDataset(random_episodes(spec, 4, 60), spec, 2, 16, 8, torch.device("cpu" if plain_data else args.device))
     policy = DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb=tacrgb)), spec, 6).to(args.device)

@@ -4,6 +4,7 @@ Cameras, touch, forces, actions and success are shown over one time axis. Needs 
 """
 
 import logging
+import os
 import shutil
 import signal
 import socket
@@ -98,7 +99,7 @@ def main(args: Args) -> None:
         file = Path(folder) / "episode.rrd"
         recording.save(file)
         recording.disconnect()
-        _show(viewer_command(file, args.port if args.web else None))
+        _show(viewer_command(file, args.port if args.web else None), without_statistics(Path(folder)))
 
 
 def viewer_command(file: Path, web_port: int | None) -> list[str]:
@@ -113,13 +114,21 @@ def viewer_command(file: Path, web_port: int | None) -> list[str]:
     Raises:
         MachineError: The installed Rerun has no viewer.
     """
+    command = [_viewer(), str(file), "--bind", LOOPBACK, "--port", str(_free_port())]
+    return command if web_port is None else [*command, "--serve-web", "--web-viewer-port", str(web_port)]
+
+
+def _viewer() -> str:
+    """Path of Rerun's program.
+
+    Raises:
+        MachineError: The installed Rerun has none.
+    """
     import rerun_cli
 
-    program = shutil.which("rerun", path=Path(rerun_cli.__file__).parent)
-    if program is None:
+    if (program := shutil.which("rerun", path=Path(rerun_cli.__file__).parent)) is None:
         raise MachineError("the installed rerun-sdk has no viewer; use --save, and open the file elsewhere")
-    command = [program, str(file), "--bind", LOOPBACK, "--port", str(_free_port())]
-    return command if web_port is None else [*command, "--serve-web", "--web-viewer-port", str(web_port)]
+    return program
 
 
 def _free_port() -> int:
@@ -129,10 +138,21 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _show(command: list[str]) -> None:
+def without_statistics(folder: Path) -> dict[str, str]:
+    """Environment variables with which Rerun does not send usage statistics, which it otherwise does.
+
+    Args:
+        folder: An empty folder, for Rerun's settings.
+    """
+    environment = os.environ | dict(XDG_CONFIG_HOME=str(folder))
+    subprocess.run([_viewer(), "analytics", "disable"], env=environment, capture_output=True, check=False)
+    return environment
+
+
+def _show(command: list[str], environment: dict[str, str]) -> None:
     """Run the viewer until it is closed or this process is interrupted; then the viewer ends, too."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with subprocess.Popen(command) as viewer:
+    with subprocess.Popen(command, env=environment) as viewer:
         try:
             if viewer.wait() != 0:
                 raise MachineError(
