@@ -70,6 +70,7 @@ results: $(READY)
 	$(PYTHON) -m docs.make_readme_results
 	$(PYTHON) -m docs.make_fidelity
 	$(PYTHON) -m docs.make_task_cards
+	$(PYTHON) -m docs.make_perturbation
 
 # for Python 3.10 to 3.12; only this target needs uv. --upgrade takes newer versions than those that were pinned.
 # sympy: torch needs it, and torch itself is left out (pyproject.toml says why).

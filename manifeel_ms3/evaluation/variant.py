@@ -22,13 +22,23 @@ def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:
         env_id: Id of the task.
         env_kwargs: Arguments of `gym.make`.
     """
-    defaults = default_arguments(env_id)
+    defaults = default_arguments(env_id) | _registered(env_id, env_kwargs)
     other = {
         name: value
         for name, value in env_kwargs.items()
-        if name not in (*SENSING, *BACKENDS) and not (name in defaults and defaults[name] == value)
+        if name not in (*SENSING, *BACKENDS) and not (name in defaults and defaults[name] == value) and value != {}
     }
     return json.dumps(other, sort_keys=True) if other else ""
+
+
+def _registered(env_id: str, env_kwargs: dict[str, Any]) -> dict[str, Any]:
+    """The time limit and the control mode that a task is registered with; {} for a task that is not registered here."""
+    try:
+        spec = task_spec(env_id)
+    except UnknownNameError:
+        return {}
+    start = {name: value for name, value in env_kwargs.items() if name == "start"}
+    return dict(max_episode_steps=spec.max_episode_steps, control_mode=spec.control_mode(start))
 
 
 @cache

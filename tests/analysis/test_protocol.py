@@ -19,6 +19,7 @@ from manifeel_ms3.analysis.estimates import (
 )
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
 from manifeel_ms3.evaluation.result import ResultError, result_of, results_in
+from manifeel_ms3.evaluation.variant import variant_of
 from manifeel_ms3.tasks.registry import task_spec
 from tests.outcomes import made_up
 from tests.tasks_and_marks import PEG
@@ -101,6 +102,15 @@ def test_what_renders_is_no_part_of_a_condition_but_what_changes_the_task_is():
     sensed = [dict(tactile_sensors=["left"]), dict(sensor_configs=dict(width=128)), dict(tactile=dict(units="tacsl"))]
     results = (result_of(PEG, env_kwargs, config, [made_up(1, True)]) for env_kwargs in sensed)
     assert len({plain.key, changed.key, *(condition_of(result).key for result in results)}) == 5
+
+
+def test_arguments_that_are_given_as_the_task_has_them_anyway_make_no_variant():
+    own = dict(max_episode_steps=240, control_mode="pd_ee_delta_pose_fixed_gripper", imperfections={}, fit="paper")
+    assert variant_of(PEG, own) == ""
+    assert variant_of(PEG, own | dict(max_episode_steps=239)) == '{"max_episode_steps": 239}'
+    bulb = "ManiFeel-BulbInstallation-v1"
+    held = dict(start="holder", control_mode=task_spec(bulb).control_mode(dict(start="holder")))
+    assert variant_of(bulb, held) == variant_of(bulb, dict(start="holder")) == '{"start": "holder"}'
 
 
 def test_one_camera_and_one_pad_may_be_given_by_their_names():
