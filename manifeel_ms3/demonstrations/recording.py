@@ -114,10 +114,14 @@ def observed_file(folder: Path, obs_mode: str = "") -> Path | None:
         folder: The folder.
         obs_mode: Observations, joined by "+", of which a file that has all of them is preferred.
     """
-    files = [path for path in [*sorted(folder.glob("trajectory.*.h5")), folder / STATES_FILE] if path.is_file()]
-    held = {path: read_header(path)["env_info"]["env_kwargs"].get("obs_mode", "none").split("+") for path in files}
-    observed = [path for path in files if held[path] != ["none"]]
-    return max(observed, key=lambda path: set(obs_mode.split("+")) <= set(held[path]), default=None)
+    first, wanted = None, set(filter(None, obs_mode.split("+")))
+    for path in filter(Path.is_file, [*sorted(folder.glob("trajectory.*.h5")), folder / STATES_FILE]):
+        held = read_header(path)["env_info"]["env_kwargs"].get("obs_mode", "none")
+        if held != "none":
+            if wanted <= set(held.split("+")):
+                return path
+            first = first or path
+    return first
 
 
 @contextmanager

@@ -142,7 +142,7 @@ def without_statistics(folder: Path) -> dict[str, str]:
     """Environment variables with which Rerun does not send usage statistics, which it otherwise does.
 
     Args:
-        folder: An empty folder, for Rerun's settings.
+        folder: A folder for Rerun's settings, which no other process writes.
     """
     environment = os.environ | dict(XDG_CONFIG_HOME=str(folder))
     subprocess.run([_viewer(), "analytics", "disable"], env=environment, capture_output=True, check=False)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations import DemonstrationError, view
-from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from tests.sample import observed_sample
 from tests.tasks_and_marks import PEG
 
@@ -33,6 +33,22 @@ def test_everything_is_there(tmp_path):
     assert {place: rows[place] for place in images} == dict.fromkeys(images, steps + 1)
     for place in ("contact_force", "actions", "success"):
         assert rows[place] == steps + 1  # and its lines' names
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere Rerun keeps its settings in another place")
+def test_rerun_sends_no_statistics(tmp_path):
+    pytest.importorskip("rerun")
+    asked = [view._viewer(), "analytics", "config"]
+    told = subprocess.run(asked, env=view.without_statistics(tmp_path), capture_output=True, text=True, check=True).stdout
+    assert '"analytics_enabled": false' in told
+
+
+def test_a_file_is_saved_in_a_new_folder_and_not_beside_a_page(tmp_path):
+    pytest.importorskip("rerun")
+    view.main(view.Args(FILE, save=tmp_path / "new/peg.rrd"))
+    assert (tmp_path / "new/peg.rrd").stat().st_size > 0
+    with pytest.raises(InvalidArgumentError, match="give one of them"):
+        view.main(view.Args(FILE, save=tmp_path / "peg.rrd", web=True))
 
 
 def test_an_episode_that_is_not_there(tmp_path):
