@@ -11,6 +11,7 @@ import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.protocol import FEWEST_EPISODES
+from manifeel_ms3.arguments import is_number
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.agreement import COMPARED, FORCE_TOLERANCE, FORCES
 from manifeel_ms3.evaluation.result import summary_of
@@ -25,8 +26,10 @@ EPISODES = FEWEST_EPISODES
 """Number of evaluation episodes of a result: that of the paper's protocol."""
 SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
-NOT_OF_A_SUBMISSION = {"sim_config", "sensor_configs", "num_envs", "render_mode", "human_render_camera_configs"}
+NOT_OF_A_SUBMISSION = {"sim_config", "num_envs", "render_mode", "human_render_camera_configs"}
 """Arguments of an environment with which running an episode again could take any time or memory."""
+MOST_PIXELS = 2048
+"""Largest number in the settings of cameras and pads, whose images could otherwise fill the memory."""
 MOST_FORCE = 500.0
 """Contact force in N above which a result is not believed: the arm cannot press so hard, and demonstrations stay below 90 N."""
 RATE_TOLERANCE = 1e-3
@@ -156,9 +159,18 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
         faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
     if given := sorted(NOT_OF_A_SUBMISSION & result["env_kwargs"].keys()):
         faults.append(f"its env_kwargs have {given}, which change the simulator or what is rendered; evaluate without them")
+    if _largest_number(result["env_kwargs"].get("sensor_configs")) > MOST_PIXELS:
+        faults.append(f"its sensor_configs hold a number above {MOST_PIXELS}; evaluate with smaller images")
     if fault := other_revision(env_id, result["revision"]):
         faults.append(f"{fault}; evaluate again with manifeel-ms3 {version('manifeel-ms3')}")
     return faults
+
+
+def _largest_number(settings: Any) -> float:
+    """The largest number in nested settings; 0 if there is none above it."""
+    if isinstance(settings, dict | list):
+        return max(map(_largest_number, settings.values() if isinstance(settings, dict) else settings), default=0)
+    return settings if is_number(settings) else 0
 
 
 def _faults_of_the_simulator(result: dict[str, Any]) -> list[str]:

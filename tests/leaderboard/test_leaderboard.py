@@ -96,6 +96,10 @@ def change(folder: Path, edit) -> None:
             r"its env_kwargs have \['num_envs', 'sim_config'\], which change the simulator",
         ),
         (
+            lambda r: r["env_kwargs"].update(sensor_configs=dict(wrist=dict(width=128, pose=[10**5]))),
+            "its sensor_configs hold a number above 2048",
+        ),
+        (
             lambda r: r["env_kwargs"].update(max_episode_steps=10**9),
             "a time limit of 1000000000 steps, the task ends after 240",
         ),
