@@ -34,8 +34,8 @@ $(DEMOS): | $(READY)
 		--obs-mode rgb+tacff --cameras wrist --tactile-sensors right --env-kwargs '$(TASK_ARGS)'
 
 $(RUN)/.trained: | $(DEMOS)
-	$(PYTHON) baselines/diffusion_policy/train.py cpu --demo-path $(DEMOS) --obs-mode rgb+tacff --run-dir $(RUN) \
-		$$(ls $(RUN)/checkpoints/*/config.json >/dev/null 2>&1 && echo --resume)
+	$(PYTHON) baselines/diffusion_policy/train.py cpu_targets --total-iters 7000 --demo-path $(DEMOS) --obs-mode rgb+tacff \
+		--run-dir $(RUN) $$(ls $(RUN)/checkpoints/*/config.json >/dev/null 2>&1 && echo --resume)
 	touch $@
 
 $(RUN)/evaluation.json: $(RUN)/.trained
