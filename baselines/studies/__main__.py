@@ -7,7 +7,6 @@ again, and a study that was stopped goes on where it stopped.
 """
 
 import logging
-import re
 import sys
 import time
 from collections import Counter
@@ -35,8 +34,6 @@ from .running import run_jobs
 from .study import KINDS, Kind, Resources, Study, read_study
 
 log = logging.getLogger(__name__)
-SEED = re.compile(r", seed \d+")
-"""The seed in a job's title."""
 SHOWN = 8
 """Largest number of running jobs in the table; set once, not tuned."""
 FILE_WIDTH = 160
@@ -185,11 +182,14 @@ def _counts(jobs: list[Job], statuses: dict[str, Status], runs: dict[str, float]
 
 
 def plan(study: Study, jobs: list[Job], root: Path) -> Table:
-    """A table of the jobs to do and of their hours on this machine; jobs that differ in their seed share a row."""
+    """A table of the jobs to do and of their hours on this machine.
+
+    Jobs that differ in their seed, or in the arguments of their evaluation, share a row; it names the source of the first cost.
+    """
     table = Table("job", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
     groups: dict[tuple[Kind, str], list[Job]] = {}
     for job in sorted(jobs, key=lambda job: KINDS.index(job.kind)):
-        groups.setdefault((job.kind, SEED.sub("", job.title)), []).append(job)
+        groups.setdefault((job.kind, job.title.partition(", seed")[0]), []).append(job)
     cpu = gpu = 0.0
     for (kind, title), group in track(groups.items(), "measuring", transient=True):
         needs = study.resources[kind]

@@ -20,8 +20,9 @@ from .rollout import EpisodeOutcome
 
 ABOUT = "submission.json"
 """File that names the checkpoints' hashes."""
-SETTINGS = ("env_kwargs", "revision", "config", "inference", "stop_at_success")
-"""Parts of a result that say what was evaluated, and how; only results that have the same can be compared by episode."""
+SETTINGS = ("env_kwargs", "revision", "inference", "stop_at_success")
+"""Parts of a result that say, beside the policy's configuration, what was evaluated, and how; only results that have the same
+can be compared by episode."""
 CHECKPOINT_HASHES = {
     "type": "object",
     "properties": {"checkpoints": {"type": "object", "additionalProperties": {"type": "string"}}},
@@ -42,7 +43,9 @@ class Entry:
 
     def unlike(self, result: dict[str, Any]) -> list[str]:
         """Names of the settings of a result that are not the entry's; its outcomes may then differ on any machine."""
-        return [name for name in SETTINGS if result[name] != self.result[name]]
+        config, own = result["config"], self.result["config"]
+        of_the_policy = sorted(name for name in config.keys() | own.keys() if config.get(name) != own.get(name))
+        return [name for name in SETTINGS if result[name] != self.result[name]] + of_the_policy
 
     def agreement(self, outcomes: list[EpisodeOutcome]) -> str:
         """Sentence that says how many of the given outcomes agree with those of the entry.

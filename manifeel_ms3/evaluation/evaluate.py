@@ -144,7 +144,7 @@ def main(args: Args) -> Path:
             run_episodes(evaluation, journal.remaining, args.workers, journal.add)
             write_result(_result(evaluation, journal.in_order, origin), out)
     if entry is not None:
-        log.info("%s", _comparison(entry, args, out, journal.in_order))
+        log.info("%s", _comparison(entry, out, journal.in_order))
     for number in args.videos:
         write_video(evaluation, seeds[number], out.parent / "videos")
     return out
@@ -176,15 +176,13 @@ def _like_entry(args: Args, entry: Entry) -> Args:
         inference_steps=made["config"].get(INFERENCE_STEPS) if args.inference_steps is None else args.inference_steps,
         stop_at_success=args.stop_at_success or made["stop_at_success"],
         env_kwargs=json.dumps(made["env_kwargs"] | json_object("--env-kwargs", args.env_kwargs)),
+        policy_kwargs=json.dumps(made["config"].get("policy_kwargs", {}) | json_object("--policy-kwargs", args.policy_kwargs)),
     )
 
 
-def _comparison(entry: Entry, args: Args, out: Path, outcomes: list[EpisodeOutcome]) -> str:
+def _comparison(entry: Entry, out: Path, outcomes: list[EpisodeOutcome]) -> str:
     """Sentence that compares the outcomes with those of the entry, or says why they cannot be compared."""
-    unlike = entry.unlike(read_result(out))
-    if json_object("--policy-kwargs", args.policy_kwargs):  # they change the policy
-        unlike.append("policy_kwargs")
-    if not unlike:
+    if not (unlike := entry.unlike(read_result(out))):
         return entry.agreement(outcomes)
     named = ", ".join(unlike)
     return f"the episodes are not compared with those of the entry {entry.name}, which was evaluated with other {named}"

@@ -10,6 +10,7 @@ from mani_skill.trajectory import replay_trajectory
 
 from manifeel_ms3.demonstrations import render_observations
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
+from manifeel_ms3.errors import WorkFailedError
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
 
@@ -45,7 +46,9 @@ def test_actions_that_were_converted_to_joints_move_the_objects_as_before(in_joi
 def test_an_episode_that_fails_with_another_controller_is_left_out(tmp_path, caplog):
     """Without an action for the gripper, no ball is grasped."""
     mode = "pd_ee_delta_pose_fixed_gripper"
-    render_observations.main(render_observations.Args(states_sample(TASK), tmp_path / "t.h5", **BARE, control_mode=mode))
+    args = render_observations.Args(states_sample(TASK), tmp_path / "t.h5", **BARE, control_mode=mode)
+    with pytest.raises(WorkFailedError, match=r"none of the 1 episodes of .* succeeds in this replay"):
+        render_observations.main(args)
     assert "the episodes of the seeds [0] do not succeed in this replay" in caplog.text
     assert not (tmp_path / "t.h5").exists()
 
