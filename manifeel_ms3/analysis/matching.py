@@ -10,7 +10,7 @@ from dataclasses import replace
 from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition
-from .paper import SCRATCH
+from .paper import MODES, SCRATCH, paper_condition
 from .presets import TrainingSettings, has_presets_encoder, training_settings_of
 from .protocol import ConditionResults
 
@@ -46,6 +46,20 @@ def answering_all(wanted: Sequence[Condition], found: Found) -> dict[TrainingSet
     common = set.intersection(*(set(one) for one in answers))
     in_order = sorted(common, key=lambda settings: settings.sort_key)
     return {settings: [one[settings] for one in answers] for settings in in_order}
+
+
+def of_table_one(task: str, found: Found) -> dict[TrainingSettings, dict[str, Condition]]:
+    """The conditions of a task of Table I that were run, by observation mode, for each set-up.
+
+    Args:
+        task: Short name of the task.
+        found: The results that enter comparisons.
+    """
+    by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
+    for mode in MODES:
+        for settings, condition in answering(paper_condition(task, mode), found).items():
+            by_settings.setdefault(settings, {})[mode] = condition
+    return by_settings
 
 
 def as_the_paper_says(condition: Condition) -> Condition:

@@ -12,7 +12,7 @@ from .condition import Condition
 from .estimates import Estimate, mean_success
 from .figures import save_figure
 from .markdown import markdown_table
-from .matching import Found, answering
+from .matching import Found, answering, of_table_one
 from .paper import DP, MODES, TABLE_I, TABLE_II, TABLE_III, Rate, paper_condition, tasks_in_table
 from .presets import PAPER, TrainingSettings
 from .protocol import ConditionResults
@@ -165,11 +165,7 @@ def overview_of_table_one(found: Found) -> dict[str, tuple[TrainingSettings, dic
     """
     overview = {}
     for task in TABLE_I:
-        by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
-        for mode in MODES:
-            for settings, condition in answering(paper_condition(task, mode), found).items():
-                by_settings.setdefault(settings, {})[mode] = condition
-        if by_settings:
+        if by_settings := of_table_one(task, found):
             overview[task] = min(
                 by_settings.items(), key=lambda item: (-len(item[1]), -_num_seeds(item[1], found), item[0].fullness)
             )

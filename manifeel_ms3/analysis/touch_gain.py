@@ -13,7 +13,7 @@ from .condition import Condition, by_condition
 from .episode_endings import Results, endings_of
 from .estimates import SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
 from .markdown import markdown_table, shown
-from .matching import Found, answering
+from .matching import Found, answering, of_table_one
 from .paper import MODES, TABLE_I, VISION, Rate, paper_condition, tasks_in_table
 from .presets import TrainingSettings
 from .protocol import ConditionResults
@@ -106,11 +106,7 @@ def _papers_rates(task: str) -> dict[str, Rate]:
 
 def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> Iterator[str]:
     """A paragraph for each set-up in which a task was run with vision alone and with touch."""
-    by_settings: dict[TrainingSettings, dict[str, Condition]] = {}
-    for mode in MODES:
-        for settings, condition in answering(paper_condition(task, mode), found).items():
-            by_settings.setdefault(settings, {})[mode] = condition
-    for settings, conditions in by_settings.items():
+    for settings, conditions in of_table_one(task, found).items():
         if VISION in conditions and len(conditions) > 1:
             gains = "; ".join(_gain(task, mode, conditions, found) for mode in conditions if mode != VISION)
             ends = " ".join(_endings(mode, results[condition]) for mode, condition in conditions.items())
