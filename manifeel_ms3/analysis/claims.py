@@ -190,8 +190,9 @@ def main(args: Args) -> dict[Comparison, list[ClaimResult]]:
         require_file("--out", args.out, "claims.md")
     collected = collect(results_in(*args.results))
     found = of_the_protocol(collected)
-    for condition in (condition for condition in collected if condition not in found):
-        log.warning("%s is left out: %s", condition, collected[condition].why_left_out)
+    for condition, results in collected.items():
+        if condition not in found:
+            log.warning("%s is left out: %s", condition, results.why_left_out)
     answered = results_of_claims(found)
     text = claims_page(found, answered)
     log.info("%s", text)
