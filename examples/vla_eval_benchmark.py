@@ -42,7 +42,7 @@ class ManiFeelBenchmark(StepBenchmark):
 
     def __init__(self, tasks: list[str] | None = None, obs_mode: str = "rgb+tacrgb", env_kwargs: dict | None = None):
         # imported here, because SAPIEN takes the renderer that is set when it is imported first
-        from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+        from manifeel_ms3.agents.panda_gelsight import FIXED_GRIPPER
         from manifeel_ms3.evaluation.lerobot_env import LeRobotEnv
         from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, all_tasks, task_spec
 
@@ -52,7 +52,7 @@ class ManiFeelBenchmark(StepBenchmark):
         self.first_seed = FIRST_EVALUATION_SEED
         self.env_kwargs = env_kwargs or {}
         modes = {spec.control_mode(self.env_kwargs) for spec in self.tasks}
-        self.has_gripper = any("gripper" in ACTION_AXES[mode] for mode in modes)
+        self.has_gripper = any(not mode.endswith(FIXED_GRIPPER) for mode in modes)
         self.env, self.made = None, None
 
     def get_tasks(self) -> list[Task]:

@@ -9,11 +9,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers import (
-    PDJointPosControllerConfig,
-    PDJointPosMimicControllerConfig,
-    deepcopy_dict,
-)
+from mani_skill.agents.controllers import deepcopy_dict
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
@@ -26,7 +22,14 @@ from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
-from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseController, LimitedLeadEEPoseControllerConfig, solve_ik
+from .controllers import (
+    GripperControllerConfig,
+    HoldGripperControllerConfig,
+    LimitedLeadEEPoseController,
+    LimitedLeadEEPoseControllerConfig,
+    RestorableJointControllerConfig,
+    solve_ik,
+)
 from .fingers import Finger
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
@@ -53,7 +56,7 @@ STILL = 0.2
 """Largest speed of a joint of an arm that is still, in rad/s (ManiSkill's Panda)."""
 FINGER_RANGE = (-0.01, 0.04)
 """Range of a finger's commanded distance from the middle, in m. A command beyond the surface of a held object is a force:
-1 kN/m times the distance."""
+1 kN/m times the distance. An object of width w is so held with 10 N + 500 N/m w at most: a peg with 14 N."""
 IK_STEPS = 20
 """Number of Levenberg-Marquardt steps of the inverse kinematics at a reset on a GPU. Set once; not tuned."""
 JOINT_DELTA = 0.1
@@ -76,6 +79,13 @@ ACTION_AXES = {
     "pd_ee_delta_yaw": ("x", "y", "z", "yaw", "gripper"),
 }
 """Names of the components of an action, in order, by delta control mode; rotations are about the axes of the base frame."""
+_JOINTS = tuple(f"panda_joint{i}" for i in range(1, 8))
+JOINT_ACTION_AXES = {
+    f"{mode}{end}": names
+    for mode in ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_target_delta_pos")
+    for end, names in (("", (*_JOINTS, "gripper")), (FIXED_GRIPPER, _JOINTS))
+}
+"""Names of the components of an action, in order, by control mode that commands joints."""
 LOCKED_AXES = {"pd_ee_delta_pose_fixed_roll_pitch": (0, 1), "pd_ee_delta_pose_fixed_rotation": (0, 1, 2)}
 """Axes of the base frame about which an action does not turn the hand, although it has components for them, by control mode."""
 WRIST_CAMERA_POSITION = (0.045, 0.0, 0.04)
@@ -110,7 +120,7 @@ class PandaGelSight(BaseAgent):
             panda_rightfinger=dict(material="housing"),
         ),
     )
-    arm_joint_names: ClassVar[list[str]] = [f"panda_joint{i}" for i in range(1, 8)]
+    arm_joint_names: ClassVar[list[str]] = list(_JOINTS)
     gripper_joint_names: ClassVar[list[str]] = ["panda_finger_joint1", "panda_finger_joint2"]
     ee_link_name = "panda_hand_tcp"
     keyframes: ClassVar[dict[str, Keyframe]] = dict(
@@ -180,9 +190,9 @@ class PandaGelSight(BaseAgent):
         arms = dict(  # each of these exists also with a gripper that keeps its grip
             pd_ee_delta_pose=delta_pose,
             pd_ee_pose=absolute_pose,
-            pd_joint_pos=PDJointPosControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
-            pd_joint_delta_pos=PDJointPosControllerConfig(**joint_delta),
-            pd_joint_target_delta_pos=PDJointPosControllerConfig(**joint_delta, use_target=True),
+            pd_joint_pos=RestorableJointControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
+            pd_joint_delta_pos=RestorableJointControllerConfig(**joint_delta),
+            pd_joint_target_delta_pos=RestorableJointControllerConfig(**joint_delta, use_target=True),
         )
         gripper, hold = self._gripper_configs
         return deepcopy_dict(
@@ -195,7 +205,7 @@ class PandaGelSight(BaseAgent):
     @property
     def _gripper_configs(self):
         """The gripper that an action opens and closes, and the one that keeps its grip."""
-        gripper = PDJointPosMimicControllerConfig(
+        gripper = GripperControllerConfig(
             self.gripper_joint_names,
             lower=FINGER_RANGE[0],
             upper=FINGER_RANGE[1],

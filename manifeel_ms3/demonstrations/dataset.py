@@ -16,13 +16,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from manifeel_ms3.arguments import require_positive
+from manifeel_ms3.arguments import require_positive, several_of
 from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import InvalidFileError, MachineError
 from manifeel_ms3.files import file_hash, read_json, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.rendering.cameras import IMAGE_SIZE
+from manifeel_ms3.tasks.obs_modes import split_obs_mode
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
@@ -72,11 +73,14 @@ def main(args: Args) -> Path:
 
     Raises:
         UnknownNameError: A task is not registered, or has no demonstrator.
-        InvalidArgumentError: A number is too small.
+        InvalidArgumentError: A number is too small, or an observation, camera or sensor is unknown.
         MachineError: The disk has too little room, or the folder cannot be written.
         InUseError: Another process writes the folder.
     """
     require_positive(num_demos=args.num, num_procs=args.workers, image_size=args.image_size)
+    split_obs_mode(args.obs_mode)
+    several_of("--cameras", args.cameras, CAMERAS)
+    several_of("--tactile-sensors", args.tactile_sensors, SIDES)
     with owned(args.out / MANIFEST_FILE):
         return _record_all(args)
 

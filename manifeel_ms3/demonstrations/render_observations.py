@@ -118,10 +118,10 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
         _warn(recording)
         recording.finish()
         if not recording.infos:
-            raise WorkFailedError(
-                f"none of the {len(episodes)} episodes of {args.path} succeeds in this replay; use the versions that its json "
-                "names, or record demonstrations of your own"
-            )
+            advice = "use the versions that its json names, or record demonstrations of your own"
+            if args.control_mode is not None:
+                advice = f"{args.control_mode} may be unable to do what they do, such as opening the hand; or {advice}"
+            raise WorkFailedError(f"none of the {len(episodes)} episodes of {args.path} succeeds in this replay: {advice}")
     return args.out
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 import tyro
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, FIXED_GRIPPER, PandaGelSight
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, JOINT_ACTION_AXES
 from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
@@ -35,14 +35,6 @@ from .formats.touch_units import SUMS, recorded_sensor
 log = logging.getLogger(__name__)
 TIMELINE = "step"
 """Name of Rerun's time axis, which counts control steps."""
-JOINTS = tuple(PandaGelSight.arm_joint_names)
-"""Names of the joints of the arm."""
-JOINT_AXES = {
-    f"{mode}{end}": names
-    for mode in ("pd_joint_pos", "pd_joint_delta_pos", "pd_joint_target_delta_pos")
-    for end, names in (("", (*JOINTS, "gripper")), (FIXED_GRIPPER, JOINTS))
-}
-"""Names of the entries of an action by control mode, for modes that command joints."""
 
 
 @dataclass
@@ -213,7 +205,7 @@ def action_names(control_mode: str, size: int) -> list[str]:
         control_mode: Name of the controller, such as "pd_ee_delta_pose".
         size: Number of entries.
     """
-    names = list((ACTION_AXES | JOINT_AXES).get(control_mode, ()))
+    names = list((ACTION_AXES | JOINT_ACTION_AXES).get(control_mode, ()))
     return names if len(names) == size else list(map(str, range(size)))
 
 

@@ -14,6 +14,9 @@ import torch
 from mani_skill.utils.structs import Actor
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.agents.controllers import LimitedLeadEEPoseController
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks import VisuotactileEnv
 
 Actions = Iterator[np.ndarray]
@@ -63,9 +66,15 @@ CONFIG = SkillConfig()
 
 
 class Skills:
-    """Motion and sensed load of the robot of a single environment (`num_envs=1`); base frame, in m, rad and N."""
+    """Motion and sensed load of the robot of a single environment (`num_envs=1`); base frame, in m, rad and N.
+
+    Raises:
+        InvalidArgumentError: The actions of the control mode are no steps of the tool, or leave out the gripper in a task
+            whose own control mode has it.
+    """
 
     def __init__(self, env: VisuotactileEnv):
+        _require_motions(env)
         self.env = env
         self.agent = env.agent
         self.arm = env.agent.controller.controllers["arm"]
@@ -146,7 +155,7 @@ class Skills:
         return motion if self.gripper is None else np.r_[motion, self.gripper]
 
     def keep_grip(self) -> None:
-        """Command the gripper to keep its present grip, where the controller does not hold it fixed."""
+        """Command the gripper, where it has an action, to keep its present grip as far as its range allows."""
         if self.agent.controller.controllers["gripper"].single_action_space.shape[0]:
             self.gripper = self.present_grip
 
@@ -217,7 +226,7 @@ class Skills:
 
     @property
     def present_grip(self) -> float:
-        """Gripper command that keeps the fingers' present target."""
+        """Gripper command that keeps the fingers' present target; the firmest one if the target is beyond their range."""
         finger = self.agent.controller.controllers["gripper"].active_joint_indices[0]
         return self.finger_action(float(self.agent.robot.get_drive_targets()[0, finger]))
 
@@ -254,6 +263,20 @@ def perceived_position(actor: Actor, rng: np.random.Generator) -> np.ndarray:
     angle, radius = rng.uniform(0, 2 * np.pi), CONFIG.sight_error * np.sqrt(rng.uniform())
     position, _ = position_rotation(actor.pose.raw_pose)
     return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+
+
+def _require_motions(env: VisuotactileEnv) -> None:
+    """Check that actions of the environment's control mode can do what a demonstrator of its task does."""
+    needs_gripper = "gripper" in ACTION_AXES.get(env.default_control_mode, ())
+    arm, gripper = (env.agent.controller.controllers[part] for part in ("arm", "gripper"))
+    moves_tool = isinstance(arm, LimitedLeadEEPoseController) and arm.config.use_delta
+    if not moves_tool or (needs_gripper and not gripper.single_action_space.shape[0]):
+        modes = [mode for mode, axes in ACTION_AXES.items() if "gripper" in axes or not needs_gripper]
+        raise InvalidArgumentError(
+            f"control_mode={env.control_mode!r}: demonstrators of {type(env).__name__} move the tool by steps"
+            f"{', and the fingers' if needs_gripper else ''}; choose from {modes}, and convert the actions afterwards by "
+            "`manifeel render-observations --control-mode`"
+        )
 
 
 def position_rotation(raw_pose: torch.Tensor) -> tuple[np.ndarray, Rotation]:

@@ -76,7 +76,8 @@ NUT_DESCENT = 1.5
 NUT_SYMMETRY = np.deg2rad(60)
 """Symmetry of a hexagon, in rad."""
 NUT_GRIP_FORCE = 27.0
-"""Force of each pad on the nut, in N. Set once; not tuned."""
+"""Force of each pad on the nut at the start, in N. Set once; not tuned. The fingers' range leaves 22 N of it from the
+first action on (`FINGER_RANGE` in agents/panda_gelsight.py)."""
 NUT_ENGAGED = 0.0018
 """Height of the nut's middle over the bolt's end, in m, at which the ridge's lower end just passes under the end of
 the crest."""
@@ -180,7 +181,7 @@ LEAD_IN = 0.25
 BULB_SYMMETRY = np.deg2rad(15)
 """Step of the angles at which the round bulb is grasped, in rad. Set once; not tuned."""
 BULB_GRIP_FORCE = 12.0
-"""Force of each pad on the bulb, in N. Set once; not tuned."""
+"""Force of each pad on the bulb at the start, in N. Set once; not tuned. From the first action on it is 11 N."""
 BULB_DENSITY = 400.0
 """Density of the whole bulb, which is hollow, in kg/m^3: it has 53 g; LED lamps of this size have 50 to 60 g (data sheets)."""
 BULB_SEATED = CONTACT_HEIGHT - CAP_TIP

@@ -72,10 +72,6 @@ class Imperfections:
         for name, values in self.config.imperfections.draw(seeds, self.config.taxel_shape).items():
             self._drawn[name][pads] = torch.as_tensor(values, device=self.device)
         self._seed[pads] = torch.as_tensor(seeds.astype(np.int64) ^ NOISE_KEY, device=self.device).to(torch.int32)
-        self.forget(pads)
-
-    def forget(self, pads: torch.Tensor) -> None:
-        """Let the next observation of these pads be the first one of their episodes."""
         self._frame[pads] = 0
         self._held[pads] = 0.0
         self._surface[pads] = 0.0

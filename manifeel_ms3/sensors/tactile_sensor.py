@@ -108,10 +108,6 @@ class TactileSensor(BaseSensor):
         seeds, episodes = (zeros if given is None else np.asarray(given) for given in (seeds, episodes))
         self.model.reset(env_idx, pad_seeds(seeds, episodes, self.config.uid))
 
-    def forget_readings(self, env_idx: torch.Tensor) -> None:
-        """Let the next observation of these environments be the first one that shear and imperfections remember."""
-        self.model.forget_readings(env_idx)
-
     def wrench(self) -> torch.Tensor:
         """Force and moment (N, 6), N and N m, of the world on the pad, about the pad frame's origin, in the pad frame."""
         return self._gauge.read()

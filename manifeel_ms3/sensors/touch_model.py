@@ -97,12 +97,6 @@ class TouchModel:
         if self._imperfections is not None:
             self._imperfections.reset(pads, seeds)
 
-    def forget_readings(self, pads: torch.Tensor) -> None:
-        """Let the next observation of these pads be the first one that shear and imperfections remember."""
-        self._bristle[pads] = 0.0
-        if self._imperfections is not None:
-            self._imperfections.forget(pads)
-
     @property
     def _memory(self) -> dict[str, torch.Tensor]:
         """The last observation, and what the next one depends on besides the present state, (N, ...) each; not copies."""

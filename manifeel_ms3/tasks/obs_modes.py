@@ -38,6 +38,8 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
             raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {token!r} is unknown; join any of {list(known)} by '+'")
     if repeated := {token for token in tokens if tokens.count(token) > 1}:
         raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} is given more than once")
+    if set(STATE_TOKENS) <= set(tokens):
+        raise InvalidArgumentError(f"obs_mode={obs_mode!r}: 'state' and 'state_dict' are two forms of one state; choose one")
     own = ["rgb+depth" if token == "rgbd" and len(tokens) > 1 else token for token in tokens if token not in TACTILE_TOKENS]
     alone = [token for token in own if token in WHOLE_MODES]
     if alone and len(tokens) > 1 and own != ["pointcloud"]:

@@ -2,6 +2,8 @@
 
 # pyright: reportArgumentType=false, reportCallIssue=false
 # (ManiSkill annotates images as arrays of any library, and sensors by their base class)
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -30,6 +32,8 @@ class SensingEnv(BaseEnv):
     _touch_is_stale: torch.Tensor
     """Whether the pads of each environment, (N,) bool, are still to be read in the present state. They are read once per state,
     since shear has a history."""
+    _observes = True
+    """Whether `get_obs` observes anything."""
     renders_cameras = True
     """Whether observations hold the cameras' images. They are left out where a policy does not use them, to save time."""
 
@@ -47,7 +51,18 @@ class SensingEnv(BaseEnv):
         drawn = {name: sensor.drawn_imperfections for name, sensor in self._tactile_sensors.items()}
         return dict(imperfections=drawn) if any(drawn.values()) else {}
 
+    @contextmanager
+    def _nothing_observed(self) -> Iterator[None]:
+        """Let `get_obs` return an empty observation in this context, and spare its time."""
+        self._observes = False
+        try:
+            yield
+        finally:
+            self._observes = True
+
     def get_obs(self, info: dict | None = None, unflattened: bool = False):
+        if not self._observes:
+            return {}
         if not self._tactile_outputs:
             return super().get_obs(info, unflattened)
         obs = self._get_obs_with_sensor_data(self.get_info() if info is None else info)

@@ -125,13 +125,25 @@ def _require_bodies_of(state: Tree, present: Tree) -> None:
             f"{[f'{part}/{name}' for part, held in bodies.items() for name in held]}: give a state of its get_state_dict"
         )
     for part, held in given.items():
-        for name, values in held.items():
-            size, wanted = (tuple(np.shape(common.to_numpy(one)))[-1:] for one in (values, bodies[part][name]))
-            if size != wanted:
-                raise InvalidArgumentError(
-                    f"the state of {part}/{name} in the option reset_to_env_states has {size or 'no'} values for each "
-                    f"environment, and not {wanted}: give a state of get_state_dict"
-                )
+        _require_sizes(part, held, bodies[part])
+    targets = present.get("controller", {})
+    for part, held in state.get("controller", {}).items():
+        _require_sizes(f"controller/{part}", held, targets.get(part, {}))
+
+
+def _require_sizes(part: str, given: Tree, present: Tree) -> None:
+    """Check that what is given has as many values for each environment as what has the same name at present.
+
+    Raises:
+        InvalidArgumentError: It does not.
+    """
+    for name in given.keys() & present.keys():
+        size, wanted = (tuple(np.shape(common.to_numpy(tree[name])))[-1:] for tree in (given, present))
+        if size != wanted:
+            raise InvalidArgumentError(
+                f"the state of {part}/{name} in the option reset_to_env_states has {size or 'no'} values for each "
+                f"environment, and not {wanted}: give a state of get_state_dict"
+            )
 
 
 def unflattened(state: torch.Tensor, like: Tree) -> dict[str, Any]:

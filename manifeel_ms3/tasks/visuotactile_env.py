@@ -297,7 +297,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
     # ---------------------------------------------------------------- episode
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None):
-        """Reset as ManiSkill does; with a seed, on the CPU, also build the scene anew (0.1 s).
+        """Reset as ManiSkill does; with a seed, on the CPU, also build the scene anew.
 
         The engine's solver remembers earlier episodes. Only in a new scene is an episode a function of its seed alone, bit for
         bit. Where several environments share a process, ManiSkill seeds the draws of their initial states with the first
@@ -316,7 +316,8 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         if "env_idx" in options:
             options["env_idx"] = env_idx  # a list is accepted, too
         with self._others_unchanged(env_idx):
-            _, info = super().reset(seed=seed, options=options)
+            with self._nothing_observed():  # before the grip has settled
+                _, info = super().reset(seed=seed, options=options)
             if state is None:
                 self._settle()
             elif isinstance(state, Mapping):
@@ -324,8 +325,6 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             else:
                 self.set_state(state, env_idx)
         self._touch_is_stale[env_idx] = True
-        for sensor in self._tactile_sensors.values():
-            sensor.forget_readings(env_idx)  # which are from before the grip had settled
         info = self.get_info() | dict(reconfigure=info["reconfigure"], language_instruction=self.get_language_instruction())
         self._last_obs = self.get_obs(info)
         return self._last_obs, info

@@ -7,7 +7,7 @@ from enum import Enum
 
 import numpy as np
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, LOCKED_AXES
 from manifeel_ms3.errors import InvalidArgumentError
 
 HOLD = 0.25
@@ -37,8 +37,8 @@ class EpisodeCommand(Enum):
     DISCARD = "discard"
 
 
-def steerable_axes(control_mode: str) -> tuple[str, ...]:
-    """Names of the entries of an action, for a control mode that a person can steer.
+def steerable_axes(control_mode: str) -> tuple[str | None, ...]:
+    """Names of the entries of an action, for a control mode that a person can steer; None for those that have no effect.
 
     Raises:
         InvalidArgumentError: Actions of the control mode are not motions of the tool.
@@ -48,18 +48,19 @@ def steerable_axes(control_mode: str) -> tuple[str, ...]:
             f"control_mode={control_mode!r} cannot be steered by hand, because its actions are not motions of the tool; choose "
             f"from {list(ACTION_AXES)}"
         )
-    return ACTION_AXES[control_mode]
+    locked = [3 + axis for axis in LOCKED_AXES.get(control_mode, ())]  # rotations come after x, y and z
+    return tuple(None if entry in locked else axis for entry, axis in enumerate(ACTION_AXES[control_mode]))
 
 
 class Operator:
     """Motions and commands of the person who steers.
 
     Args:
-        axes: Names of an action's entries, such as ("x", "y", "z", "yaw", "gripper").
+        axes: Names of an action's entries, such as ("x", "y", "z", None, None, "yaw", "gripper"); those without a name stay 0.
         clock: Function that returns the time in s.
     """
 
-    def __init__(self, axes: tuple[str, ...], clock: Callable[[], float] = time.monotonic):
+    def __init__(self, axes: tuple[str | None, ...], clock: Callable[[], float] = time.monotonic):
         self.axes, self.speed, self._clock = axes, FIRST_SPEED, clock
         self._changed = threading.Condition()
         self._mode = Mode.READY
@@ -104,7 +105,8 @@ class Operator:
             now = self._clock()
             moving = {axis: direction * self.speed for axis, (direction, until) in self._pushed.items() if now < until}
             moving["gripper"] = self._gripper
-            return np.clip([moving.get(axis, 0.0) for axis in self.axes], -1.0, 1.0).astype(np.float32)
+            wanted = [moving.get(axis, 0.0) if axis else 0.0 for axis in self.axes]
+            return np.clip(wanted, -1.0, 1.0).astype(np.float32)
 
     # ---------------------------------------------------------------- modes
 

@@ -48,8 +48,17 @@ KEYS = {
     "arrowright": ("roll", 1.0),
 }
 """Axis and direction of each key, as seen from behind the robot: x is forward, y to the left."""
-HELP = """Keys (hold them): **W S** forward, back · **A D** left, right · **R F** up, down · **Q E** turn · arrows tilt ·
-**G** gripper · **space** start, pause · **enter** save · **backspace** discard"""
+KEYS_OF_AXES = {
+    "x": "**W S** forward, back",
+    "y": "**A D** left, right",
+    "z": "**R F** up, down",
+    "yaw": "**Q E** turn",
+    "roll": "arrows tilt",
+    "gripper": "**G** gripper",
+}
+"""What the page says of the keys of each axis."""
+KEYS_OF_EPISODES = ("**space** start, pause", "**enter** save", "**backspace** discard")
+"""What the page says of the other keys."""
 
 
 class Page:
@@ -158,7 +167,8 @@ class Page:
         """Two buttons for every axis, and one for the gripper."""
         gui = self._server.gui
         with gui.add_folder("steer"):
-            gui.add_markdown(HELP)
+            keys = [said for axis, said in KEYS_OF_AXES.items() if axis in self.operator.axes]
+            gui.add_markdown("Keys (hold them): " + " · ".join([*keys, *KEYS_OF_EPISODES]))
             for axis in dict.fromkeys(axis for axis, _ in KEYS.values() if axis in self.operator.axes):
                 for sign, name in ((1.0, f"{axis} +"), (-1.0, f"{axis} -")):
                     push = self._if_pilot(partial(self.operator.push, axis, sign))
@@ -168,8 +178,10 @@ class Page:
 
     def _build_keys(self) -> None:
         for key, (axis, sign) in KEYS.items():
-            self._key(f"{axis} {'+' if sign > 0 else '-'}", key, partial(self.operator.push, axis, sign))
-        self._key("gripper", "G", self.operator.toggle_gripper)
+            if axis in self.operator.axes:
+                self._key(f"{axis} {'+' if sign > 0 else '-'}", key, partial(self.operator.push, axis, sign))
+        if "gripper" in self.operator.axes:
+            self._key("gripper", "G", self.operator.toggle_gripper)
         self._key("start or pause", "space", self._start_or_pause)
         self._key("save", "enter", partial(self.operator.command, EpisodeCommand.SAVE))
         self._key("discard", "backspace", partial(self.operator.command, EpisodeCommand.DISCARD))

@@ -92,7 +92,10 @@ class Session:
             self._recording.finish()
 
     def _actions(self) -> Iterator[np.ndarray]:
-        """Actions at the environment's control rate, while the operator lets the robot move; the first ones keep the grip."""
+        """Actions at the environment's control rate, while the operator lets the robot move; the first ones keep the grip.
+
+        A grip on a thin part becomes weaker (`Skills.present_grip`).
+        """
         if "gripper" in self.operator.axes:
             skills = Skills(cast(VisuotactileEnv, self.env.unwrapped))
             self.operator.take_over_gripper(skills.present_grip, bool(skills.squeeze.min() >= GRASP_FORCE))

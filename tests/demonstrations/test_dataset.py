@@ -92,6 +92,20 @@ def test_numbers_that_are_too_small_are_refused(folder, tmp_path, given):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (dict(obs_mode="rgb+foo"), "token 'foo' is unknown"),
+        (dict(cameras=("foo",)), "--cameras='foo'"),
+        (dict(tactile_sensors=("middle",)), "--tactile-sensors='middle'"),
+    ],
+)
+def test_unknown_observations_are_refused_before_anything_is_recorded(tmp_path, flags, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        dataset.main(dataset.Args(tmp_path / "set", (PEG,), num=1, **flags))
+    assert not list(tmp_path.iterdir())
+
+
 def test_negative_numbers_of_what_may_be_left_out_are_refused(folder):
     states = folder / PEG / STATES
     with pytest.raises(InvalidArgumentError, match="--replay -1 must be at least 0"):

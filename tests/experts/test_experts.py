@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from manifeel_ms3.demonstrations.episode import demonstrate
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.experts import BallSortingExpert, make_expert
 from manifeel_ms3.experts.skills import perceived_position
 from manifeel_ms3.sensors.depth.surfaces import RELIEF
@@ -89,6 +90,29 @@ def test_insertion_is_demonstrated_with_controllers_that_take_other_actions(make
     env = make_env(obs_mode="none", render_backend="none", control_mode=control_mode)
     gentle_success(env, PEG, 0)
     assert env.action_space.shape == (action_dim,)
+
+
+@pytest.mark.parametrize(
+    ("task", "control_mode", "said"),
+    [
+        (
+            PEG,
+            "pd_ee_pose",
+            r"of PegInsertionEnv move the tool by steps; choose from \['pd_ee_delta_pose', 'pd_ee_delta_pose_fixed",
+        ),
+        (PEG, "pd_joint_delta_pos", "move the tool by steps"),
+        (
+            "ManiFeel-ObjectSearch-v1",
+            "pd_ee_delta_pose_fixed_gripper",
+            r"by steps, and the fingers; .* \['pd_ee_delta_pose', 'pd_e",
+        ),
+    ],
+)
+def test_controllers_that_no_demonstrator_commands_are_refused(make_env, task, control_mode, said):
+    env = make_env(task, obs_mode="none", render_backend="none", control_mode=control_mode)
+    env.reset(seed=0)
+    with pytest.raises(InvalidArgumentError, match=f"control_mode='{control_mode}': .*{said}"):
+        make_expert(task, env.unwrapped, 0)
 
 
 def test_reorientation_turns_the_peg_in_the_hand(make_env):

@@ -65,19 +65,6 @@ def test_reset_clears_the_shear_of_these_pads_alone():
     assert (locked_in[[0, 2]] > 1e-4).all()
 
 
-def test_a_reading_before_the_episode_leaves_no_shear():
-    """A reset reads the pads before the grip has settled: with the forces of the last step of the episode before."""
-    pads, fresh = model(2), model(2)
-    ball = [meshes()[0]] * 2
-    released = LOADS[:1].repeat(2, 1)
-    released[:, [0, 1, 5]] = 0.0
-    pads.observe(pressed(ball), LOADS[:1].repeat(2, 1))
-    pads.forget_readings(torch.tensor([1]))
-    seen, expected = (each.observe(pressed(ball), released)["force_field"] for each in (pads, fresh))
-    assert torch.equal(seen[1], expected[1])
-    assert (seen[0] - expected[0]).abs().max() > 1e-4
-
-
 def test_randomised_gel_sinks_otherwise_under_the_same_force():
     pads = model(8, **{"randomization.stiffness": 0.3, "randomization.friction": 0.2})
     seen = pads.observe(pressed([meshes()[0]] * 8), LOADS[:1].repeat(8, 1))

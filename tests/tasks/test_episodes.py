@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from mani_skill.sensors.camera import Camera
 
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.experts import make_expert
+from manifeel_ms3.sensors import TactileSensor
 from manifeel_ms3.tasks.checks import check_seed, checked_reset
 from manifeel_ms3.tasks.states import is_part_of
 
@@ -69,11 +72,14 @@ def test_a_list_without_a_seed_is_refused(make_env):
         make_env(obs_mode="state", render_backend="none").reset(seed=[])
 
 
-@pytest.mark.parametrize("seed", [-1, 2**32, 0.5, "0", [0, -1], [2**32], np.array([0.5])], ids=str)
+@pytest.mark.parametrize(
+    "seed", [-1, 2**32, 0.5, "0", True, [0, -1], [True], [2**32], np.array([0.5]), np.array([[1]])], ids=str
+)
 def test_what_is_no_seed_is_refused(seed):
     with pytest.raises(InvalidArgumentError, match=r"seed=.*from 0 to 2\*\*32 - 1"):
         check_seed(seed)
-    check_seed([0, 2**32 - 1])
+    for sound in (None, 5, np.int64(5), np.array(5), np.array([5, 6]), [0, 2**32 - 1]):
+        check_seed(sound)
 
 
 def test_seeds_that_are_not_one_for_each_of_several_environments_are_refused():
@@ -194,6 +200,7 @@ def test_a_state_of_other_bodies_does_not_begin_an_episode(make_env):
         (dict(actors=dict(cup=body), articulations=state["articulations"]), r"holds \['actors/cup'\]"),
         (state | dict(actors=dict(peg=torch.zeros(1, 3))), r"actors/peg .* has \(3,\) values .* and not \(13,\)"),
         (state | dict(actors=dict(peg="x")), r"actors/peg .* has no values"),
+        (state | dict(controller=dict(arm=dict(target_pose=body))), r"controller/arm/target_pose .* has \(13,\) .* not \(7,\)"),
         (dict(actors=body), r"env_states\['actors'\]=.* must be a dict"),
     ):
         with pytest.raises(InvalidArgumentError, match=said):
@@ -201,6 +208,57 @@ def test_a_state_of_other_bodies_does_not_begin_an_episode(make_env):
         assert is_part_of(state, env.unwrapped.get_state_dict())
     without_controller = dict(actors=state["actors"], articulations=state["articulations"])  # as other programs write it
     env.reset(options=dict(reset_to_env_states=dict(env_states=without_controller)))
+
+
+@pytest.mark.parametrize(
+    "mode",
+    ["pd_ee_delta_pose", "pd_joint_pos", "pd_joint_delta_pos", "pd_joint_target_delta_pos", "pd_joint_pos_fixed_gripper"],
+)
+def test_a_state_holds_the_targets_of_all_drives(make_env, mode):
+    env = make_env(obs_mode="none", render_backend="none", control_mode=mode)
+    base = env.unwrapped
+    env.reset(seed=0)
+    action = np.full(env.action_space.shape, 0.3, np.float32)
+    if mode.startswith("pd_joint_pos"):
+        action[:7] = base.agent.robot.get_qpos()[0, :7] + 0.03
+    if not mode.endswith("_fixed_gripper"):
+        action[-1] = -0.9
+    for _ in range(3):
+        env.step(action)
+    state, targets = base.get_state_dict(), base.agent.robot.get_drive_targets().clone()
+    env.reset(seed=1)
+    assert (base.agent.robot.get_drive_targets() - targets).abs().max() > 1e-3
+    base.set_state_dict(state)
+    assert base.agent.robot.get_drive_targets() == pytest.approx(targets, abs=1e-3 if "ee" in mode else 1e-6)
+    assert is_part_of(state["controller"]["gripper"], base.get_state_dict()["controller"]["gripper"])
+
+
+def test_what_the_fingers_hold_is_held_after_its_state_is_set(make_env):
+    """The grip of a hand that an action has closed comes with the state, into an environment whose hand is open."""
+    env = make_env("ManiFeel-ObjectSearch-v1", obs_mode="tacff", render_backend="none")
+    env.reset(seed=1)
+    for action in make_expert("ManiFeel-ObjectSearch-v1", env.unwrapped, 1).actions():
+        obs, *_ = env.step(action)
+        gripped = obs["sensor_data"]["tactile_right"]["force_field"][..., 0].sum().item()
+        if gripped > 15:
+            break
+    assert gripped > 15
+    state = env.unwrapped.get_state_dict()
+    obs, _ = env.reset(seed=2, options=dict(reset_to_env_states=dict(env_states=state)))
+    assert obs["sensor_data"]["tactile_right"]["force_field"][..., 0].sum().item() == pytest.approx(gripped, rel=0.1)
+
+
+def test_a_reset_observes_once(make_env, monkeypatch):
+    """Before the grip has settled, nothing is rendered and no pad is read."""
+    env = make_env(obs_mode="rgb+tacff")
+    calls = []
+    for kind in (Camera, TactileSensor):
+        capture = kind.capture
+        monkeypatch.setattr(kind, "capture", lambda *args, capture=capture: (calls.append(args[0]), capture(*args))[1])
+    for seed in (0, None):
+        calls.clear()
+        obs, _ = env.reset(seed=seed)
+        assert len(calls) == len(obs["sensor_data"]) == 2
 
 
 def test_touch_after_a_state_is_set_is_that_of_the_state(make_env):

@@ -87,7 +87,13 @@ def test_state_modes(make_env):
 
 @pytest.mark.parametrize(
     ("mode", "word"),
-    [("rgb+touch", "tacff"), ("rgb+rgb", "more than once"), ("pointcloud+rgb", "cannot be joined"), ("", "unknown")],
+    [
+        ("rgb+touch", "tacff"),
+        ("rgb+rgb", "more than once"),
+        ("pointcloud+rgb", "cannot be joined"),
+        ("", "unknown"),
+        ("state+state_dict", "two forms"),
+    ],
 )
 def test_bad_obs_modes_name_what_is_known(mode, word):
     with pytest.raises(ValueError, match=word):

@@ -234,6 +234,14 @@ def test_a_control_mode_that_cannot_be_steered_is_refused():
         steerable_axes("pd_joint_pos")
 
 
+def test_an_axis_that_is_locked_cannot_be_pushed():
+    operator = Operator(steerable_axes("pd_ee_delta_pose_fixed_roll_pitch"))
+    assert operator.axes == ("x", "y", "z", None, None, "yaw", "gripper")
+    for axis in ("x", "roll", "yaw"):
+        operator.push(axis, 1.0)
+    assert operator.action().tolist() == [0.5, 0.0, 0.0, 0.0, 0.0, 0.5, 1.0]
+
+
 @pytest.mark.parametrize("seed", [-1, 100_000])
 def test_seeds_that_are_not_for_demonstrations_are_refused(seed, make_env, tmp_path):
     env = make_env(**KWARGS)

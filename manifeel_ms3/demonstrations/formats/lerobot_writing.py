@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, JOINT_ACTION_AXES
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.files import write_json
@@ -110,7 +110,7 @@ class _Features:
 
     def __init__(self, header: dict[str, Any], videos: bool):
         modes = {episode.get("control_mode") for episode in header["episodes"]}
-        self._action_axes = ACTION_AXES.get(str(modes.pop())) if len(modes) == 1 else None
+        self._action_axes = (ACTION_AXES | JOINT_ACTION_AXES).get(str(modes.pop())) if len(modes) == 1 else None
         self._videos = videos
         self.fps = _control_freq(header)
         """Frames per second."""

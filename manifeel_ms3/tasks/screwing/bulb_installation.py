@@ -69,7 +69,7 @@ class BulbInstallationEnv(ScrewingEnv):
     The gripper starts 120 mm above the table, its wrist turned back by 200 degrees; the bulb's place in it is fixed.
 
     **Success Conditions:** held for 0.5 s
-    - the cap is within 0.5 mm of the holder's contact
+    - the cap is within 0.5 mm of the holder's contact, and the bulb within 2 mm of the holder's axis
     - the hand tightens it with more than 0.1 N m
 
     **Fail Conditions:** the bulb is out of the hand (50 mm) and off the holder.
