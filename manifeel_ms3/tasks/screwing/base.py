@@ -127,8 +127,8 @@ class ScrewingEnv(VisuotactileEnv):
         return (away > LOST) & (measures["offset"] > OFF_AXIS)
 
     def shortcomings(self, measures):
-        above = measures["descent"] <= 0.0
-        return {"threads not engaged": above, "engaged, not tight": ~above}
+        beside, above = measures["offset"] > OFF_AXIS, measures["descent"] <= 0.0
+        return {"beside the axis": beside, "threads not engaged": above, "engaged, not tight": ~above}
 
     def _privileged_state(self):
         return dict(held_pose=self.held.pose.raw_pose, fixed_pose=self.fixed.pose.raw_pose)
