@@ -139,6 +139,15 @@ def test_the_device_that_is_tried_is_the_one_that_maniskill_would_render_on(monk
     assert tried == [device]
 
 
+def test_the_cpu_renders_where_maniskills_tools_ask_for_a_gpu_and_there_is_none(monkeypatch, caplog):
+    monkeypatch.setattr(backend, "_works", lambda name: name == "cpu")
+    for name, value in (("_renders_in", None), ("_renders_on", None)):
+        monkeypatch.setattr(backend, name, value)
+    asked = ("gpu", "sapien_cuda", "gpu:1", "pci:01:00")
+    assert [backend.available_render_backend(name) for name in asked] == ["cpu", "cpu", "none", "none"]
+    assert caplog.text.count("there is no such device; the CPU renders in its place") == 2
+
+
 @needs_renderer
 def test_a_renderer_does_not_come_along_with_a_fork(make_env):
     make_env(obs_mode="rgb").reset(seed=0)

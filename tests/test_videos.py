@@ -11,7 +11,9 @@ from PIL import Image
 from manifeel_ms3 import cli
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.tasks.registry import task_spec
+from manifeel_ms3.videos import __main__ as film
 from manifeel_ms3.videos import layout
 from manifeel_ms3.videos.__main__ import read_source
 from manifeel_ms3.videos.shots import Shot, Take, shown_steps
@@ -164,3 +166,15 @@ def test_a_result_names_the_seed_and_the_length_of_an_episode(tmp_path):
     assert (source.seed, source.length) == (episodes[-1]["seed"], episodes[-1]["episode_len"])
     with pytest.raises(InvalidArgumentError, match="has the episodes 0 to"):
         read_source(path, len(episodes))
+
+
+def test_a_result_is_shown_with_the_checkpoint_that_was_evaluated(tmp_path):
+    path = copy_of_result(tmp_path, task_spec(PEG).revision)
+    step = json.loads(path.read_text())["config"]["step"]
+    later = tmp_path / "checkpoints" / f"{step + 1:08d}"
+    later.mkdir(parents=True)
+    (later / "config.json").write_text(json.dumps(dict(policy_name="diffusion_policy", step=step + 1)))
+    (later.parent / "last").symlink_to(later.name)
+    said = f"is of step {step}, whose checkpoint is not in"
+    with pytest.raises(CheckpointError, match=said):
+        film.main(film.Args((path,), tmp_path / "video.mp4"))

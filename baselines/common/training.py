@@ -90,9 +90,10 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
                 f"{run_dir} has the checkpoints of an earlier run; continue it with --resume, replace it with --overwrite, or "
                 "give another --run-dir"
             )
+        trainer = Trainer(replace(args, exp_name=exp_name, run_dir=run_dir), policy_class, processes)
         if processes.first:
             log.info("the run is in %s", run_dir)
-        return Trainer(replace(args, exp_name=exp_name, run_dir=run_dir), policy_class, processes).run()
+        return trainer.run()
 
 
 class Trainer:
@@ -118,7 +119,6 @@ class Trainer:
         self.device = processes.device
         keep_freed_memory(self.device)
         seed_everything(args.seed)
-
         spec = spec_of(vars(args))
         env_kwargs, mode = learnable_task(args, policy_class)
         episodes = read_episodes(args.demos, args.env_id, spec, args.num_demos)

@@ -12,8 +12,8 @@ CENSUS = """
 
 Counts over all episodes of the last checkpoint of every training seed. "Lost" means that the episode could no longer succeed,
 for example because a part was dropped; the other endings say what was missing at the time limit. "Pressed too hard" counts
-the unsuccessful episodes whose largest contact force was above the task's limit for gentle success. In screwing, results without
-"beside the axis" are older: a part beside the axis is among the others there, according to its height.
+the unsuccessful episodes whose largest contact force was above the task's limit for gentle success. In screwing, results
+without "beside the axis" are older: a part beside the axis is among the others there, according to its height.
 
 """
 Results = list[dict[str, Any]]

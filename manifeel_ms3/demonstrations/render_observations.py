@@ -166,7 +166,8 @@ def _env_kwargs(args: Args, source: dict[str, Any]) -> dict[str, Any]:
     recorded = source["env_info"]["env_kwargs"]
     if args.image_size is not None:
         asked["sensor_configs"] = _resized(recorded.get("sensor_configs") or {}, args.image_size, args.cameras)
-    return recorded | sensing | asked
+    without_renderer = "render_backend" if recorded.get("render_backend") == "none" else None
+    return {name: value for name, value in recorded.items() if name != without_renderer} | sensing | asked
 
 
 def _resized(configs: Any, size: int, cameras: tuple[str, ...]) -> dict[str, Any]:

@@ -136,7 +136,7 @@ def _recorded(path: Path, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str
 
 
 def main(args: Args) -> int:
-    """Replay, and return 1 if an episode fails, else 0.
+    """Replay, and return 1 if an episode neither succeeds nor ends as it was recorded, else 0.
 
     Raises:
         InvalidArgumentError: The number of episodes is less than 1.
@@ -145,9 +145,9 @@ def main(args: Args) -> int:
     """
     require_positive(num_demos=args.num)
     results = replay(args.path, args.num)
-    failures = [result.seed for result in results if not result.success]
-    worst = max((result.deviation for result in results), default=0.0)
-    log.info("%d of %d episodes succeed again; %s", len(results) - len(failures), len(results), _comparison(worst))
+    failures = [result.seed for result in results if not result.success and result.deviation > 0]
+    worst, successes = max((result.deviation for result in results), default=0.0), sum(result.success for result in results)
+    log.info("%d of %d episodes succeed again; %s", successes, len(results), _comparison(worst))
     if failures:
         log.error("seeds that failed: %s", failures)
     return int(bool(failures))

@@ -92,7 +92,11 @@ def _replay_problems(path: Path, num: int) -> list[str]:
     except (ManifeelError, OSError) as error:
         return [str(error)]
     moved = [replayed for replayed in replays if replayed.deviation > 0]
-    return [f"seed {other.seed} does not come out as recorded (off by {other.deviation})" for other in moved]
+    return [
+        f"seed {other.seed} does not come out as recorded (off by {other.deviation:.1e}); this is a fault if the file was "
+        "recorded on this processor and with these versions, and may be rounding otherwise"
+        for other in moved
+    ]
 
 
 def _manifest_problems(found: dict[str, Any], entry: dict[str, Any]) -> list[str]:
@@ -142,7 +146,7 @@ def main(args: Args) -> int:
 def next_step(args: Args, wrong: int) -> str:
     """What the command found, and what one can do next."""
     if wrong:
-        return f"{args.path} is not in order; get it again from its source, or record it again with `manifeel record`"
+        return f"mend {args.path}: get it again from its source, or record it again with `manifeel record`"
     return f"{args.path} is in order; `manifeel summary FILE` describes a file, `manifeel train` trains a policy on it"
 
 

@@ -123,23 +123,27 @@ def randomization_of(result: dict[str, Any]) -> dict[str, tuple[float, float]]:
     return {name: (getattr(used, name), getattr(default, name)) for name in default.__dataclass_fields__}
 
 
-def evaluated_checkpoint(run_dir: Path, result: dict[str, Any]) -> Path:
-    """The checkpoint of a run that has the step of a result; training may have gone on to another one since.
+def evaluated_checkpoint(path: Path, result: dict[str, Any]) -> Path:
+    """The checkpoint, among those beside a result, that the result is of; training may have gone on to another one since.
+
+    Args:
+        path: Path of the result file.
+        result: Its content.
 
     Raises:
         CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted or is of another
             training.
     """
-    last, step = run_dir / CHECKPOINTS / LAST_LINK, result["config"].get("step")
+    last, step = path.parent / CHECKPOINTS / LAST_LINK, result["config"].get("step")
     found = last if checkpoint_config(last).get("step") == step else last.with_name(str(step).zfill(8))
     if not found.is_dir():
         raise CheckpointError(
-            f"{run_dir / EVALUATION} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
+            f"{path} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
             f"another one with `manifeel eval --checkpoint {last}`"
         )
     if not is_of_config(result, checkpoint_config(found), but=(INFERENCE_STEPS,)):
         raise CheckpointError(
-            f"{run_dir / EVALUATION} is of another training than {found}; evaluate it with `manifeel eval --checkpoint {found}`"
+            f"{path} is of another training than {found}; evaluate it with `manifeel eval --checkpoint {found}`"
         )
     return found
 
@@ -152,10 +156,10 @@ def main(args: Args) -> Path:
         CheckpointError: The checkpoint of the evaluation is missing or broken.
         MachineError: This machine does not have the device of the evaluation.
     """
-    result = read_result(args.run_dir / EVALUATION)
+    result = read_result(evaluation := args.run_dir / EVALUATION)
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
-    policy = PolicySource(evaluated_checkpoint(args.run_dir, result)).as_in(result).make()
+    policy = PolicySource(evaluated_checkpoint(evaluation, result)).as_in(result).make()
     outcome, frames = record_episode(result["env_id"], result["env_kwargs"], policy, seed)
     rows, strip = image_strip(frames)
     page = jinja2.Template(TEMPLATE.read_text(), autoescape=True).render(

@@ -2,12 +2,14 @@
 
 import functools
 import gc
+import logging
 import os
 
 import sapien
 import torch
 from mani_skill.envs.utils.system.backend import render_backend_name_mapping
 
+log = logging.getLogger(__name__)
 NO_RENDERER = (
     "no Vulkan renderer was found, and {wanted} needs one. Without a GPU, install Mesa 24.3 or newer (Debian 12: "
     "`apt install -t bookworm-backports mesa-vulkan-drivers` and `apt install libvulkan1 libegl1 libgl1`; Ubuntu 24.04: "
@@ -32,7 +34,8 @@ _renders_on: str | None = None
 def available_render_backend(asked: str = "auto") -> str:
     """The `render_backend` to use: "gpu", "cpu", "none", or what is asked for.
 
-    A process that was forked from one with a renderer has none.
+    A process that was forked from one with a renderer has none. Where there is no GPU, the CPU renders in its place, with a
+    warning, as in ManiSkill, whose tools ask for one.
 
     Args:
         asked: A name of ManiSkill's, such as "gpu", "cuda:1" or "cpu"; "none", or "auto" for the one that this process uses
@@ -43,7 +46,10 @@ def available_render_backend(asked: str = "auto") -> str:
         return "none"
     backend = (_renders_on or _first_that_works()) if asked == "auto" else asked
     if backend == "none" or not _works(backend):
-        return "none"
+        if backend == "none" or _device_of(backend) != "cuda" or not _works("cpu"):
+            return "none"
+        log.warning("render_backend=%r: there is no such device; the CPU renders in its place", asked)
+        backend = "cpu"
     _renders_in, _renders_on = os.getpid(), backend
     _keep_inherited_objects_after_fork()
     return backend
@@ -87,10 +93,14 @@ def _first_that_works() -> str:
 @functools.cache
 def _works(backend: str) -> bool:
     """Whether SAPIEN can render in this process on the device that ManiSkill calls `backend`, such as "gpu" or "cuda:1"."""
-    name, *address = backend.split(":")
-    kind = render_backend_name_mapping.get(name, name).removeprefix("sapien_")
     try:
-        sapien.render.RenderSystem(sapien.Device(":".join([kind, *address])))
+        sapien.render.RenderSystem(sapien.Device(_device_of(backend)))
         return True
     except RuntimeError:
         return False
+
+
+def _device_of(backend: str) -> str:
+    """SAPIEN's name of the device that ManiSkill calls `backend`, such as "cuda" for "gpu"."""
+    name, *address = backend.split(":")
+    return ":".join([render_backend_name_mapping.get(name, name).removeprefix("sapien_"), *address])

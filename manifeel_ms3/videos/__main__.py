@@ -8,7 +8,7 @@ pad; arrows are shear) and the contact force over time, under the names of task,
     manifeel film peg.h5 nut.h5 --max-frames 40 --width 720 --out both.webp
 
 The episode of a trajectory file is replayed from its actions, and every image is rendered anew, so that the file needs no
-observations. A result holds no actions: they are those that its policy takes again, from `checkpoints/last` beside the
+observations. A result holds no actions: they are those that its policy takes again, from its checkpoint beside the
 result if no other is given.
 """
 
@@ -29,6 +29,7 @@ from manifeel_ms3.demonstrations.formats.folder_checks import require_revision
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Policy, PolicySource
+from manifeel_ms3.evaluation.report import evaluated_checkpoint
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.evaluation.video import act_again, replayed
 from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
@@ -64,7 +65,7 @@ class Args:
     width: int | None = None
     """Width of the video, in pixels; 1048 if not given."""
     checkpoint: Path | None = None
-    """Checkpoint folder of the policy of a result; checkpoints/last beside the result if not given."""
+    """Checkpoint folder of the policy of a result; that of its step, in checkpoints beside the result, if not given."""
     policy: str | None = None
     """Policy of a result, if it is not a checkpoint: a class ("module:Class"), or the address of a server."""
     policy_kwargs: str = "{}"
@@ -217,12 +218,13 @@ def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:
     """The policy of a result."""
     if args.policy is not None:
         return PolicySource(policy=args.policy, kwargs=args.policy_kwargs).make()
-    checkpoint = args.checkpoint or path.parent / CHECKPOINTS / LAST_LINK
-    if not checkpoint.is_dir():
+    expected = args.checkpoint or path.parent / CHECKPOINTS / LAST_LINK
+    if not expected.is_dir():
         raise InvalidArgumentError(
-            f"{path} holds no actions, and there is no policy in {checkpoint} that could act again; give its "
+            f"{path} holds no actions, and there is no policy in {expected} that could act again; give its "
             "--checkpoint or --policy"
         )
+    checkpoint = args.checkpoint or evaluated_checkpoint(path, result)
     return PolicySource(checkpoint, kwargs=args.policy_kwargs).as_in(result).make()
 
 

@@ -314,5 +314,5 @@ def test_formats_are_told_apart_by_what_lies_there(tmp_path):
         assert known.name == kind
         assert known.count(tmp_path / kind) == 2
         assert len(list(known.read(tmp_path / kind, KEYS))) == 2
-    with pytest.raises(DemonstrationError, match=r"no known format; known are \['lerobot', 'zarr', 'maniskill'\]"):
+    with pytest.raises(DemonstrationError, match=r"is a folder, but no LeRobot dataset or zarr store; give one"):
         format_of(tmp_path)

@@ -21,4 +21,6 @@ def format_of(path: Path) -> DemonstrationFormat:
     for known in FORMATS:
         if known.matches(path):
             return known
-    raise DemonstrationError(f"{path} is a folder of no known format; known are {[known.name for known in FORMATS]}")
+    raise DemonstrationError(
+        f"{path} is a folder, but no LeRobot dataset or zarr store; give one, or a trajectory file, which ends in .h5"
+    )

@@ -66,11 +66,11 @@ def read_header(path: Path) -> dict[str, Any]:
         DemonstrationError: The file or its json is missing, or the json is broken.
     """
     path = Path(path)
-    beside = path.with_suffix(".json")
     if path.is_dir():
         raise DemonstrationError(f"{path} is a folder; give a trajectory file, which ends in .h5")
     if not path.is_file():
         raise DemonstrationError(f"demonstration file {path} does not exist; record one with `manifeel record`")
+    beside = path.with_suffix(".json")
     if not beside.is_file():
         raise DemonstrationError(f"{path} lacks its json: {beside} does not exist; copy both files of a recording together")
     try:
