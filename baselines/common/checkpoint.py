@@ -48,14 +48,13 @@ def save_in_half_precision(checkpoint: Path, folder: Path) -> None:
         folder: Folder of the copy, which must not exist.
 
     Raises:
-        CheckpointError: The checkpoint is broken.
+        CheckpointError: The checkpoint is missing or broken.
         FileWriteError: The copy cannot be written.
     """
-    weights = read_tensors(checkpoint / WEIGHTS)
+    config, weights = published_config(checkpoint_config(checkpoint)), read_tensors(checkpoint / WEIGHTS)
     rounded = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in weights.items()}
     with atomic_folder(folder) as partial:
         write_tensors(partial / WEIGHTS, rounded)
-        config = published_config(checkpoint_config(checkpoint))
         (partial / CONFIG).write_text(json.dumps(config, indent=2), encoding="utf-8")
 
 

@@ -86,6 +86,10 @@ def find_entry(name: str) -> Entry:
             "`pip install -e .`"
         )
     known = {path.parents[2].relative_to(board).as_posix(): path for path in sorted(board.glob(f"*/**/{CHECKPOINTS}/*"))}
+    if not known:
+        raise UnknownNameError(
+            f"{board.resolve()} has no entries with checkpoints; run the command in a copy of the repository"
+        )
     if name not in known:
         raise UnknownNameError(f"no entry {name!r} with a checkpoint is in {board}; choose from {list(known)}")
     checkpoint = known[name]

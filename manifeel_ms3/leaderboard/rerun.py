@@ -93,7 +93,9 @@ def checkpoints_in(folders: Iterable[Path]) -> dict[str, Path]:
     for folder in folders:
         here = [folder] if (folder / CONFIG).is_file() else sorted(path.parent for path in visible_files(folder, WEIGHTS))
         if not here:
-            raise InvalidArgumentError(f"--checkpoint {folder} is no checkpoint and holds none; give runs/x/checkpoints")
+            raise InvalidArgumentError(
+                f"--checkpoint {folder} is no checkpoint and holds none; give a folder with {CONFIG} and {WEIGHTS}"
+            )
         found.update({published_hash(checkpoint): checkpoint for checkpoint in here})
     return found
 
