@@ -47,10 +47,8 @@ def check_arguments(arguments: list[str]) -> None:
     if preset in spec.presets:
         return
     choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
-    raise InvalidArgumentError(
-        f"`manifeel train {policy}` needs the name of a preset before its flags; choose from {choices}"
-        f"{meant(preset, spec.presets)}"
-    )
+    wrong = f"has no preset {preset!r}" if preset.strip("_") == preset != "" else "needs the name of a preset before its flags"
+    raise InvalidArgumentError(f"`manifeel train {policy}` {wrong}; choose from {choices}{meant(preset, spec.presets)}")
 
 
 def main(args: TrainArgs) -> Path:

@@ -1,6 +1,6 @@
-"""Draws the curve of docs/from_maniskill.md: run `python -m docs.make_ppo_curve runs/ppo/log.jsonl` after `examples/ppo.py`."""
+"""Draws the curve of docs/from_maniskill.md, or that of another run of `examples/ppo.py`: `python -m docs.make_ppo_curve
+runs/ppo/log.jsonl`."""
 
-import shutil
 from pathlib import Path
 
 import matplotlib
@@ -15,7 +15,7 @@ IMAGES = Path(__file__).parent / "images"
 
 
 def main(log: tyro.conf.Positional[Path] = IMAGES / "ppo.jsonl") -> Path:
-    """Draw return and success over steps, keep the log beside the picture, and return the picture.
+    """Draw return and success over steps into a picture beside the log, and return its path.
 
     Args:
         log: Log of a run of the example.
@@ -29,12 +29,10 @@ def main(log: tyro.conf.Positional[Path] = IMAGES / "ppo.jsonl") -> Path:
     bottom.set(ylabel="success, %", ylim=(-5, 105), xlabel="environment steps")
     for ax in (top, bottom):
         ax.grid(alpha=0.3)
-    out = IMAGES / "ppo.png"
+    out = log.with_name("ppo.png")
     fig.savefig(out, dpi=100)
-    if log.resolve() != (IMAGES / "ppo.jsonl").resolve():
-        shutil.copy(log, IMAGES / "ppo.jsonl")
     return out
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    print(tyro.cli(main))  # noqa: T201

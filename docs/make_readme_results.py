@@ -36,8 +36,8 @@ ROWS = {
 }
 """First cells of the rows, in the order of the table."""
 TEXT = """
-**What touch adds, in numbers:** success rates of Diffusion Policy with small networks. Each task has, of the presets `cpu`,
-`cpu_long` and `cpu_targets`, the last of those with which all sensings were run with most training seeds. Each policy was
+**What touch adds, in numbers:** success rates of Diffusion Policy with small networks. Each row has one preset: of those with
+which all three sensings were run with most training seeds, the last of `cpu`, `cpu_long` and `cpu_targets`. Each policy was
 trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the paper's number of demonstrations, and evaluated on
 {episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds;
 rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are

@@ -56,8 +56,9 @@ class DiffusionPolicyDataset(Dataset):
     """Windows of a recording: `OBS_HORIZON` observations and `PRED_HORIZON` actions, padded at the ends of episodes."""
 
     def __init__(self, path: Path):
+        header = read_header(path)
         with open_trajectories(path) as file:
-            episodes = [group_of(file, entry) for entry in read_header(path)["episodes"]]
+            episodes = [group_of(file, entry) for entry in header["episodes"]]
             if not all("obs" in episode for episode in episodes):
                 raise DemonstrationError(f"{path} holds no observations; `manifeel render-observations` makes a file with them")
             self.observations = [obs_process_fn(episode["obs"]) for episode in episodes]
@@ -84,6 +85,10 @@ def maniskills_dataset(path: Path, folder: Path) -> Dataset:
         path: Trajectory file with observations.
         folder: Folder `examples/baselines/diffusion_policy` of a clone of ManiSkill, whose `train_rgbd.py` is imported.
     """
+    if not (folder / "train_rgbd.py").is_file():
+        raise SystemExit(
+            f"--maniskill {folder} has no train_rgbd.py; give examples/baselines/diffusion_policy of a clone of ManiSkill"
+        )
     sys.path.insert(0, str(folder))
     script = importlib.import_module("train_rgbd")
     recorded = read_header(path)["env_info"]

@@ -314,6 +314,8 @@ def main(args: Args) -> dict[str, float]:
     """Train or evaluate, and return the metrics of the last evaluation."""
     if args.evaluate and not args.checkpoint:
         raise SystemExit("--evaluate needs --checkpoint, the file of the weights")
+    if args.checkpoint and not Path(args.checkpoint).is_file():
+        raise SystemExit(f"--checkpoint {args.checkpoint} does not exist; give a file of weights, such as runs/ppo/ckpt_40.pt")
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     torch.set_num_threads(1)  # networks this small gain nothing from more, and lose much where other processes run
     torch.manual_seed(args.seed)

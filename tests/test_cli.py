@@ -373,3 +373,16 @@ def test_a_shell_can_complete_commands_and_flags(shell, capsys):
         "--check-only",
     ):
         assert word in said, word
+
+
+def test_a_misspelt_task_or_preset_is_named_with_the_nearest(capsys):
+    for typed, near in (("PegInsertoin", "ManiFeel-PegInsertion-v1"), ("peginsertion", "ManiFeel-PegInsertion-v1")):
+        assert cli.main(["tasks", typed]) == 1
+        assert f"did you mean '{near}'?" in capsys.readouterr().err
+    assert cli.main(["train", "diffusion_policy", "cpuu", "--demo-path", "x.h5"]) == 1
+    assert "has no preset 'cpuu'; choose from" in capsys.readouterr().err
+
+
+def test_the_command_after_training_names_the_module_of_a_task_that_was_typed_with_it():
+    typed = SimpleNamespace(env_id="lift_block:My-LiftBlock-v1")
+    assert "--env-id lift_block:My-LiftBlock-v1` evaluates it" in cli.command_module("train").next_step(typed, Path("last"))

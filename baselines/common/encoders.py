@@ -1,5 +1,6 @@
 """Observation encoders: one network per camera, tactile sensor and modality; their features are concatenated."""
 
+import logging
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,6 +13,8 @@ from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 
 from .observation import POSE, ObservationSpec, is_tactile
+
+log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -191,14 +194,18 @@ class PretrainedEncoder(nn.Module):
         raise NotImplementedError
 
 
-def load_pretrained(policy: nn.Module, weights: Path) -> None:
-    """Load weights into the pretrained part of every TacRGB encoder of a policy.
+def load_pretrained(policy: nn.Module, weights: Path | None) -> None:
+    """Load weights into the pretrained part of every TacRGB encoder of a policy; warn if it has one, and no weights are given.
 
     Raises:
         InvalidArgumentError: No encoder of the policy has a pretrained part.
         CheckpointError: The weights belong to another architecture.
     """
     encoders = [module for module in policy.modules() if isinstance(module, PretrainedEncoder)]
+    if weights is None:
+        if encoders:
+            log.warning("the TacRGB encoder begins with random weights; --tacrgb-weights gives it pretrained ones")
+        return
     if not encoders:
         raise InvalidArgumentError(
             f"tacrgb_weights={weights}: no network of this policy takes them; choose one that does, such as "

@@ -208,7 +208,7 @@ class Trainer:
         of_names = {name: averaged[weight] for name, weight in self.policy.named_parameters(remove_duplicate=False)}
         weights = self.policy.state_dict() | of_names
         state = pack(self.optimizer, self.policy, random_states) | self.order.state_dict()
-        cost = dict(trained_on=machine(), training_seconds=round(time.time() - self.begin, 1))
+        cost = dict(trained_on=machine(), training_seconds=round(time.time() - self.begin, 3))
         save_checkpoint(folder, self.config | cost | dict(step=self.step), weights, state)
         make_last(folder)
         return folder
@@ -217,7 +217,7 @@ class Trainer:
         """The policy before training, on the device."""
         policy = policy_class(self.args.policy, self.dataset.spec, self.config["action_dim"]).to(self.device)
         lay_out_channels_last(policy)
-        if self.args.tacrgb_weights and not self.args.resume:
+        if not self.args.resume:
             load_pretrained(policy, self.args.tacrgb_weights)
         policy.fit_normalizers(self.dataset.observations, self.dataset.actions_to_fit)
         if self.args.compile:

@@ -19,8 +19,6 @@ from mani_skill.agents.controllers import (
     PDEEPoseControllerConfig,
     PDJointPosController,
     PDJointPosControllerConfig,
-    PDJointPosMimicController,
-    PDJointPosMimicControllerConfig,
 )
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.utils import common
@@ -176,40 +174,7 @@ class LimitedLeadEEPoseControllerConfig(PDEEPoseControllerConfig):
         self.pos_lower, self.rot_lower = -self.pos_upper, -self.rot_upper
 
 
-class RestorableJointController(PDJointPosController):
-    """Position control of joints whose state holds the targets of the drives, and with them the forces that these exert.
-
-    ManiSkill's own controllers keep no target, or, with `use_target`, set it without the drives.
-    """
-
-    def get_state(self) -> dict:
-        return {"target_qpos": self.articulation.get_drive_targets()[:, self.active_joint_indices]}
-
-    def set_state(self, state: dict):
-        if state:  # empty in files that hold no targets of these joints
-            self._target_qpos = common.to_tensor(state["target_qpos"], device=self.device).reshape(-1, len(self.joints)).clone()
-            self.set_drive_targets(self._target_qpos)
-
-
-@dataclass
-class RestorableJointControllerConfig(PDJointPosControllerConfig):
-    """Configuration of `RestorableJointController`."""
-
-    controller_cls = RestorableJointController
-
-
-class GripperController(RestorableJointController, PDJointPosMimicController):
-    """A gripper whose second finger moves as the first one, which an action opens and closes."""
-
-
-@dataclass
-class GripperControllerConfig(PDJointPosMimicControllerConfig):
-    """Configuration of `GripperController`."""
-
-    controller_cls = GripperController
-
-
-class HoldGripperController(RestorableJointController):
+class HoldGripperController(PDJointPosController):
     """A gripper without an action, which keeps the grip that the robot was reset with.
 
     The fingers stay position controlled, so that a sideways push on the held object meets their stiffness.
@@ -226,7 +191,7 @@ class HoldGripperController(RestorableJointController):
 
 
 @dataclass
-class HoldGripperControllerConfig(RestorableJointControllerConfig):
+class HoldGripperControllerConfig(PDJointPosControllerConfig):
     """Configuration of `HoldGripperController`."""
 
     normalize_action: bool = False

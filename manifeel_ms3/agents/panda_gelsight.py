@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
 # (ManiSkill builds controller configurations from dicts of mixed types, and annotates a combined controller by its base class)
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any, ClassVar
 
@@ -9,10 +10,16 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.agents.base_agent import BaseAgent, Keyframe
-from mani_skill.agents.controllers import deepcopy_dict
+from mani_skill.agents.controllers import (
+    PDJointPosController,
+    PDJointPosControllerConfig,
+    PDJointPosMimicControllerConfig,
+    deepcopy_dict,
+)
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.agents.registration import register_agent
 from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import common
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
 from mani_skill.utils.structs import Actor, Pose
 
@@ -22,14 +29,7 @@ from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE
 from manifeel_ms3.rendering.shader_pack import camera_shader
 from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 
-from .controllers import (
-    GripperControllerConfig,
-    HoldGripperControllerConfig,
-    LimitedLeadEEPoseController,
-    LimitedLeadEEPoseControllerConfig,
-    RestorableJointControllerConfig,
-    solve_ik,
-)
+from .controllers import HoldGripperControllerConfig, LimitedLeadEEPoseController, LimitedLeadEEPoseControllerConfig, solve_ik
 from .fingers import Finger
 from .panda_gelsight_urdf import panda_gelsight_urdf
 
@@ -168,6 +168,36 @@ class PandaGelSight(BaseAgent):
             raise InvalidArgumentError(f"the action holds NaN: {given.tolist()}; give finite numbers")
         self.controller.set_action(action)
 
+    def get_controller_state(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Targets of arm and gripper, (N, ...) each; where joints are controlled, those of the drives, which exert the forces.
+
+        ManiSkill's own controllers of joints keep no target, or, with `use_target`, set it without the drives.
+        """
+        drives = self.robot.get_drive_targets()
+        joints = {name: dict(target_qpos=drives[:, part.active_joint_indices]) for name, part in self._joint_parts.items()}
+        poses = {name: part.get_state() for name, part in self._parts.items() if name not in joints}
+        return poses | joints
+
+    def set_controller_state(self, state: Mapping[str, Mapping[str, Any]]) -> None:
+        """Set the targets that a state holds; it may lack some, or hold those of another control mode."""
+        for name, part in self._parts.items():
+            if name not in self._joint_parts:
+                part.set_state(state.get(name))
+            elif given := state.get(name):  # empty in files that hold no targets of these joints
+                targets = common.to_tensor(given["target_qpos"], device=self.device).reshape(-1, len(part.joints))
+                part._target_qpos = targets.clone()
+                part.set_drive_targets(targets)
+
+    @property
+    def _parts(self) -> dict[str, Any]:
+        """Controllers of arm and gripper by name."""
+        return self.controller.controllers
+
+    @property
+    def _joint_parts(self) -> dict[str, PDJointPosController]:
+        """Those of them that control joints, and not the pose of the tool."""
+        return {name: part for name, part in self._parts.items() if not isinstance(part, LimitedLeadEEPoseController)}
+
     @property
     def _controller_configs(self):
         drive = dict(
@@ -190,9 +220,9 @@ class PandaGelSight(BaseAgent):
         arms = dict(  # each of these exists also with a gripper that keeps its grip
             pd_ee_delta_pose=delta_pose,
             pd_ee_pose=absolute_pose,
-            pd_joint_pos=RestorableJointControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
-            pd_joint_delta_pos=RestorableJointControllerConfig(**joint_delta),
-            pd_joint_target_delta_pos=RestorableJointControllerConfig(**joint_delta, use_target=True),
+            pd_joint_pos=PDJointPosControllerConfig(**drive, lower=None, upper=None, normalize_action=False),
+            pd_joint_delta_pos=PDJointPosControllerConfig(**joint_delta),
+            pd_joint_target_delta_pos=PDJointPosControllerConfig(**joint_delta, use_target=True),
         )
         gripper, hold = self._gripper_configs
         return deepcopy_dict(
@@ -205,7 +235,7 @@ class PandaGelSight(BaseAgent):
     @property
     def _gripper_configs(self):
         """The gripper that an action opens and closes, and the one that keeps its grip."""
-        gripper = GripperControllerConfig(
+        gripper = PDJointPosMimicControllerConfig(
             self.gripper_joint_names,
             lower=FINGER_RANGE[0],
             upper=FINGER_RANGE[1],

@@ -118,6 +118,10 @@ def main(args: Hash | Submit | Build) -> Path:
 
 
 def _build(args: Build) -> Path:
+    if not args.board.is_dir():
+        raise InvalidArgumentError(
+            f"--board {args.board} is no folder; give that of a leaderboard, such as `leaderboard` in a copy of the repository"
+        )
     rows = rows_on(args.board)
     path = write_page(rows, args.board)
     log.info("%s, of %d submissions", path, len({row.submission.folder for row in rows}))

@@ -130,7 +130,7 @@ def task_sensor(
         UnknownNameError: A sensor, field or imperfection is unknown; the message lists the known ones.
         InvalidArgumentError: A value is not allowed.
     """
-    if own := {"uid", "link", "pad_pose"} & set(options or {}):
+    if own := {"uid", "link"} & set(options or {}):
         raise InvalidArgumentError(f"tactile options {sorted(own)} are set by the robot; leave them out")
     config = with_options(sensor_config(name, uid, link), options or {})
     if "optics.calibration" in (options or {}) and config.optics.lights is not None:

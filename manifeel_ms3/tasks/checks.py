@@ -136,9 +136,8 @@ def check_seed(seed: Any) -> None:
     Raises:
         InvalidArgumentError: A seed is not a whole number from 0 to 2**32 - 1.
     """
-    seeds = np.atleast_1d(seed) if isinstance(seed, list | tuple | np.ndarray) else [seed]
-    are_whole = all(isinstance(one, int | np.integer) and not isinstance(one, bool) for one in seeds)
-    are_sound = len(seeds) > 0 and are_whole and all(0 <= one < 2**32 for one in seeds)
+    seeds = seed if isinstance(seed, list | tuple) else np.atleast_1d(seed) if isinstance(seed, np.ndarray) else [seed]
+    are_sound = len(seeds) > 0 and all(isinstance(one, int | np.integer) and 0 <= one < 2**32 for one in seeds)
     if seed is not None and not are_sound:
         raise InvalidArgumentError(
             f"seed={seed!r} must be a whole number from 0 to 2**32 - 1, or one such number for each environment"

@@ -21,7 +21,7 @@ import gymnasium as gym
 from mani_skill.utils.registration import register_env
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.arguments import is_number
+from manifeel_ms3.arguments import is_number, meant
 from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, PluginError, UnknownNameError
 
 log = logging.getLogger(__name__)
@@ -266,7 +266,8 @@ def full_id(name: str) -> str:
 
 def _known(env_id: str) -> TaskSpec:
     if env_id not in _SPECS:
-        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{_left_out()}")
+        near = meant(env_id if env_id.startswith(PREFIX) else full_id(env_id), _SPECS)
+        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{_left_out()}{near}")
     return _SPECS[env_id]
 
 

@@ -104,7 +104,7 @@ def _record(session: Session, page: "Page", args: Args, out: Path) -> None:
     try:
         session.run(page)
     except KeyboardInterrupt:
-        log.info("ended; what was saved is in %s", out)
+        log.info("ended; %s", f"what was saved is in {out}" if session.num_saved else "nothing was saved")
 
 
 def _require_images(env: gym.Env, obs_mode: str) -> None:

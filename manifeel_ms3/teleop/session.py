@@ -80,11 +80,16 @@ class Session:
         while self.operator.mode is not Mode.CLOSED:
             require_demonstration_seeds(self._seed, 1, f"the next episode would have the seed {self._seed}; ")
             self.operator.begin()
-            screen.set_message(f"seed {self._seed}, {len(self._recording.infos)} saved")
+            screen.set_message(f"seed {self._seed}, {self.num_saved} saved")
             episode = run_episode(self.env, self._seed, self._actions, screen.show)
             command = self._decision(screen, episode)
             if command is not EpisodeCommand.RETRY:
                 self._seed += 1
+
+    @property
+    def num_saved(self) -> int:
+        """Number of episodes in the file."""
+        return len(self._recording.infos)
 
     def finish(self) -> None:
         """Turn the saved episodes into one file, and let others record into it."""

@@ -271,3 +271,9 @@ def test_the_page_needs_nothing_else(board):
     page = (board / "index.html").read_text()
     assert not re.search(r'<(script|link|img)[^>]+(src|href)="https?:', page)
     assert "Alpha &lt;b&gt;" in page
+
+
+def test_no_leaderboard_is_built_where_there_is_none(tmp_path):
+    with pytest.raises(InvalidArgumentError, match="is no folder; give that of a leaderboard"):
+        main(Build(tmp_path / "leaderboard"))
+    assert not list(tmp_path.iterdir())

@@ -147,7 +147,7 @@ def test_imperfections_take_a_number_or_a_range_of_known_names():
         task_sensor("digit", "a", "b", None, {"crosstalk": "much"})
 
 
-@pytest.mark.parametrize("name", ["uid", "link", "pad_pose"])
+@pytest.mark.parametrize("name", ["uid", "link"])
 def test_what_the_robot_sets_is_no_option(name):
     with pytest.raises(InvalidArgumentError, match=rf"tactile options \['{name}'\] are set by the robot; leave them out"):
         task_sensor("digit", "a", "b", {name: "c"}, None)

@@ -72,9 +72,7 @@ def test_a_list_without_a_seed_is_refused(make_env):
         make_env(obs_mode="state", render_backend="none").reset(seed=[])
 
 
-@pytest.mark.parametrize(
-    "seed", [-1, 2**32, 0.5, "0", True, [0, -1], [True], [2**32], np.array([0.5]), np.array([[1]])], ids=str
-)
+@pytest.mark.parametrize("seed", [-1, 2**32, 0.5, "0", [0, -1], [2**32], np.array([0.5]), np.array([[1]])], ids=str)
 def test_what_is_no_seed_is_refused(seed):
     with pytest.raises(InvalidArgumentError, match=r"seed=.*from 0 to 2\*\*32 - 1"):
         check_seed(seed)
