@@ -88,7 +88,7 @@ def _measure_task(env_id: str, args: Args) -> Path:
     path = floors_file(spec.env_id, args.out)
     floors, commands = _earlier(path, spec.revision)
     if floors.keys() <= set(args.policies):  # all are measured anew
-        commands = []
+        floors, commands = {}, []
     for number, name in enumerate(args.policies, start=1):
         with tempfile.TemporaryDirectory() as folder:
             result = _evaluate(name, spec.env_id, demos, Path(folder), args)

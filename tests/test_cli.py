@@ -376,9 +376,9 @@ def test_a_shell_can_complete_commands_and_flags(shell, capsys):
 
 
 def test_a_misspelt_task_or_preset_is_named_with_the_nearest(capsys):
-    for typed, near in (("PegInsertoin", "ManiFeel-PegInsertion-v1"), ("peginsertion", "ManiFeel-PegInsertion-v1")):
+    for typed in ("PegInsertoin", "peginsertion", "ManiFeel-PegInsertoin-v1"):
         assert cli.main(["tasks", typed]) == 1
-        assert f"did you mean '{near}'?" in capsys.readouterr().err
+        assert "did you mean 'PegInsertion'?" in capsys.readouterr().err
     assert cli.main(["train", "diffusion_policy", "cpuu", "--demo-path", "x.h5"]) == 1
     assert "has no preset 'cpuu'; choose from" in capsys.readouterr().err
 

@@ -247,9 +247,9 @@ class Trainer:
         for folder in (self.run_dir, self.checkpoints):
             remove_leftovers(folder)
         if self.args.overwrite:
-            for folder in filter(Path.is_dir, (self.checkpoints, self.run_dir / EVALUATIONS)):
-                remove_folder(folder)
-            (self.run_dir / EVALUATION).unlink(missing_ok=True)
+            evaluations = self.run_dir.glob(f"{Path(EVALUATION).stem}.*")  # the result, and episodes of an unfinished one
+            for path in (self.checkpoints, self.run_dir / EVALUATIONS, *evaluations):
+                remove_folder(path) if path.is_dir() else path.unlink(missing_ok=True)
         opened = RunLog(self.run_dir, self.config, self.step, wandb_run_of(self.args, str(self.config["policy_name"])))
         if self.args.resume:
             make_last(newest_checkpoint(self.checkpoints))

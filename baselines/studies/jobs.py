@@ -24,8 +24,8 @@ from manifeel_ms3.demonstrations.formats.maniskill_h5 import read_header
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.policy import PolicyError
-from manifeel_ms3.evaluation.result import ResultError, is_of_config, read_result
-from manifeel_ms3.files import FileWriteError, write_json
+from manifeel_ms3.evaluation.result import ResultError, is_of_config, published_config, read_result
+from manifeel_ms3.files import FileWriteError, remove_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.processes import process_exists
@@ -190,7 +190,9 @@ def _require_answers(path: Path) -> None:
 
 
 def _rounded(checkpoint: Path, copy: Path) -> Path:
-    """The copy of a checkpoint in half precision, which is made where it is missing."""
+    """The copy of a checkpoint in half precision, which is made where it is missing, or is that of another training."""
+    if copy.is_dir() and checkpoint_config(copy) != published_config(checkpoint_config(checkpoint)):
+        remove_folder(copy)
     return half_precision.main(tyro.cli(half_precision.Args, args=half_precision_arguments(str(checkpoint), str(copy))))
 
 

@@ -1,4 +1,4 @@
-"""Publishing a study: its results become a submission of the leaderboard, with one checkpoint of each row."""
+"""Publishing a study: its results become a submission of the leaderboard, with the checkpoints of the training seed 0."""
 
 import json
 import re

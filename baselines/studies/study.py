@@ -48,6 +48,8 @@ MOST_VALUES = 10_000
 """Largest number of values in a study's file with its aliases expanded; set once, not tuned."""
 LEAST = {"demos": 1, "num_demos": 1, "episodes": 1, "checkpoints": 1, "cpus": 0.1, "gpus": 0}
 """Smallest numbers that entries of a grid and of `resources` can have."""
+LEAST_SHARE = 0.0001
+"""Smallest share of a GPU that Ray can give to a job."""
 TABLE = "table "
 """Prefix of `tasks` if it names a table of the paper instead of listing tasks: "table I"."""
 
@@ -221,6 +223,7 @@ def _grid(entry: Any, place: str) -> Grid:
         raise StudyError(f"{place}: {error}") from error
     if unknown := set(grid.pretrain) - set(get_args(Representation)):
         raise StudyError(f"{place}: pretrain {sorted(unknown)} cannot be pretrained; choose from {get_args(Representation)}")
+    _check_encoders(grid, place)
     if too_many := [count for count in grid.num_demos if count and count > max(recorded, default=0)]:
         raise StudyError(f"{place}: num_demos {too_many} are more than the {max(recorded)} recorded; raise `demos`")
     return replace(  # with one spelling of everything, so that the same run is the same job however it is written
@@ -231,6 +234,16 @@ def _grid(entry: Any, place: str) -> Grid:
         train=train,
         encoder_flags=of_encoders,
     )
+
+
+def _check_encoders(grid: Grid, place: str) -> None:
+    """Check that what is given for encoders is given for those of the grid.
+
+    Raises:
+        StudyError: It is not.
+    """
+    if unused := (set(grid.encoder_flags) | set(grid.pretrain)) - set(grid.encoders):
+        raise StudyError(f"{place}: encoder_flags and pretrain name {sorted(unused)}; `encoders` are {list(grid.encoders)}")
 
 
 def _check_sensing(grid: Grid) -> None:
@@ -287,6 +300,8 @@ def _section(kind: type, entry: Any, place: str) -> Any:
         least = LEAST.get(name, -math.inf)
         if wrong := [x for x in numbers if name in LEAST and x is not None and not least <= x < math.inf]:
             raise StudyError(f"{place}: `{name}` is {_shown(wrong[0])}; at least {least} is needed, and not infinity")
+        if name == "gpus" and not (value == int(value) or LEAST_SHARE <= value < 1):
+            raise StudyError(f"{place}: `gpus` is {value}; give a whole number, or a share of one GPU from {LEAST_SHARE} on")
     try:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
     except TypeError as error:

@@ -62,7 +62,7 @@ is the highest success of policies that have learnt nothing, where it was measur
 paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)); older results
 lack it. "TacRGB encoder" is the network for tactile images: `fine_cnn` is the small one of the preset `cpu`, trained from
 scratch. "Settings" names the preset of the policy and what differs from it, and "id" is a hash of everything that defines the
-condition. "Cost" is the time of training, summed over the seeds, and "on" the machine, of which each job used one core. It is
+condition. "Cost" is the time of training, summed over the seeds, and "on" the machine. It is
 the time on the clock, so that a job that shared its machine with other work, or was paused, shows more than it needs.
 """
 CHART = """

@@ -266,8 +266,8 @@ def full_id(name: str) -> str:
 
 def _known(env_id: str) -> TaskSpec:
     if env_id not in _SPECS:
-        near = meant(env_id if env_id.startswith(PREFIX) else full_id(env_id), _SPECS)
-        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{_left_out()}{near}")
+        near = meant(short_name(env_id), map(short_name, _SPECS))
+        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{near}{_left_out()}")
     return _SPECS[env_id]
 
 

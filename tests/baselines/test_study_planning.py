@@ -346,6 +346,14 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
         ("grids: [{tasks: table I, policies: []}]", "`policies` is empty, so that there would be no job"),
         ("grids: [{tasks: []}]", "`tasks` is empty, so that there would be no job"),
         ("grids: [{tasks: table I}]\nresources: {train: {cpus: 0}}", "resources/train: `cpus` is 0; at least 0.1 is needed"),
+        (
+            "grids: [{tasks: table I}]\nresources: {train: {gpus: 1.5}}",
+            "`gpus` is 1.5; give a whole number, or a share of one GPU",
+        ),
+        (
+            "grids: [{tasks: table I, encoders: [t3], encoder_flags: {T3: {image-size: 224}}}]",
+            r"encoder_flags and pretrain name \['T3'\]; `encoders` are \['t3'\]",
+        ),
         ("grids: [{tasks: table I}]\nresources: {train: {gpus: .nan}}", "resources/train: `gpus` is nan; at least 0 is needed"),
         (
             "grids: [{tasks: table I}]\nresources: {record: {cpus: .inf}}",
