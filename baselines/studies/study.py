@@ -300,8 +300,8 @@ def _section(kind: type, entry: Any, place: str) -> Any:
         least = LEAST.get(name, -math.inf)
         if wrong := [x for x in numbers if name in LEAST and x is not None and not least <= x < math.inf]:
             raise StudyError(f"{place}: `{name}` is {_shown(wrong[0])}; at least {least} is needed, and not infinity")
-        if name == "gpus" and not (value == int(value) or LEAST_SHARE <= value < 1):
-            raise StudyError(f"{place}: `gpus` is {value}; give a whole number, or a share of one GPU from {LEAST_SHARE} on")
+        if odd := [x for x in numbers if name == "gpus" and not (x == int(x) or LEAST_SHARE <= x < 1)]:
+            raise StudyError(f"{place}: `gpus` is {odd[0]}; give a whole number, or a share of one GPU from {LEAST_SHARE} on")
     try:
         return kind(**{name: tuple(value) if isinstance(value, list) else value for name, value in entry.items()})
     except TypeError as error:
