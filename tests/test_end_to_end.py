@@ -74,15 +74,14 @@ def test_a_report_shows_the_checkpoint_that_was_evaluated_and_not_a_later_one(tm
         make_last(checkpoint)
         return checkpoint
 
-    first, second = trained(5), trained(10)
-    found = {step: report.evaluated_checkpoint(tmp_path / "evaluation.json", dict(config=dict(step=step))) for step in (5, 10)}
+    first, second, evaluation = trained(5), trained(10), tmp_path / "evaluation.json"
+    found = {step: report.evaluated_checkpoint(evaluation, dict(config=dict(step=step))) for step in (5, 10)}
     assert {step: checkpoint.resolve() for step, checkpoint in found.items()} == {5: first, 10: second}
     with pytest.raises(CheckpointError, match="is of step 4, whose checkpoint is not in"):
-        report.evaluated_checkpoint(tmp_path / "evaluation.json", dict(config=dict(step=4)))
+        report.evaluated_checkpoint(evaluation, dict(config=dict(step=4)))
     of_another = dict(config=dict(step=10, inference_steps=4, seed=1))
-    assert (
-        report.evaluated_checkpoint(tmp_path / "evaluation.json", of_another).resolve() == second
-    )  # the number of steps is the evaluation's
+    found = report.evaluated_checkpoint(evaluation, of_another)
+    assert found.resolve() == second  # the number of steps is the evaluation's
     (second / "config.json").write_text(json.dumps(dict(step=10, inference_steps=8, seed=0)))
     with pytest.raises(CheckpointError, match="is of another training than"):
-        report.evaluated_checkpoint(tmp_path / "evaluation.json", of_another)
+        report.evaluated_checkpoint(evaluation, of_another)
