@@ -64,8 +64,10 @@ def timed(root: Path, module: str, checkpoint: Path, args: Args, *flags: str) ->
         command += ["--episodes", str(args.episodes), "--workers", str(args.workers), *flags]
         environment = os.environ | dict(PYTHONPATH=str(root.absolute()), OMP_NUM_THREADS="1")
         before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        subprocess.run(command, cwd=root, env=environment, check=True, stderr=subprocess.DEVNULL)
+        done = subprocess.run(command, cwd=root, env=environment, stderr=subprocess.PIPE, text=True)
         seconds, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+        if done.returncode != 0:
+            raise RuntimeError(f"{' '.join(command)} ended with exit code {done.returncode}:\n{done.stderr}")
         episodes = json.loads(out.read_text())["episodes"]
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     steps = sum(episode.get("episode_len", episode.get("length")) for episode in episodes)

@@ -138,11 +138,20 @@ install_system_packages() {
   fi
 }
 
+PYTHON=
+find_python() { # the first Python for which requirements.lock names packages
+  for PYTHON in python3 python3.12 python3.11 python3.10; do
+    "$PYTHON" -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null && return
+  done
+  say "Python 3.10, 3.11 or 3.12 is needed, and python3 is $(python3 --version 2>&1 || true); install one of these (as python3.12, for example) and run this script again."
+  return 1
+}
+
 # Every package but torch, those that torch needs included, has the version and the hash of requirements.lock. torch's builds for
 # the CPU and for CUDA are different files, so that one lock with hashes cannot name both; the latter itself names the exact
 # versions of NVIDIA's packages that it needs.
 install_python_packages() {
-  [ -x .venv/bin/python ] || python3 -m venv .venv
+  [ -x .venv/bin/python ] || { find_python && "$PYTHON" -m venv .venv; }
   # nothing is compiled in advance: a module is compiled at its first import, and most modules are never imported
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
   say "Installing the packages of requirements.lock"

@@ -23,7 +23,7 @@ from manifeel_ms3.files import file_hash, read_json, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.rendering.cameras import IMAGE_SIZE
-from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.obs_modes import has_images, split_obs_mode
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
 
@@ -134,9 +134,10 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
         MachineError: The disk has too little room.
     """
     free = shutil.disk_usage(args.out).free
-    modes = args.obs_mode.split("+")
-    cameras = len(args.cameras) * ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2 * ("rgb" in modes)
-    images = cameras + len(args.tactile_sensors) * ("tacrgb" in modes)
+    own, touch = split_obs_mode(args.obs_mode)
+    textures = sum(map(has_images, own.replace("rgbd", "rgb+depth").split("+")))
+    cameras = len(args.cameras) * ((args.image_size or IMAGE_SIZE) / IMAGE_SIZE) ** 2 * textures
+    images = cameras + len(args.tactile_sensors) * ("rgb" in touch)
     share = images / (len(CAMERAS) + len(SIDES))  # all are counted as images of one size
     full = sum(count * task_spec(task).demo_megabytes * 1e6 for task, count in counts.items())
     if (needed := full * max(share, SMALLEST_SHARE)) > free:

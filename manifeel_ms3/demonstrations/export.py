@@ -1,5 +1,6 @@
 """Export demonstrations: `manifeel export peg.h5 --to lerobot --out folder`."""
 
+import logging
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,9 +20,10 @@ from manifeel_ms3.progress import progress_bar
 from .formats import FORMATS
 from .formats.demonstration_format import Progress
 from .formats.lerobot_writing import write_lerobot
-from .formats.maniskill_h5 import DemonstrationError, observation_keys, read_header, read_trajectories
+from .formats.maniskill_h5 import DemonstrationError, observation_keys, observations_beside, read_header, read_trajectories
 from .recording import train_command
 
+log = logging.getLogger(__name__)
 Format = Literal["lerobot", "zarr", "npz"]
 
 
@@ -71,6 +73,8 @@ def main(args: Args) -> Path:
     with owned(args.out):
         if args.out.exists():
             raise DemonstrationError(f"{args.out} exists already; give another --out, or delete it")
+        if left_out := observations_beside(args.file, observation_keys(args.file)):
+            log.info("a data set holds images, force fields and the pose of the tool; left out: %s", ", ".join(left_out))
         with atomic_folder(args.out) as folder, progress_bar() as bar:
             folder.rmdir()  # writers make their folder themselves
             write(args.file, folder, lambda indices: bar.track(indices, description=f"exporting {args.file.name}"))
@@ -81,7 +85,8 @@ def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     if args.to == "npz":
         return f"{made} holds one file for each episode; `numpy.load` opens them"
-    return f"{made} is a data set of the format {args.to}; {train_command(made, read_header(args.file))} trains on it"
+    train = train_command(made, read_header(args.file))
+    return f"{made} is a data set of the format {args.to}" + (f"; {train} trains on it" if train else "")
 
 
 if __name__ == "__main__":

@@ -362,25 +362,26 @@ def next_step(_args: Any, path: Path) -> str:
     rendering = as_typed("manifeel", "render-observations", path, "--out", "FILE")
     if seen["obs_mode"] == "none":
         return f"{held}; {rendering} adds observations"
-    if not _learnable(seen["obs_mode"]):
+    if not (train := train_command(path, header)):
         rendered = f"{rendering} makes a file with cameras and touch instead"
         return f"{held}; no policy is trained on the obs_mode {seen['obs_mode']}: {rendered}"
-    return f"{held}; {as_typed('manifeel', 'view', path)} shows them, {train_command(path, header)} trains a policy"
+    return f"{held}; {as_typed('manifeel', 'view', path)} shows them, {train} trains a policy"
 
 
 def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
-    """The command that trains a policy on what was recorded, in backquotes and quoted for a shell.
+    """The command that trains a policy on what was recorded, in backquotes and quoted for a shell; "" if none can be.
 
     Args:
         demonstrations: Path of the trajectory file, or of what was exported from it.
         header: The json beside the trajectory file.
     """
     seen = header["env_info"]["env_kwargs"]
+    if not (obs_mode := _learnable(seen.get("obs_mode", "none"))):
+        return ""
     with_module = header["env_info"]["env_id"]
     typed = with_module.rpartition(":")[0] in imported()  # without its module, another command would not find the task
-    held = str(seen.get("obs_mode", "none"))
     words = ["manifeel", "train", "diffusion_policy", "cpu", "--demo-path", demonstrations]
-    words += ["--env-id", with_module if typed else task_of(header), "--obs-mode", _learnable(held) or held]
+    words += ["--env-id", with_module if typed else task_of(header), "--obs-mode", obs_mode]
     if cameras := names_in(seen.get("cameras")):  # other programs name them only where they are not the task's policy camera
         words += ["--cameras", *cameras]
     pads = names_in(seen.get("tactile_sensors"))

@@ -10,6 +10,7 @@ continues where it stopped.
 With `--control-mode` the actions are also converted to another controller.
 """
 
+import hashlib
 import logging
 import sys
 from collections.abc import Callable
@@ -44,6 +45,8 @@ from .recording import Recorder, Recording, make_header, make_recorder, next_ste
 from .replay import pose_difference, without_images
 
 log = logging.getLogger(__name__)
+RECORDED = "recorded_actions_sha256"
+"""Field of an episode's json: hash of the recorded actions of which it is the replay."""
 DEVIATION = "replay_deviation"
 """Field of an episode's json, if its replay differs: largest difference of a pose from the recorded one at the same step."""
 
@@ -97,7 +100,9 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
     if args.control_mode is not None:
         source_kwargs = without_images(source["env_info"]["env_kwargs"])
     episodes = _by_seed(args.path, first_episodes(args.path, source, args.num))
+    recorded = _recorded(args.path, episodes)
     with open_recording(args.out, header, list(episodes)) as recording:
+        _require_same_actions(recording, args.path, recorded)
         left = [seed for seed in episodes if seed not in recording.infos and seed not in recording.failed]
         if recording.is_complete and not left:
             log.info("%s already holds %d episodes", args.out, len(recording.infos))
@@ -111,7 +116,7 @@ def main(args: Args, on_episode: Callable[[], None] | None = None) -> Path:
                 if seed in recording.kept:
                     count(recording.accept_kept(seed))
                 else:
-                    pool.submit(partial(_render_episode, path=args.path), episodes[seed])
+                    pool.submit(partial(_render_episode, recorded=recorded[seed]), episodes[seed])
             for finished in pool.as_finished():
                 seed, info = finished.task["episode_seed"], finished.result()
                 count(recording.reject(seed) if info is None else recording.accept(seed, info))
@@ -182,47 +187,88 @@ def _resized(configs: Any, size: int, cameras: tuple[str, ...]) -> dict[str, Any
     return given | shape | own
 
 
-def _render_episode(recorder: Recorder, recorded: dict[str, Any], path: Path) -> dict[str, Any] | None:
-    """In a worker process: replay an episode of `path` with observations, and return its entry in the json.
+@dataclass(frozen=True)
+class _Recorded:
+    """What a file holds of an episode that is rendered."""
+
+    path: Path
+    """Path of the file."""
+    actions: np.ndarray
+    """Actions (T, A)."""
+    actors: dict[str, np.ndarray]
+    """States (T + 1, 13) by actor."""
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the actions, which together with the seed decide what is rendered."""
+        return hashlib.sha256(self.actions.tobytes()).hexdigest()
+
+
+def _recorded(path: Path, episodes: dict[int, dict[str, Any]]) -> dict[int, _Recorded]:
+    """Actions and states of all episodes by seed, given the entries of the episodes in the json."""
+    recorded = {}
+    with open_trajectories(path) as file:
+        for seed, episode in episodes.items():
+            actors = group_of(file, episode).get("env_states/actors", {})
+            states = {name: values[()] for name, values in actors.items()}
+            recorded[seed] = _Recorded(path, actions_of(file, episode), states)
+    return recorded
+
+
+def _require_same_actions(recording: Recording, path: Path, recorded: dict[int, _Recorded]) -> None:
+    """Check that the episodes that were rendered earlier are those of the file that is rendered now.
+
+    Raises:
+        DemonstrationError: An episode was rendered from other actions. Episodes of earlier versions do not say from which.
+    """
+    rendered = {seed: info[RECORDED] for seed, info in (recording.infos | recording.kept).items() if RECORDED in info}
+    if other := [seed for seed in rendered.keys() & recorded.keys() if rendered[seed] != recorded[seed].sha256]:
+        raise DemonstrationError(
+            f"{recording.path} holds the seeds {sorted(other)} with other actions than {path} has now; give another --out, or "
+            "delete the file to render all episodes anew"
+        )
+
+
+def _render_episode(recorder: Recorder, entry: dict[str, Any], recorded: _Recorded) -> dict[str, Any] | None:
+    """In a worker process: replay an episode with observations, and return its entry in the json.
+
+    Args:
+        recorder: State of the process.
+        entry: The recorded episode's entry in its json.
+        recorded: What its file holds of it.
 
     Returns:
         None if the recording succeeds and the replay does not.
     """
-    seed = recorded["episode_seed"]
-    with open_trajectories(path) as file:
-        actions = actions_of(file, recorded)
-    source = recorder.source
+    seed, source, actions = entry["episode_seed"], recorder.source, recorded.actions
     episode = run_episode(
         recorder.env, seed, lambda: actions if source is None else converted(actions, seed, source, recorder.env)
     )
-    if episode.info["success"] < recorded["success"]:
+    if episode.info["success"] < entry["success"]:
         return None
     if source is None:
-        with open_trajectories(path) as file:
-            before = group_of(file, recorded)["env_states/actors"]
-            deviation = _deviation(before, episode.arrays["env_states"]["actors"], len(actions))
+        deviation = _deviation(recorded, episode.arrays["env_states"]["actors"])
         if deviation or len(actions) != episode.info["elapsed_steps"]:
             episode.info[DEVIATION] = deviation
-    episode.info |= _origin(recorded)
+    episode.info |= _origin(entry) | {RECORDED: recorded.sha256}
     return recorder.write(episode)
 
 
-def _deviation(recorded: Any, replayed: dict[str, np.ndarray], steps: int) -> float:
+def _deviation(recorded: _Recorded, replayed: dict[str, np.ndarray]) -> float:
     """Largest difference of any actor's pose at any step that both have, in m or in a quaternion's components.
 
     Args:
-        recorded: Group of the file that holds the states (T + 1, 13) of the actors.
+        recorded: What the file holds of the episode.
         replayed: The states of the replay by actor, of fewer steps if it ended earlier.
-        steps: Number T of recorded actions.
 
     Raises:
         DemonstrationError: The recording has states of other actors, or not after every action.
     """
     differences = [0.0]
     for name, states in replayed.items():
-        before = recorded.get(name)
-        if before is None or before.shape != (steps + 1, *states.shape[1:]):
-            raise DemonstrationError(f"{recorded.file.filename} has no states of {name} at every step; record it again")
+        before = recorded.actors.get(name)
+        if before is None or before.shape != (len(recorded.actions) + 1, *states.shape[1:]):
+            raise DemonstrationError(f"{recorded.path} has no states of {name} at every step; record it again")
         differences.append(pose_difference(before[: len(states)], states))
     return max(differences)
 

@@ -72,10 +72,10 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
     header = read_header(path)
     require_revision(path, task_of(header), header.get("revision"))
     results = []
-    with closing(_recorded_env(path, header)) as env, progress_bar() as bar:
+    with closing(_recorded_env(path, header)) as env, open_trajectories(path) as file, progress_bar() as bar:
         base: Any = env.unwrapped
         for info in bar.track(first_episodes(path, header, num), description="replaying"):
-            actions, ends = _recorded(path, info)
+            actions, ends = _recorded(file, info)
             env.reset(seed=info["episode_seed"])
             success = False
             for action in actions:
@@ -127,12 +127,10 @@ def _recorded_env(path: Path, header: dict[str, Any]) -> gym.Env:
         raise DemonstrationError(f"{path}: {error}, or record the file again") from error
 
 
-def _recorded(path: Path, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _recorded(file: Any, episode: dict[str, Any]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """The actions (T, A) of a recorded episode, and the last state (13,) of each object."""
-    with open_trajectories(path) as file:
-        group = group_of(file, episode)
-        actors = group["env_states/actors"]
-        return actions_of(file, episode), {name: actors[name][-1] for name in actors}
+    actors = group_of(file, episode)["env_states/actors"]
+    return actions_of(file, episode), {name: actors[name][-1] for name in actors}
 
 
 def main(args: Args) -> int:

@@ -29,7 +29,7 @@ from manifeel_ms3.network import LOOPBACK
 from manifeel_ms3.sensors.config import TactileSensorConfig
 from manifeel_ms3.sensors.visualisation import force_field_images
 
-from .formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header, task_of
+from .formats.maniskill_h5 import DemonstrationError, first_episodes, group_of, open_trajectories, read_header, task_of
 from .formats.touch_units import SUMS, recorded_sensor
 
 log = logging.getLogger(__name__)
@@ -186,9 +186,10 @@ def read_streams(file: Path, episode: int) -> EpisodeStreams:
         ManifeelError: The sensor is of a package that is not installed, or the arguments of the pads are not allowed.
     """
     header = read_header(file)
-    if not 0 <= episode < len(header["episodes"]):
-        raise DemonstrationError(f"{file} has episodes 0 to {len(header['episodes']) - 1}; there is no {episode}")
-    entry = header["episodes"][episode]
+    episodes = first_episodes(file, header, None)
+    if not 0 <= episode < len(episodes):
+        raise DemonstrationError(f"{file} has episodes 0 to {len(episodes) - 1}; there is no {episode}")
+    entry = episodes[episode]
     title = f"{task_of(header)}, seed {entry['episode_seed']}"
     with open_trajectories(file) as opened:
         group = group_of(opened, entry)

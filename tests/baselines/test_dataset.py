@@ -114,6 +114,12 @@ def test_files_of_another_sensor_or_controller_are_refused(demos, tmp_path, key)
         read_episodes([demos, copy], PEG, SPEC, None)
 
 
+def test_a_state_of_another_length_is_no_pose(demos, tmp_path):
+    copy = changed_copy(demos, tmp_path, "obs/extra/tcp_pose", lambda values: np.pad(values, ((0, 0), (0, 1))))
+    with pytest.raises(DemonstrationError, match=r"'extra/tcp_pose' of episode 1, .* has the shape \(8,\) .*expected \(7,\)"):
+        read_episodes([copy], PEG, SPEC, None)
+
+
 def test_one_episode_at_its_recorded_size_is_in_memory():
     spec = observation_spec("rgb", ("wrist",), (), 32)
     recorded = read_demonstrations(observed_sample(PEG), spec.keys)

@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -17,7 +18,7 @@ from manifeel_ms3.paths import data_dir
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG, needs_renderer
-from tests.trajectories import arrays_of
+from tests.trajectories import arrays_of, bytes_of
 
 SEARCH = "ManiFeel-ObjectSearch-v1"
 STATES, OBSERVED = "trajectory.h5", "trajectory.tacff.pd_ee_delta_pose_fixed_gripper.physx_cpu.h5"
@@ -191,6 +192,20 @@ def test_a_replay_that_rounds_differently_is_kept_with_its_own_states_and_one_th
     assert moved[-1, 0] == pytest.approx(-1e-3, rel=1e-3)
 
 
+def test_episodes_that_were_rendered_from_another_recording_are_refused(folder, tmp_path):
+    states, rendered = damaged(folder, tmp_path) / PEG / STATES, tmp_path / "rendered.h5"
+    args = render_observations.Args(states, rendered, "tacff", (), num=1)
+    render_observations.main(args)
+    before = bytes_of(rendered)
+    assert render_observations.main(args) == rendered  # the same recording: nothing is left to do
+    with h5py.File(states, "r+") as file:
+        file["traj_0/actions"][:, 0] *= 0.999
+    for num in (1, 2):
+        with pytest.raises(DemonstrationError, match=r"holds the seeds \[0\] with other actions than .* give another --out"):
+            render_observations.main(replace(args, num=num))
+    assert bytes_of(rendered) == before
+
+
 def test_a_replay_that_ends_earlier_is_compared_as_far_as_it_goes(folder, tmp_path):
     states = damaged(folder, tmp_path) / PEG / STATES
     with h5py.File(states, "r+") as file:
@@ -324,6 +339,8 @@ def test_a_file_of_maniskills_tools_is_replayed_without_their_renderer(tmp_path)
         (dict(cameras=("wrist",), tactile_sensors=("right",)), 0.4),
         (dict(obs_mode="tacrgb"), 0.4),
         (dict(obs_mode="tacff"), 0.2),
+        (dict(obs_mode="rgbd"), 1.2),
+        (dict(obs_mode="depth"), 0.6),
         (dict(image_size=128), 0.55),
     ],
 )

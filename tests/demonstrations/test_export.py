@@ -11,8 +11,9 @@ import torch
 
 from baselines.common.dataset import read_episodes, recorded_env_kwargs, recorded_task
 from baselines.common.observation import observation_spec
-from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations, replay
+from manifeel_ms3.demonstrations import DemonstrationError, export, read_demonstrations, replay, view
 from manifeel_ms3.demonstrations.formats import MANISKILL_H5, diffusion_policy_zarr, format_of, lerobot
+from manifeel_ms3.demonstrations.formats.lerobot_statistics import QUANTILES, episode_statistics
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import observation_keys, open_trajectories, read_header
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import task_spec
@@ -71,6 +72,39 @@ def test_lerobot(tmp_path):
     assert stats["observation.state"]["count"] == [len(poses)]
     images = np.concatenate([episode[KEYS[0]][:-1] for episode in read_demonstrations(SAMPLE, KEYS)]) / 255
     assert np.allclose(np.ravel(stats["observation.images.wrist"]["mean"]), images.mean((0, 1, 2)), atol=1e-6)
+    assert np.allclose(np.ravel(stats["observation.images.wrist"]["std"]), images.std((0, 1, 2)), atol=1e-6)
+
+
+def test_statistics_of_images_are_those_of_all_their_pixels():
+    images = np.random.default_rng(0).integers(0, 200, (3, 5, 7, 3), np.uint8)
+    found, pixels = episode_statistics(images), images.reshape(-1, 3) / 255
+    assert found["count"] == [3]
+    for name in ("min", "max", "mean", "std"):
+        assert np.shape(found[name]) == (3, 1, 1)
+        assert np.allclose(np.ravel(found[name]), getattr(pixels, name)(0), atol=1e-12)
+    for name, quantile in QUANTILES.items():
+        assert np.allclose(np.ravel(found[name]), np.quantile(pixels, quantile, axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["lerobot", "zarr"])
+@pytest.mark.parametrize(("key", "said"), [("actions", r"\(5,\) as 'actions?'"), ("obs/extra/tcp_pose", r"\(6,\) as")])
+def test_episodes_of_two_forms_are_refused(kind, key, said, tmp_path):
+    pytest.importorskip("pyarrow" if kind == "lerobot" else "zarr")
+    other = changed_copy(SAMPLE, tmp_path, key, lambda values: values[:, 1:])
+    with pytest.raises(DemonstrationError, match=rf"episode 1, counted from 0, has float32 {said}.* and the first episode"):
+        export.main(export.Args(other, kind, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_an_export_leaves_out_is_said(tmp_path, caplog):
+    caplog.set_level("INFO")
+    exported("npz", tmp_path)
+    assert "left out: agent/qpos, agent/qvel, " in caplog.text
+
+
+def test_no_command_is_named_that_could_not_train(tmp_path):
+    other = changed_copy(SAMPLE, tmp_path, "rewards", np.negative, obs_mode="state_dict")
+    assert export.next_step(export.Args(other, "lerobot", tmp_path), tmp_path).endswith("is a data set of the format lerobot")
 
 
 def test_episodes_are_found_by_their_numbers(tmp_path):
@@ -103,6 +137,8 @@ def test_a_file_without_episodes_has_nothing_to_export(tmp_path):
     other.with_suffix(".json").write_text(json.dumps(header | dict(episodes=[])))
     with pytest.raises(DemonstrationError, match="holds no episode"):
         observation_keys(other)
+    with pytest.raises(DemonstrationError, match="holds no episode yet; record some"):
+        view.read_streams(other, 0)
 
 
 def test_a_lerobot_dataset_keeps_the_arguments_of_the_task(tmp_path):
@@ -163,8 +199,7 @@ def test_a_lerobot_dataset_holds_the_outcome_of_each_action(tmp_path):
             table = pq.read_table(folder / f"data/chunk-000/file-{e:03d}.parquet")
             assert table["next.success"].to_pylist() == file[f"traj_{e}/success"][()].tolist()
             assert table["next.done"].to_pylist() == [False] * (table.num_rows - 1) + [True]
-            if "rewards" in file[f"traj_{e}"]:
-                assert np.allclose(table["next.reward"].to_pylist(), file[f"traj_{e}/rewards"][()])
+            assert np.allclose(table["next.reward"].to_pylist(), file[f"traj_{e}/rewards"][()])
 
 
 def test_a_lerobot_dataset_counts_its_frames_and_tells_their_times(tmp_path):

@@ -13,6 +13,8 @@ from manifeel_ms3.demonstrations.formats.lerobot import count_episodes, feature_
 from tests.sample import KEYS
 
 pytest.importorskip("pyarrow")
+import pyarrow.parquet as pq
+
 DATASETS = Path(__file__).with_name("lerobot")
 LENGTHS = (4, 3)
 
@@ -75,6 +77,50 @@ def test_progress_is_reported_and_fewer_can_be_read():
 def copy(tmp_path):
     shutil.copytree(DATASETS / "images", tmp_path / "dataset")
     return tmp_path / "dataset"
+
+
+def split(folder: Path) -> None:
+    """Give the second episode a data file of its own, and turn the rows of the first around."""
+    data, episodes = folder / "data/chunk-000/file-000.parquet", folder / "meta/episodes/chunk-000/file-000.parquet"
+    table, entries = pq.read_table(data), pq.read_table(episodes)
+    first = LENGTHS[0]
+    pq.write_table(table.slice(first), data.with_name("file-001.parquet"))
+    pq.write_table(table.take(list(range(first))[::-1]), data)
+    place = entries.schema.get_field_index("data/file_index")
+    pq.write_table(entries.set_column(place, "data/file_index", [[0, 1]]), episodes)
+
+
+def test_each_data_file_is_read_when_its_episode_is(copy):
+    expected = list(read_lerobot(copy, KEYS))
+    split(copy)
+    for episode, original in zip(read_lerobot(copy, KEYS), expected, strict=True):
+        assert all(np.array_equal(episode[name], values) for name, values in original.items())
+    (copy / "data/chunk-000/file-001.parquet").write_bytes(b"PAR1 no more")
+    assert len(list(read_lerobot(copy, KEYS, 1))) == 1
+    with pytest.raises(DemonstrationError, match=r"in data/chunk-000/file-001\.parquet, the data cannot be read"):
+        list(read_lerobot(copy, KEYS, 2))
+
+
+def test_rows_that_a_data_file_lacks_are_said(copy):
+    data = copy / "data/chunk-000/file-000.parquet"
+    pq.write_table(pq.read_table(data).slice(0, 6), data)
+    with pytest.raises(DemonstrationError, match=r"episode 1 has 3 frames from 4 on, of which file-000\.parquet holds 2"):
+        list(read_lerobot(copy, KEYS))
+
+
+def test_a_state_of_joint_positions_is_no_pose(copy, caplog):
+    info = json.loads((copy / "meta/info.json").read_text())
+    state = info["features"]["observation.state"]
+    joints = [f"joint_{i}" for i in range(7)]
+    for names in (joints, dict(motors=joints)):
+        state["names"] = names
+        (copy / "meta/info.json").write_text(json.dumps(info))
+        with pytest.raises(DemonstrationError, match=r"observation\.state holds \['joint_0'.* take the pose of the tool"):
+            list(read_lerobot(copy, KEYS))
+    state["names"] = dict(axes=["x", "y", "z", "qw", "qx", "qy", "qz"])
+    (copy / "meta/info.json").write_text(json.dumps(info | dict(fps=30)))
+    assert len(list(read_lerobot(copy, KEYS))) == 2
+    assert "has 30 frames per second; tasks here act 10 times per second" in caplog.text
 
 
 def test_what_is_missing_or_broken_is_named(copy):

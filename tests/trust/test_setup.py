@@ -174,6 +174,19 @@ def test_a27_a_long_list_of_libraries_is_read_as_a_whole(apt, tmp_path):
     assert (tmp_path / "calls").read_text().split() == ["call"]
 
 
+def test_b10_python_is_one_for_which_packages_are_locked(tmp_path):
+    for name, version in (("python3", "3, 13"), ("python3.12", "3, 14"), ("python3.11", "3, 11")):
+        asked = f'"import sys; sys.version_info = ({version}, 0); ${{2#*; }}"'
+        (tmp_path / name).write_text(f"#!/bin/bash\n'{sys.executable}' -c {asked}\n")
+        (tmp_path / name).chmod(0o755)
+    found = run(f"PATH='{tmp_path}:/usr/bin:/bin'\nfind_python && echo $PYTHON", tmp_path)
+    assert found.stdout.split() == ["python3.11"]
+    (tmp_path / "python3.11").unlink()
+    none = run(f"PATH='{tmp_path}'\nfind_python || echo refused", tmp_path)
+    assert "Python 3.10, 3.11 or 3.12 is needed" in none.stdout
+    assert none.stdout.split()[-1] == "refused"
+
+
 def test_b10_the_image_is_named_by_its_content_and_has_git():
     lines = (SETUP.parents[1] / "Dockerfile").read_text().splitlines()
     (base,) = [line for line in lines if line.startswith("FROM ")]
@@ -182,6 +195,8 @@ def test_b10_the_image_is_named_by_its_content_and_has_git():
     assert len(digest) == 64
     assert int(digest, 16)
     assert any("apt-get install" in line and " git " in line for line in lines)
+    ignored = (SETUP.parents[1] / ".dockerignore").read_text().split()
+    assert ".git" not in ignored  # without it, results made in the image could not name their commit
 
 
 def test_b10_every_package_is_installed_by_its_hash():

@@ -20,7 +20,7 @@ from manifeel_ms3.tasks.obs_modes import PAD
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .folder_checks import broken_if_fails, read_origin, require_task
-from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories
+from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories, require_same_form
 from .touch_units import recorded_units
 from .zarr_arrays import open_arrays
 
@@ -175,10 +175,12 @@ def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
     """
     with missing_extras_named():
         import zarr
-    keys, arrays, ends = observation_keys(path), {}, []
+    keys, arrays, ends, first = observation_keys(path), {}, [], {}
     store = zarr.open_group(str(folder), mode="w", zarr_format=2)
     store.attrs.update(_about(path, keys))
-    for episode in read_trajectories(path, keys, progress=progress):
+    for number, episode in enumerate(read_trajectories(path, keys, progress=progress)):
+        first = first or {name: array[:1] for name, array in episode.items()}
+        require_same_form(path, number, episode, first)
         length = len(episode["actions"])
         parts = {array_name(key): _to_paper(key, episode[key][:length]) for key in keys} | dict(action=episode["actions"])
         for name, values in parts.items():

@@ -11,6 +11,7 @@ cannot be imported beside the CPU build of torch 2.13. With torch 2.10 the two p
 that lerobot 0.4.4 has written; where lerobot is installed, its reader also reads what is written here.
 """
 
+import logging
 import math
 from collections.abc import Iterator
 from contextlib import closing
@@ -24,12 +25,18 @@ import numpy as np
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import MAX_COMPRESSION, Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .folder_checks import broken_if_fails, read_origin, require_task, stored_bytes
-from .lerobot_layout import INFO, ORIGIN, VIDEO, earlier_feature_name, feature_name
+from .lerobot_layout import DATA, INFO, ORIGIN, POSE_AXES, VIDEO, earlier_feature_name, feature_name
 from .lerobot_writing import pyarrow, write_lerobot
 
+log = logging.getLogger(__name__)
+POSE = "extra/tcp_pose"
+"""Key of the tool's pose."""
+PLACE = ("chunk_index", "file_index")
+"""Numbers that name a file of the layout."""
 MP4 = b"ftyp"
 """Bytes 4 to 8 of an mp4 file (ISO 14496-12, section 4.3); a playlist of that name would make ffmpeg read other files."""
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -129,30 +136,44 @@ def read_lerobot(
         MissingExtraError: pyarrow or imageio is not installed.
     """
     info = read_info(folder)
-    require_task(folder, _origin(folder), env_id)
+    require_task(folder, origin := _origin(folder), env_id)
+    if not origin and info["fps"] != CONTROL_FREQ:
+        log.warning("%s has %g frames per second; tasks here act %d times per second", folder, info["fps"], CONTROL_FREQ)
     names = {key: next((n for n in _names(key) if n in info["features"]), feature_name(key)) for key in keys}
     if missing := [name for name in (*names.values(), "action") if name not in info["features"]]:
         raise DemonstrationError(f"{folder} lacks {missing}; it holds {sorted(info['features'])}")
+    _require_pose(folder, info, [name for key, name in names.items() if key == POSE])
     folder, files = Path(folder), stored_bytes(folder)
     videos = {name: _Video(folder, info, name) for name in names.values() if info["features"][name]["dtype"] == "video"}
     entries = _entries(folder, files, list(videos))
-    columns = ["index", "action", *(name for name in names.values() if name not in videos)]
-    data = _table(folder, files, "data", columns).sort_by("index")
+    data = _Data(folder, files, ["index", "action", *(name for name in names.values() if name not in videos)])
     count = info["total_episodes"] if num is None else num
     if not 0 < count <= len(entries):
         raise DemonstrationError(f"{folder} holds {len(entries)} episodes, {count} are wanted; ask for fewer")
     for i in progress(range(count)):
-        first, length = entries[i]["dataset_from_index"], entries[i]["length"]
-        if not (first >= 0 and 0 < length <= data.num_rows - first):
-            raise DemonstrationError(
-                f"{folder}: episode {i} has {length} frames from {first} on, of {data.num_rows}; export it again"
-            )
-        rows = data.slice(first, length)
+        rows = data.rows(entries[i])
         episode = {}
         for key, name in names.items():
             values = videos[name].frames(entries[i]) if name in videos else _values(folder, info, name, rows)
             episode[key] = np.concatenate([values, values[-1:]])
         yield episode | dict(actions=_numbers(folder, info, "action", rows))
+
+
+def _require_pose(folder: Path, info: dict[str, Any], names: list[str]) -> None:
+    """Check that features whose components have names are poses of the tool, and not, for example, positions of seven joints.
+
+    Raises:
+        DemonstrationError: A feature has other components.
+    """
+    for name in names:
+        components = info["features"][name].get("names")
+        if isinstance(components, dict) and len(components) == 1:  # lerobot also writes {"motors": [...]}
+            (components,) = components.values()
+        if components is not None and components != POSE_AXES:
+            raise DemonstrationError(
+                f"{folder}: {name} holds {components}, and policies here take the pose of the tool, {POSE_AXES}; write a "
+                "dataset that has it"
+            )
 
 
 def _names(key: str) -> tuple[str, str]:
@@ -165,8 +186,9 @@ def _entries(folder: Path, files: dict[Path, int], videos: list[str]) -> list[di
     Raises:
         DemonstrationError: The entries are broken.
     """
-    parts = ["chunk_index", "file_index", "from_timestamp"]
-    numbers = ["episode_index", "dataset_from_index", "length", *(f"videos/{name}/{part}" for name in videos for part in parts)]
+    parts = [*PLACE, "from_timestamp"]
+    numbers = ["episode_index", "dataset_from_index", "length", *(f"data/{part}" for part in PLACE)]
+    numbers += [f"videos/{name}/{part}" for name in videos for part in parts]
     entries = _table(folder, files, "meta/episodes", numbers).sort_by("episode_index").to_pylist()
     for entry in entries:
         for name, value in entry.items():
@@ -182,23 +204,62 @@ def _table(folder: Path, files: dict[Path, int], part: str, columns: list[str]) 
     Raises:
         DemonstrationError: A table is broken, lacks a column, or declares more numbers than it can hold.
     """
-    pa, pq = pyarrow()
-    tables = []
+    pa, _ = pyarrow()
     with broken_if_fails(folder, part):
-        for path in sorted((folder / part).glob("chunk-*/file-*.parquet")):
-            with pq.ParquetFile(path) as file:
-                about = file.metadata
-                held = sum(
-                    about.row_group(g).column(c).num_values
-                    for g in range(about.num_row_groups)
-                    for c in range(about.num_columns)
+        paths = sorted((folder / part).glob("chunk-*/file-*.parquet"))
+        return pa.concat_tables(_read_table(path, files[path], columns) for path in paths)
+
+
+def _read_table(path: Path, stored: int, columns: list[str]) -> Any:
+    """Columns of one table, whose file has this number of bytes; the errors are those of `_table` and of pyarrow."""
+    _, pq = pyarrow()
+    with pq.ParquetFile(path) as file:
+        about = file.metadata
+        groups, parts = range(about.num_row_groups), range(about.num_columns)
+        held = sum(about.row_group(g).column(c).num_values for g in groups for c in parts)
+        if max(held, about.num_rows) * WORD > MAX_COMPRESSION * stored:
+            raise DemonstrationError(f"{path} declares {held} numbers in {stored} bytes; get it again")
+        if missing := sorted(set(columns) - set(file.schema_arrow.names)):
+            raise DemonstrationError(f"{path} lacks {missing}; export the dataset again")
+        return file.read(columns=columns)
+
+
+class _Data:
+    """The rows of the episodes, of which each lies in one data file. One file is in memory at a time.
+
+    Args:
+        folder: Folder of the dataset.
+        files: Sizes of its files in bytes, by their paths.
+        columns: Features to read, and "index".
+    """
+
+    def __init__(self, folder: Path, files: dict[Path, int], columns: list[str]):
+        self._folder, self._files, self._columns = folder, files, columns
+        self._path: Path | None = None
+        self._table: Any = None
+
+    def rows(self, entry: dict[str, Any]) -> Any:
+        """The rows of the episode that has this entry in meta/episodes, in their order.
+
+        Raises:
+            DemonstrationError: The data file is missing or broken, or lacks rows of the episode.
+        """
+        path = self._folder / DATA.format(**{part: entry[f"data/{part}"] for part in PLACE})
+        first, length = entry["dataset_from_index"], entry["length"]
+        with broken_if_fails(self._folder, f"in {path.relative_to(self._folder)}, the data"):
+            if path != self._path:
+                self._table = None  # before the next one is read
+                self._path, self._table = path, _read_table(path, self._files[path], self._columns)
+            index = np.asarray(self._table["index"])
+            places = np.flatnonzero((index >= first) & (index < first + length))
+            places = places[np.argsort(index[places])]
+            if length == 0 or not np.array_equal(index[places], np.arange(first, first + length)):
+                raise DemonstrationError(
+                    f"{self._folder}: episode {entry['episode_index']} has {length} frames from {first} on, of which "
+                    f"{path.name} holds {len(places)}; export it again"
                 )
-                if max(held, about.num_rows) * WORD > MAX_COMPRESSION * files[path]:
-                    raise DemonstrationError(f"{path} declares {held} numbers in {files[path]} bytes; get it again")
-                if missing := sorted(set(columns) - set(file.schema_arrow.names)):
-                    raise DemonstrationError(f"{path} lacks {missing}; export the dataset again")
-                tables.append(file.read(columns=columns))
-        return pa.concat_tables(tables)
+            rising = np.array_equal(places, np.arange(places[0], places[0] + length))
+            return self._table.slice(places[0], length) if rising else self._table.take(places)
 
 
 def _values(folder: Path, info: dict, name: str, rows: Any) -> np.ndarray:
@@ -246,7 +307,7 @@ class _Video:
         Raises:
             DemonstrationError: The video is missing or broken, or ends before the episode does.
         """
-        place = {part: entry[f"videos/{self._name}/{part}"] for part in ("chunk_index", "file_index")}
+        place = {part: entry[f"videos/{self._name}/{part}"] for part in PLACE}
         path = self._folder / VIDEO.format(video_key=self._name, **place)
         first, length = round(entry[f"videos/{self._name}/from_timestamp"] * self._info["fps"]), entry["length"]
         with broken_if_fails(self._folder, f"the video {path.relative_to(self._folder)}"):

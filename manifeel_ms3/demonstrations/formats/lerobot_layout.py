@@ -12,6 +12,8 @@ DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 """Paths of the files in LeRobot's layout 3.0. The layout that a data set describes is compared and never filled in, because a
 description can name any file."""
+POSE_AXES = ["x", "y", "z", "qw", "qx", "qy", "qz"]
+"""Names of the components of `observation.state`, the pose of the tool."""
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """Features that number frames, episodes and tasks; every LeRobot dataset has them."""
 
@@ -20,7 +22,7 @@ def feature_name(key: str) -> str:
     """LeRobot's name of an observation.
 
     Images are `observation.images.<camera>` and `observation.images.tactile_<side>`, which policies of LeRobot take like any
-    other image. Further outputs of a pad are `observation.tactile.<side>.<output>`.
+    other image. Force fields are `observation.tactile.<side>.force_field`.
 
     Args:
         key: Key of the observation, such as "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose".

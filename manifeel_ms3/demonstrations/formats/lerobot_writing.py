@@ -17,17 +17,16 @@ from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import DemonstrationError, Progress
 from .lerobot_card import card
-from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, VIDEO, feature_name
+from .lerobot_layout import CARD, COUNTERS, DATA, INFO, ORIGIN, POSE_AXES, VIDEO, feature_name
 from .lerobot_statistics import episode_statistics, joined_statistics
-from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories, task_of
+from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories, require_same_form, task_of
 
 FILES_PER_CHUNK = 1000
 """Number of files in a folder, lerobot's default."""
 DATA_FILE_MB, VIDEO_FILE_MB = 100, 200
 """Sizes in MB from which lerobot starts a new file, its defaults."""
-POSE_AXES = ["x", "y", "z", "qw", "qx", "qy", "qz"]
 IMAGE_AXES, FIELD_AXES = ["height", "width", "channels"], ["rows", "columns", "force"]
-"""Names of the components of the tool's pose, and of the axes of an image and of a force field."""
+"""Names of the axes of an image and of a force field."""
 CRF, KEYFRAME_EVERY = 18, 2
 """Constant rate factor of H.264, nearly without visible loss (FFmpeg's H.264 guide), and number of frames from one key frame to
 the next, lerobot's default."""
@@ -51,10 +50,12 @@ def write_lerobot(path: Path, folder: Path, progress: Progress = iter, videos: b
     """
     pa, pq = pyarrow()
     header, keys = read_header(path), observation_keys(path)
-    writer, entries, start = _Features(header, videos), [], 0
+    writer, entries, start, first = _Features(header, videos), [], 0, {}
     task = _instruction(header)
     for e, episode in enumerate(read_trajectories(path, keys, progress=progress, outcomes=tuple(OUTCOMES))):
         values = _features_of(episode, keys, e, start, writer.fps)
+        first = first or {name: array[:1] for name, array in values.items()}
+        require_same_form(path, e, values, first)
         writer.describe(values)
         place = dict(chunk_index=e // FILES_PER_CHUNK, file_index=e % FILES_PER_CHUNK)
         file = folder / DATA.format(**place)

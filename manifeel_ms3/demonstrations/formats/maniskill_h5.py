@@ -267,6 +267,8 @@ def first_episodes(path: Path, header: dict[str, Any], num: int | None) -> list[
         DemonstrationError: The file has fewer episodes, or none.
     """
     held = header["episodes"]
+    if not held:
+        raise DemonstrationError(f"{path} holds no episode yet; record some with `manifeel record`")
     count = len(held) if num is None else num
     if not 0 < count <= len(held):
         raise DemonstrationError(f"{path} holds {len(held)} episodes, {count} are wanted; record more, or ask for fewer")
@@ -277,20 +279,60 @@ def observation_keys(path: Path) -> list[str]:
     """Keys of a file's observations that policies use: images, force fields, and the pose of the tool.
 
     Raises:
-        DemonstrationError: The file holds states and actions alone, or no episode.
+        DemonstrationError: The file lacks the pose of the tool, or holds no episode.
     """
-    episodes = read_header(path)["episodes"]
-    if not episodes:
-        raise DemonstrationError(f"{path} holds no episode; record some with `manifeel record`")
+    header = read_header(path)
     with open_trajectories(path) as file:
-        group = group_of(file, episodes[0])
+        group = group_of(file, first_episodes(path, header, None)[0])
         sensors = group.get("obs/sensor_data", {})
         keys = [
             f"sensor_data/{sensor}/{kind}" for sensor in sensors for kind in ("rgb", "force_field") if kind in sensors[sensor]
         ]
         if "obs/extra/tcp_pose" not in group:
-            raise DemonstrationError(f"{path} holds states and actions alone; `manifeel render-observations` adds observations")
+            held = "states and actions alone"
+            if (mode := header["env_info"]["env_kwargs"].get("obs_mode", "none")) != "none":
+                held = f"observations of obs_mode={mode!r}, in which the pose of the tool is not an array of its own"
+            raise DemonstrationError(f"{path} holds {held}; `manifeel render-observations` makes a file with observations")
     return [*keys, "extra/tcp_pose"]
+
+
+def observations_beside(path: Path, keys: list[str]) -> list[str]:
+    """Names of the observations in a file that are not among these keys, in alphabetical order.
+
+    Args:
+        path: Trajectory file.
+        keys: Keys from `observation_keys`.
+    """
+    found: list[str] = []
+
+    def add(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and name not in keys:
+            found.append(name)
+
+    with open_trajectories(path) as file:
+        group_of(file, read_header(path)["episodes"][0])["obs"].visititems(add)
+    return sorted(found)
+
+
+def require_same_form(path: Path, number: int, arrays: dict[str, np.ndarray], first: dict[str, np.ndarray]) -> None:
+    """Check that an episode has the arrays of the first one: their names, their types, and their shapes at a step.
+
+    Args:
+        path: Trajectory file, for the message.
+        number: Number of the episode, from 0.
+        arrays: Arrays (T, ...) of the episode.
+        first: Arrays of the first episode.
+
+    Raises:
+        DemonstrationError: It has others.
+    """
+    forms = [{name: (str(v.dtype), v.shape[1:]) for name, v in episode.items()} for episode in (first, arrays)]
+    for name in [name for name in forms[0] | forms[1] if forms[0].get(name) != forms[1].get(name)]:
+        expected, found = (f"{form[name][0]} {form[name][1]}" if name in form else "nothing" for form in forms)
+        raise DemonstrationError(
+            f"{path}: episode {number}, counted from 0, has {found} as {name!r}, and the first episode {expected}; a data set "
+            "has one form: export files of the same sensors and control mode separately"
+        )
 
 
 def _outcomes(group: Any, names: tuple[str, ...]) -> Demonstration:
