@@ -1,5 +1,7 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
+from collections.abc import Collection
+
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
@@ -48,3 +50,21 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
         )
     touch = tuple(output for token, output in TACTILE_TOKENS.items() if token in tokens)
     return "+".join(own) or "none", touch
+
+
+def check_pads(obs_mode: str, outputs: Collection[str], sides: Collection[str]) -> None:
+    """Check that there is a pad if touch is observed.
+
+    Args:
+        obs_mode: Observation mode, for the message.
+        outputs: Outputs of the pads that it asks for.
+        sides: Sides of the pads.
+
+    Raises:
+        InvalidArgumentError: There is none.
+    """
+    if outputs and not sides:
+        raise InvalidArgumentError(
+            f"obs_mode={obs_mode!r} observes touch, and tactile_sensors names no pad; give 'left', 'right' or both, or leave "
+            "'tacrgb' and 'tacff' out"
+        )

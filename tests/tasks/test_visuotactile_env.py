@@ -106,6 +106,7 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         (dict(obs_mode="rgb+smell"), "tacrgb"),
         (dict(cameras=("top",)), "wrist"),
         (dict(tactile_sensors=("middle",)), "left"),
+        (dict(obs_mode="rgb+tacff", tactile_sensors=()), "names no pad; give 'left', 'right' or both"),
         (dict(lighting="disco"), "dim"),
         (dict(tactile={"optics.nose": 1.0}), "optics.nose"),
         (dict(tactile={"gel.thickness": 0.0}), "gel.thickness"),
