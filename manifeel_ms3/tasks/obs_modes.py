@@ -1,7 +1,5 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
-from collections.abc import Collection
-
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
@@ -52,19 +50,15 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     return "+".join(own) or "none", touch
 
 
-def check_pads(obs_mode: str, outputs: Collection[str], sides: Collection[str]) -> None:
-    """Check that there is a pad if touch is observed.
-
-    Args:
-        obs_mode: Observation mode, for the message.
-        outputs: Outputs of the pads that it asks for.
-        sides: Sides of the pads.
+def pads_to_observe(obs_mode: str, sides: tuple[str, ...]) -> tuple[str, ...]:
+    """The sides of the pads, of which there is at least one if touch is observed.
 
     Raises:
         InvalidArgumentError: There is none.
     """
-    if outputs and not sides:
+    if not sides and split_obs_mode(obs_mode)[1]:
         raise InvalidArgumentError(
             f"obs_mode={obs_mode!r} observes touch, and tactile_sensors names no pad; give 'left', 'right' or both, or leave "
             "'tacrgb' and 'tacff' out"
         )
+    return sides

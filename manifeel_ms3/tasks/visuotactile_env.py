@@ -28,7 +28,7 @@ from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_argument_names, check_base_arguments, checked_randomization, checked_reset, split_sensor_configs
-from .obs_modes import PAD, check_pads, has_images, split_obs_mode
+from .obs_modes import PAD, has_images, pads_to_observe, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SceneryEnv
 from .states import RestorableEnv, take_given_state
@@ -146,12 +146,11 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         **kwargs,
     ):
         check_argument_names(type(self), kwargs)
-        self._full_obs_mode = obs_mode or "state"
+        self._full_obs_mode, self.sensor = obs_mode or "state", sensor
         own_mode, self._tactile_outputs = split_obs_mode(self._full_obs_mode)
         asked = self.policy_cameras if cameras is None else cameras
         self.camera_names = several_of("cameras", asked, (*CAMERAS, *self.own_cameras))
-        self.sensor, self._sides = sensor, several_of("tactile_sensors", tactile_sensors, SIDES)
-        check_pads(self._full_obs_mode, self._tactile_outputs, self._sides)
+        self._sides = pads_to_observe(self._full_obs_mode, several_of("tactile_sensors", tactile_sensors, SIDES))
         names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self.camera_names, [names[s] for s in self._sides])
         pad_options = by_name("tactile", tactile or {}, '{"units": "tacsl", "optics.noise": 2.0}')
