@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -24,6 +24,17 @@ def one_of(name: str, given: T, allowed: Iterable[T]) -> T:
     if given not in list(allowed):
         raise InvalidArgumentError(f"{name}={given!r} is unknown; choose from {list(allowed)}")
     return given
+
+
+def require_choices(settings: Any) -> None:
+    """Check that the fields of a dataclass whose type is a `Literal` have one of its values, as the command line does.
+
+    Raises:
+        InvalidArgumentError: A field has another value.
+    """
+    for name, kind in get_type_hints(type(settings)).items():
+        if get_origin(kind) is Literal:
+            one_of(name, getattr(settings, name), get_args(kind))
 
 
 def meant(given: str, names: Iterable[str]) -> str:

@@ -334,8 +334,9 @@ def remove_folder(folder: Path) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete the folders inside a folder that processes were writing or deleting when they were killed."""
-    _delete_all(folder, f".*{PARTIAL}")
+    """Delete what processes were writing into a folder, or deleting from it, when they were killed."""
+    for path in folder.glob(f".*{PARTIAL}"):
+        _delete_if_abandoned(path)
 
 
 def _delete_all(folder: Path, pattern: str) -> None:
@@ -355,10 +356,15 @@ def _delete(path: Path) -> None:
 def _delete_abandoned(path: Path) -> None:
     """Delete what earlier writers of a file or folder left when they were killed."""
     for old in path.parent.glob(f".{escape(path.name)}.*{PARTIAL}"):
-        writer = re.fullmatch(r"(\w+)-(\d+)-\w+", old.name.removeprefix(f".{path.name}.").removesuffix(PARTIAL))
-        with suppress(FileNotFoundError):  # its writer ends at this moment
-            if writer and _was_abandoned(old, writer[1], int(writer[2])):
-                _delete(old)
+        _delete_if_abandoned(old)
+
+
+def _delete_if_abandoned(partial: Path) -> None:
+    """Delete a temporary file or folder whose writer has ended."""
+    writer = re.fullmatch(r"\..+\.(\w+)-(\d+)-\w+", partial.name.removesuffix(PARTIAL))
+    with suppress(FileNotFoundError):  # its writer ends at this moment
+        if writer and _was_abandoned(partial, writer[1], int(writer[2])):
+            _delete(partial)
 
 
 def _was_abandoned(partial: Path, machine: str, process: int) -> bool:

@@ -23,6 +23,7 @@ from manifeel_ms3.files import (
     read_json_lines,
     read_npz,
     remove_folder,
+    remove_leftovers,
     restore_folder,
     write_json,
     write_text,
@@ -150,6 +151,15 @@ def test_what_another_machine_writes_is_deleted_only_when_it_is_old(tmp_path, ma
             (own / "file" if own.is_dir() else own).write_text("whole")
         assert half.exists() is is_kept
         shutil.rmtree(tmp_path / "x") if make is atomic_folder else (tmp_path / "x").unlink()
+
+
+def test_what_another_process_is_writing_at_this_moment_is_no_leftover(tmp_path):
+    with atomic_write(tmp_path / "x.json") as partial:
+        partial.write_text("whole")
+        partial.with_name(partial.name.replace(f"-{os.getpid()}-", f"-{2**22 + 1}-")).touch()  # no process has this number
+        remove_leftovers(tmp_path)
+        assert list(tmp_path.iterdir()) == [partial]
+    assert (tmp_path / "x.json").read_text() == "whole"
 
 
 def test_the_next_removal_of_a_folder_completes_one_that_was_killed(tmp_path):

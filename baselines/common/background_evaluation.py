@@ -8,7 +8,9 @@ import time
 from collections import deque
 from pathlib import Path
 
+from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.result import MEANS, RATES, read_result
+from manifeel_ms3.typed_modules import imported
 
 log = logging.getLogger(__name__)
 SUCCESS = "eval/success_once"
@@ -76,7 +78,9 @@ class BackgroundEvaluation:
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
         # an interrupted run may have evaluated another checkpoint of this step
         command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite-other", *self._arguments]
-        folder = None if NOT_FROM_HERE else self.folder  # a folder that only this package writes into
+        if modules := imported():  # of the task that was typed with its module, which a checkpoint does not name
+            command += ["--env-id", f"{modules[-1]}:{checkpoint_config(checkpoint)['env_id']}"]
+        folder = None if NOT_FROM_HERE or modules else self.folder  # a folder that only this package writes into
         environment = os.environ | dict(PYTHONSAFEPATH="1")  # the same for the processes that the evaluation starts
         with result.with_suffix(".log").open("w") as output:
             return checkpoint, subprocess.Popen(command, cwd=folder, env=environment, stdout=output, stderr=output)

@@ -29,7 +29,7 @@ TAXEL_SHAPE = TactileSensorConfig.taxel_shape
 CameraView = Literal["whole", "work"]
 """Parts of a camera image that networks take: all of it, or the square in which the work is done."""
 WORK_SQUARES = dict(wrist=(0.28, 0.14, 0.72), front=(0.0, 0.125, 0.75), side=(0.0, 0.125, 0.75))
-"""Top, left and side of the square of each camera's image in which the work is done, as shares of the image's side. Outside
+"""Top, left and side of the square of each camera's image in which the work is done, as shares of its side. Outside
 of it the wrist camera sees its own housing, and the others see bare table (judged by eye in demonstrations of all tasks)."""
 
 
@@ -134,10 +134,16 @@ def prepare(key: str, value: np.ndarray, spec: ObservationSpec) -> np.ndarray:
 
 
 def work_square(images: np.ndarray, camera: str) -> np.ndarray:
-    """The square of a camera's images (T, H, W, 3) in which the work is done; images of other cameras are returned whole."""
+    """The square of a camera's images (T, H, W, 3) in which the work is done; images of other cameras are returned whole.
+
+    The square is that of the largest square in the middle of an image, as if a wide or tall image were cut to it.
+    """
     if camera not in WORK_SQUARES:
         return images
-    top, left, side = (round(share * images.shape[1]) for share in WORK_SQUARES[camera])
+    height, width = images.shape[1:3]
+    whole = min(height, width)
+    top, left, side = (round(share * whole) for share in WORK_SQUARES[camera])
+    top, left = top + (height - whole) // 2, left + (width - whole) // 2
     return images[:, top : top + side, left : left + side]
 
 

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal, cast
 import torch
 import torch.nn as nn
 
-from manifeel_ms3.arguments import require_amount, require_at_least
+from manifeel_ms3.arguments import require_amount, require_at_least, require_choices
 from manifeel_ms3.errors import InvalidArgumentError
 
 from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
@@ -93,6 +93,7 @@ class PolicyConfig:
         return f"at least {self.least_inference_steps}" + ("" if most is None else f" and at most {most}")
 
     def __post_init__(self):
+        require_choices(self)
         if self.obs_horizon < 1 or self.action_horizon < 1:
             raise InvalidArgumentError(
                 f"obs_horizon={self.obs_horizon} and action_horizon={self.action_horizon} must be at least 1"

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import torch
 from tyro.conf import arg
 
-from manifeel_ms3.arguments import flag_of, require_amount, require_not_negative, require_positive
+from manifeel_ms3.arguments import flag_of, require_amount, require_choices, require_not_negative, require_positive
 from manifeel_ms3.command_line import json_object, missing_extras_named
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.checks import check_argument_names, check_obs_mode, check_seed
@@ -63,8 +63,8 @@ class TrainArgs:
     steps: Annotated[int | None, arg(name="total-iters", aliases=["--steps"])] = None
     """Number of gradient steps; if not given, `epochs` says how long training is."""
     epochs: int | None = None
-    """Number of epochs where the number of gradient steps is not given; if neither is, 50,000 divided by the number of
-    demonstrations, as in the paper."""
+    """Number of epochs where neither --total-iters nor the preset gives a number of gradient steps, as "cpu" does; if neither
+    is given, 50,000 divided by the number of demonstrations, as in the paper."""
     min_steps: Annotated[int, arg(name="min-iters")] = 1
     """Smallest number of gradient steps of a training whose length is given in epochs."""
     lr: float | None = None
@@ -178,6 +178,7 @@ def check_run(args: TrainArgs) -> None:
     for flag, rate in (*(("--betas", beta) for beta in args.betas), ("--ema-max-decay", args.ema_max_decay)):
         if not 0 <= rate < 1:  # also where it is NaN
             raise InvalidArgumentError(f"{flag} {rate}: a decay rate must be at least 0 and below 1")
+    require_choices(args)
     if not args.policy.can_generate_in(args.inference_steps):
         raise InvalidArgumentError(
             f"--inference-steps {args.inference_steps}: this policy needs {args.policy.step_range} to generate"

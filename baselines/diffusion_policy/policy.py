@@ -27,6 +27,10 @@ class DiffusionConfig(PolicyConfig):
         require_at_least(1, diffusion_steps=self.diffusion_steps)
 
     @property
+    def least_inference_steps(self):
+        return min(2, self.diffusion_steps)  # a single step of DDIM is the last one, which returns the noise
+
+    @property
     def most_inference_steps(self):
         return self.diffusion_steps
 

@@ -47,7 +47,7 @@ def weights_of(job: Job, root: Path) -> Path:
 def pretrain_arguments(job: Job, root: Path, gpus: float) -> list[str]:
     """Arguments of `python -m baselines.tactile_representations.pretrain` for a job."""
     (record,) = job.needs
-    files = ["--demo-path", str(trajectory_of(record, root)), "--out", str(weights_of(job, root))]
+    files = ["--demo-path", str(trajectory_of(record, root)), "--out", str(weights_of(job, root)), "--overwrite"]
     return [job.settings["encoder"], *device_arguments(job.kind, gpus), *files]
 
 

@@ -9,7 +9,7 @@ transformers by masked autoencoding; the option `--tacrgb-weights` of a policy's
 
 import math
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -29,6 +29,7 @@ from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats.folder_checks import require_task
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import about_task, group_of, open_trajectories, read_header
+from manifeel_ms3.errors import FileExistsAlreadyError
 from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.ownership import owned
@@ -50,7 +51,7 @@ EPOCHS = 50
 """Number of times that training sees each image on average, unless told otherwise; that of the paper's public code for UniT."""
 ADVERSARY_WEIGHT = 0.1
 """Weight of the discriminator's judgement in the loss; constant, whereas Esser et al. (2021, eq. 7) adapt theirs."""
-REPRESENTATIONS: dict[str, Callable[[], UniT | TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
+REPRESENTATIONS: dict[str, type[UniT] | type[TokenRepresentation]] = dict(unit=UniT, t3=T3, anytouch=AnyTouch, sparsh=Sparsh)
 """Networks of the representations, by name."""
 Representation = Literal["unit", "t3", "anytouch", "sparsh"]
 """Names of the representations that can be trained."""
@@ -66,8 +67,10 @@ class Args:
     """Trajectory files with TacRGB images."""
     env_id: str | None = None
     """Environment id of the task that all demonstrations must be of; any tasks if not given."""
-    out: Path = Path("representation.safetensors")
-    """File of the trained weights; it appears when training has ended."""
+    out: Path | None = None
+    """File of the trained weights, which appears when training has ended; <representation>.safetensors if not given."""
+    overwrite: bool = False
+    """Replace the file of earlier weights if there is one."""
     image_size: int | None = None
     """Height and width to which images are resized, pixels, the same as TacRGB has in the policy's training; if not given, 256
     for unit and 224 for the others, as in the paper."""
@@ -95,17 +98,26 @@ def main(args: Args) -> list[float]:
         InvalidArgumentError: A number is too small, the representation does not take images of this size, or the path of the
             weights is a folder.
         DemonstrationError: The files hold no TacRGB images, or are of another task than asked for or of another revision of it.
+        FileExistsAlreadyError: The file of the weights exists, and is not to be overwritten.
         FileWriteError: The weights cannot be written.
         InUseError: Another process trains into the same file.
     """
     require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
     require_amount("--lr ", args.lr)
-    require_file("--out", args.out, str(Args.out))
-    with owned(args.out):
-        return _pretrain(args)
+    out = out_file(args)
+    require_file("--out", out, f"{args.representation}.safetensors")
+    with owned(out):
+        if out.exists() and not args.overwrite:
+            raise FileExistsAlreadyError(f"{out} holds weights already; give another --out, or --overwrite to replace them")
+        return _pretrain(args, out)
 
 
-def _pretrain(args: Args) -> list[float]:
+def out_file(args: Args) -> Path:
+    """Path of the file of the trained weights."""
+    return args.out or Path(f"{args.representation}.safetensors")
+
+
+def _pretrain(args: Args, out: Path) -> list[float]:
     torch.manual_seed(args.seed)
     representation = REPRESENTATIONS[args.representation]().to(checked_device(args.device))
     size = args.image_size or representation.size
@@ -127,7 +139,7 @@ def _pretrain(args: Args) -> list[float]:
                 losses.append(float(loss))
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)
-    with atomic_write(args.out) as partial:
+    with atomic_write(out) as partial:
         write_tensors(partial, representation.state_dict())
     return losses
 
@@ -232,8 +244,9 @@ def _descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
 
 def next_step(args: Args, _losses: list[float]) -> str:
     """What the command made, and what one can do with it."""
-    flags = ("--policy.encoder.tacrgb", args.representation, "--tacrgb-weights", args.out)
-    return f"{args.out} holds the weights; {as_typed('manifeel', 'train', '...', *flags)} trains a policy with them"
+    out, size = out_file(args), args.image_size or REPRESENTATIONS[args.representation].size
+    flags = ("--policy.encoder.tacrgb", args.representation, "--tacrgb-weights", out, "--tactile-image-size", size)
+    return f"{out} holds the weights; {as_typed('manifeel', 'train', '...', *flags)} trains a policy with them"
 
 
 if __name__ == "__main__":

@@ -39,14 +39,15 @@ class UniT(Representation):
             on 128 x 160 pixels; the paper ManiFeel uses 256 x 256 pixels and no attention.
     """
 
-    patch, out_features = 8, LATENT_CHANNELS
+    patch, size, out_features = 8, SIZE, LATENT_CHANNELS
     released = "a checkpoint of UniT's VQGAN"
 
     def __init__(self, channels: tuple[int, ...] = CHANNELS, attention: bool = False):
         from diffusers import VQModel  # pyright: ignore[reportPrivateImportUsage] (imported here, because it takes seconds)
 
         super().__init__()
-        self.size = RELEASED_SIZE if attention else SIZE
+        if attention:
+            self.size = RELEASED_SIZE
         coarsest = "Attn" if attention else ""
         finer = len(channels) - 1
         self.vqgan = VQModel(

@@ -22,7 +22,7 @@ from mani_skill.utils.wrappers import CPUGymWrapper
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks import registry
-from manifeel_ms3.tasks.obs_modes import PAD
+from manifeel_ms3.tasks.obs_modes import PAD, STATE_TOKENS
 
 GYM_ID = "manifeel_ms3/LeRobot-v0"
 """Id under which gymnasium makes a `LeRobotEnv`."""
@@ -45,9 +45,9 @@ class LeRobotEnv(gym.Env):
 
     def __init__(self, env_id: str, obs_mode: str = "rgb", env_kwargs: dict[str, Any] | None = None):
         given = env_kwargs or {}
-        if "state" in obs_mode.split("+"):
+        if not {"none", *STATE_TOKENS}.isdisjoint(obs_mode.split("+")):
             raise InvalidArgumentError(
-                f"obs_mode={obs_mode!r} holds the simulation's state; give modalities such as rgb+tacrgb"
+                f"obs_mode={obs_mode!r} holds the simulation's state, or nothing; give modalities such as rgb+tacrgb"
             )
         if given.get("render_backend") == "none":  # nothing can be shown
             self.render_mode = None

@@ -218,7 +218,8 @@ class PolicyProcess:
                 caller.knows_policy = True
                 _send(caller.connection, self._ready)
             elif caller.request is not None and isinstance(self._ready, Exception):
-                self._reply(caller, self._ready)
+                reason = f"the policy crashed and could not be loaded again ({type(self._ready).__name__}: {self._ready})"
+                self._reply(caller, PolicyUnavailableError(f"{reason}; run the command again, which keeps finished episodes"))
 
     def _ask_next_batch(self) -> None:
         if self._busy or not isinstance(self._ready, Ready):

@@ -129,8 +129,9 @@ def evaluate_episode(
         while not over:
             begin = time.perf_counter()
             action = _checked(_answer(lambda obs=obs: whole.act(obs), step_timeout), shape)
-            metrics.thinking += time.perf_counter() - begin - whole.waited
-            task.renders_cameras = whole.looks
+            looks, waited = _answer(lambda: (bool(whole.looks), float(whole.waited)), step_timeout)
+            metrics.thinking += time.perf_counter() - begin - waited
+            task.renders_cameras = looks
             on_action(action)
             obs, reward, terminated, truncated, info = env.step(action)
             metrics.add(float(reward), info)

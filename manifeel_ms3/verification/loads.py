@@ -157,7 +157,7 @@ def measure(
         if name.startswith("box"):
             found.loop = _loop(press, touching)
         if name == "ball, 10 mm":
-            found.depths = _depths(press, touching)
+            found.depths = _depths(press, name, touching, found.left_out)
         press.close()
     for name, (shape, touching, few) in KNOWN_LIMITS.items():
         press = Press(indenter(name, **shape), **arguments)
@@ -215,13 +215,16 @@ def _loop(press: Press, touching: float) -> np.ndarray:
     return np.array(points)
 
 
-def _depths(press: Press, touching: float) -> np.ndarray:
+def _depths(press: Press, name: str, touching: float, left_out: list[str]) -> np.ndarray:
     rows, gel = [], press.sensor.config.gel
     for load in DEPTH_LOADS:
+        if load > largest_load(press, name):
+            left_out.append(f"the depth of {name} at {load:g} N: it would reach the housing")
+            continue
         press.place(touching + CLEARANCE)
         press.push(load)
         rows.append((load, press.depth.max(), ball_depth(gel, BALL_RADIUS, press.wrench[0])))
-    return np.array(rows)
+    return np.array(rows).reshape(-1, 3)
 
 
 def ball_depth(gel: GelConfig, radius: float, load: float) -> float:

@@ -247,6 +247,40 @@ def test_diffusion_learns_what_its_network_predicts_and_generates_the_demonstrat
     assert same == [not draws_again] * 3
 
 
+@pytest.mark.parametrize(
+    "wrong", [dict(action_scale="Root"), dict(action_form="targets"), dict(sampler="DDPM"), dict(action_network="transformer")]
+)
+def test_choices_are_checked_as_on_the_command_line(wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(InvalidArgumentError, match=f"{name}='{value}' is unknown; choose from "):
+        DiffusionConfig(**wrong)
+
+
+class KnowsSpread(torch.nn.Module):
+    """The best network of Diffusion Policy where the demonstrated actions have a normal distribution; it predicts them."""
+
+    def __init__(self, mean: float, spread: float, alphas: torch.Tensor):
+        super().__init__()
+        self.mean, self.variance, self.alphas = mean, spread**2, alphas
+
+    def forward(self, x, step, condition):
+        signal = self.alphas[step].view(-1, 1, 1)
+        gain = signal.sqrt() * self.variance / (signal * self.variance + 1 - signal)
+        return self.mean + gain * (x - signal.sqrt() * self.mean)
+
+
+def test_few_steps_of_diffusion_generate_actions_as_they_are_distributed_and_one_step_is_refused():
+    policy = DiffusionPolicy(DiffusionConfig(prediction="sample", sampler="ddim", down_dims=(8,)), SPEC, 6).eval()
+    policy.action_network = KnowsSpread(0.5, 0.1, policy.ddim.alphas_cumprod)
+    for steps in (4, 8, 16, 50, 100):
+        actions = policy.generate(torch.zeros(200, 4), steps, generators(200))
+        assert float(actions.mean()) == pytest.approx(0.5, abs=0.03), steps
+        assert 0.03 < float(actions.std()) < 0.13, steps
+    assert not policy.config.can_generate_in(1)
+    assert policy.config.can_generate_in(2)
+    assert policy.config.step_range == "at least 2 and at most 100"
+
+
 class KnowsVelocity(torch.nn.Module):
     """The best network of Flow Matching where all demonstrations are `CLEAN`: straight to them, in the time that is left."""
 

@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from baselines.common.observation import POSE, WORK_SQUARES, observation_spec, prepare, quaternion_pose, rotation_6d_pose
+from baselines.common.observation import (
+    POSE,
+    WORK_SQUARES,
+    observation_spec,
+    prepare,
+    quaternion_pose,
+    rotation_6d_pose,
+    work_square,
+)
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError
 from tests.sample import observed_sample
@@ -50,6 +58,16 @@ def test_images_are_resized_alike_for_training_and_evaluation():
     prepared = prepare(spec.images[0], images, spec)
     assert prepared.shape == (3, 64, 64, 3)
     assert np.array_equal(prepare(spec.images[0], images[1:2], spec)[0], prepared[1])
+
+
+@pytest.mark.parametrize("camera", WORK_SQUARES)
+@pytest.mark.parametrize("shape", [(240, 320), (320, 240)])
+def test_the_work_is_cut_from_the_middle_of_wide_and_tall_images(camera, shape):
+    images = np.random.default_rng(0).integers(0, 256, (1, *shape, 3), dtype=np.uint8)
+    middle = images[:, :, 40:280] if shape[1] > 240 else images[:, 40:280]
+    part = work_square(images, camera)
+    assert part.shape[1] == part.shape[2]
+    assert np.array_equal(part, work_square(middle, camera))
 
 
 def test_a_pixel_of_a_smaller_image_is_the_mean_of_the_pixels_that_it_stands_for():

@@ -22,7 +22,7 @@ from baselines.tactile_representations.sparsh import Sparsh
 from baselines.tactile_representations.t3 import T3
 from baselines.tactile_representations.unit import UniT
 from manifeel_ms3.demonstrations import DemonstrationError, read_header, record
-from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from tests.tasks_and_marks import PEG
 
@@ -227,6 +227,28 @@ def test_every_network_of_touch_can_be_laid_out_for_training(name):
     lay_out_channels_last(encoder)  # weights of other ranks, such as those of video patches, stay as they are
     laid_out = [p.is_contiguous(memory_format=torch.channels_last) for p in encoder.parameters() if p.dim() == 4]
     assert all(laid_out)
+
+
+def test_earlier_weights_stay_unless_they_are_to_be_overwritten(pictures, tmp_path, monkeypatch):
+    monkeypatch.setitem(pretrain.REPRESENTATIONS, "t3", small_t3)
+    out, short = tmp_path / "weights.safetensors", dict(steps=1, batch_size=1)
+    trained("t3", pictures, out, **short)
+    before = out.read_bytes()
+    with pytest.raises(FileExistsAlreadyError, match="holds weights already; give another --out, or --overwrite"):
+        trained("t3", pictures, out, seed=1, **short)
+    assert out.read_bytes() == before
+    trained("t3", pictures, out, seed=1, overwrite=True, **short)
+    assert out.read_bytes() != before
+
+
+@pytest.mark.parametrize(
+    ("asked", "size"), [(dict(representation="t3"), 224), (dict(representation="unit", image_size=96), 96)]
+)
+def test_the_command_that_trains_a_policy_has_the_size_of_the_images(asked, size):
+    args = pretrain.Args(demos=(), **asked)
+    weights = f"{asked['representation']}.safetensors"
+    said = pretrain.next_step(args, [])
+    assert f"--tacrgb-weights {weights} --tactile-image-size {size}`" in said
 
 
 def test_weights_that_would_replace_a_folder_are_refused_before_the_training(tmp_path):

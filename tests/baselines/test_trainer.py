@@ -81,7 +81,7 @@ def test_a_length_in_epochs_counts_unless_that_is_fewer_steps_than_wanted_or_ste
         ),
         (
             dict(policy=DiffusionConfig(diffusion_steps=50), inference_steps=51),  # would be cut to 50, which no result says
-            "--inference-steps 51: this policy needs at least 1 and at most 50 to generate",
+            "--inference-steps 51: this policy needs at least 2 and at most 50 to generate",
         ),
         (dict(env_id=PEG), "no demonstrations are given; give --demo-path"),
     ],

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from baselines.common import training
+from baselines.common import background_evaluation, training
 from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.dataset import recorded_env_kwargs
@@ -22,6 +22,7 @@ from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow
 from baselines.references import MeanAction, Untrained
 from baselines.registry import PolicySpec
+from manifeel_ms3 import typed_modules
 from manifeel_ms3.demonstrations import DemonstrationError, read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError, checkpoint_config, samples_per_step
 from tests.command_process import run_module
@@ -288,6 +289,17 @@ def test_checkpoints_are_evaluated_one_after_the_other(evaluation, tmp_path):
     assert rates[0]["eval/success_once"] == result["success_once"]["rate"]
     assert [episode["episode_len"] for episode in result["episodes"]] == [20]  # as the evaluation's arguments say
     assert evaluation.in_use == set()
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_a_task_that_was_typed_with_its_module_is_evaluated_with_it(evaluation, tmp_path, monkeypatch):
+    """A checkpoint names no module: nothing is imported because a file says so."""
+    monkeypatch.setattr(typed_modules, "_imported", ["tests.task_of_mine"])
+    monkeypatch.setattr(background_evaluation.subprocess, "Popen", lambda command, **_: commands.append(command))
+    commands, (checkpoint, _) = [], sorted((tmp_path / "checkpoints").iterdir())
+    evaluation.submit(checkpoint)
+    evaluation._start(checkpoint)
+    assert commands[0][-2:] == ["--env-id", f"tests.task_of_mine:{PEG}"]
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)

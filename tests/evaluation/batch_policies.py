@@ -3,6 +3,7 @@
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -52,6 +53,15 @@ class Single:
 
     def act(self, obs):
         return np.zeros(6)
+
+
+class CrashesOnce(Moody):
+    """Crashes in an episode of the seed `CRASHES`, and cannot be made again, as where its memory was taken meanwhile."""
+
+    def __init__(self):
+        if (marker := Path(os.environ["CRASHES_ONCE"])).exists():
+            raise RuntimeError("out of memory")
+        marker.touch()
 
 
 class DiesWhenMade:

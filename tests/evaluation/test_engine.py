@@ -33,6 +33,7 @@ from tests.evaluation.batch_policies import (
     MISCOUNTS,
     RAISES,
     CannotBeMade,
+    CrashesOnce,
     DiesWhenMade,
     Moody,
     Single,
@@ -122,6 +123,17 @@ def test_an_episode_that_ends_the_policy_fails_alone(process, bad, reason, monke
 def test_a_policy_that_cannot_be_made_ends_the_evaluation_with_the_reason(policy, kind, reason):
     with pytest.raises(kind, match=reason):
         run_episodes(Evaluation(source_of(policy), PEG, BARE, {}), [1], workers=1)
+
+
+def test_a_policy_that_cannot_be_loaded_again_ends_the_evaluation_and_fails_no_episode(tmp_path, monkeypatch):
+    monkeypatch.setenv("CRASHES_ONCE", str(tmp_path / "marker"))
+    with PolicyProcess(source_of(CrashesOnce), answer_timeout=20.0) as process:
+        part = SharedPolicy(process.address, nothing)
+        part.begin_episode(FINE)
+        assert part.act({}).tolist() == [FINE, 0, 1]
+        assert "exit code 7" in answer_to(process, CRASHES)  # a fault of the policy
+        with pytest.raises(PolicyUnavailableError, match=r"could not be loaded again .*out of memory.*; run the command again"):
+            part.act({})
 
 
 def test_a_policy_that_answers_one_episode_is_made_where_it_is_asked():

@@ -433,6 +433,22 @@ class Derived(EpisodePolicy):
         return np.zeros(6)
 
 
+class Confused(StandStill):
+    """A policy that cannot say whether it looks."""
+
+    @property
+    def looks(self):
+        return 1 / 0
+
+
+def test_members_of_a_policy_that_fail_are_its_fault_and_end_only_its_episode(make_env):
+    env = make_env(**BARE)
+    impatient = StandStill()
+    impatient.waited = None
+    for policy, reason in ((Confused(), "step 0: ZeroDivisionError"), (impatient, "step 0: TypeError")):
+        assert reason in evaluate_episode(env, policy, 100000).error
+
+
 def test_a_policy_with_the_two_methods_has_the_defaults_of_all_others():
     plain, blind, derived = StandStill(), Blind(), Derived()
     assert with_defaults(derived) is derived

@@ -72,8 +72,9 @@ def test_what_cannot_be_made_is_said():
         make_env(cfg=SimpleNamespace(task="Nothing-v1"))
     with pytest.raises(InvalidArgumentError, match="n_envs=0"):
         make_env(n_envs=0)
-    with pytest.raises(InvalidArgumentError, match="holds the simulation's state"):
-        LeRobotEnv(PEG, "state+tacff")
+    for mode in ("state+tacff", "state_dict", "none"):
+        with pytest.raises(InvalidArgumentError, match="holds the simulation's state"):
+            LeRobotEnv(PEG, mode)
 
 
 @needs_renderer

@@ -83,7 +83,7 @@ def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp
     assert "2 of 2 episodes agree with those of the entry tiny/Peg/tacff" in caplog.text
     for changes, named in (
         (dict(env_kwargs='{"fit": "tight"}'), "env_kwargs"),
-        (dict(inference_steps=1), "inference_steps"),
+        (dict(inference_steps=3), "inference_steps"),
         (dict(policy_kwargs='{"seed": 1}'), "policy_kwargs"),
         (dict(stop_at_success=True), "stop_at_success"),
     ):
