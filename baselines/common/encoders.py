@@ -45,12 +45,18 @@ class EncoderConfig:
     tactile_features: int = 512
     """Number of features of each TacRGB image and of each TacFF force field; 512 as in the paper's public code."""
     crop: int = 0
-    """Side of the square crops of camera images, pixels: random in training, central in evaluation; whole images if 0. TacRGB
-    is not cropped, because it matters where the gel is pressed."""
+    """Side of the square crops of camera images, pixels: random in training, central in evaluation; whole images if 0."""
+    tactile_crop: int = 0
+    """The same of TacRGB images. By default they are whole, because it matters where the gel is pressed; crops that are
+    smaller by a few pixels keep a policy from recognising each demonstration by its images."""
 
     def __post_init__(self):
         require_at_least(1, image_features=self.image_features, tactile_features=self.tactile_features)
-        require_at_least(0, crop=self.crop)
+        require_at_least(0, crop=self.crop, tactile_crop=self.tactile_crop)
+
+    def crop_of(self, key: str) -> int:
+        """Side of the crops of an image, pixels; 0 for the whole image."""
+        return self.tactile_crop if is_tactile(key) else self.crop
 
 
 class SpatialSoftmax(nn.Module):
@@ -273,9 +279,10 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
         UnknownNameError: No network has the configured name.
         InvalidArgumentError: The network does not take images of this size, or cannot be frozen.
     """
+    size = network_size(config, spec, key)
     if not is_tactile(key):
-        return by_name(IMAGE_ENCODERS, config.image)(camera_size(config, spec), config.image_features)
-    encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(spec.tactile_image_size, config.tactile_features)
+        return by_name(IMAGE_ENCODERS, config.image)(size, config.image_features)
+    encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(size, config.tactile_features)
     if config.freeze_tacrgb or config.tacrgb_sensor:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(
@@ -288,9 +295,9 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     return encoder
 
 
-def camera_size(config: EncoderConfig, spec: ObservationSpec) -> int:
-    """Side of the camera images that networks get, pixels; a crop that is larger than the images leaves them whole."""
-    return min(config.crop or spec.image_size, spec.image_size)
+def network_size(config: EncoderConfig, spec: ObservationSpec, key: str) -> int:
+    """Side of an image that a network gets, pixels; a crop that is larger than the image leaves it whole."""
+    return min(config.crop_of(key) or spec.size_of(key), spec.size_of(key))
 
 
 def field_encoder(config: EncoderConfig, spec: ObservationSpec) -> nn.Module:
@@ -328,7 +335,7 @@ class ObservationEncoder(nn.Module):
 
     def __init__(self, config: EncoderConfig, spec: ObservationSpec, obs_horizon: int):
         super().__init__()
-        self.crop, self.spec = config.crop, spec
+        self.config, self.spec = config, spec
         self.images = nn.ModuleList(image_encoder(config, spec, key) for key in spec.images)
         self.fields = nn.ModuleList(field_encoder(config, spec) for _ in spec.force_fields)
         pads = sum(map(is_tactile, spec.images)) + len(self.fields)
@@ -338,28 +345,26 @@ class ObservationEncoder(nn.Module):
         )
 
     def forward(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Encode observations {key: (B, obs_horizon, ...)}: images as uint8, the rest as normalised floats."""
+        """Encode observations {key: (B, obs_horizon, ...)}: images as uint8 or normalised, the rest as normalised floats."""
         batch, horizon = obs[POSE].shape[:2]
         features = [obs[POSE].flatten(0, 1)]
         for key, net in zip(self.spec.images, self.images, strict=True):
-            features.append(net(network_images(key, obs[key], self.crop, self.training)))
+            features.append(net(network_images(obs[key], self.config.crop_of(key), self.training)))
         for key, net in zip(self.spec.force_fields, self.fields, strict=True):
             features.append(net(obs[key].flatten(0, 1).movedim(-1, 1)))
         return torch.cat(features, dim=-1).view(batch, horizon, -1).flatten(1)
 
 
-def network_images(key: str, images: torch.Tensor, crop: int, at_random: bool) -> torch.Tensor:
-    """Images (B, T, H, W, 3) uint8 as networks take them: (B * T, 3, H, W) in [-1, 1], those of cameras cropped.
+def network_images(images: torch.Tensor, crop: int, at_random: bool) -> torch.Tensor:
+    """Images (B, T, H, W, 3) as networks take them: (B * T, 3, H, W), cropped, and in [-1, 1] where they were uint8.
 
     Args:
-        key: The observation's path.
-        images: The images.
-        crop: Side of the crops of camera images, pixels; 0 for whole images.
+        images: The images, uint8, or floats that are normalised already.
+        crop: Side of the crops, pixels; 0 for whole images.
         at_random: Whether crops are taken at random places; else the centre is taken.
     """
-    if not is_tactile(key):
-        images = cropped(images, crop, at_random)
-    return images.flatten(0, 1).movedim(-1, 1).float() / 127.5 - 1.0
+    taken = cropped(images, crop, at_random).flatten(0, 1).movedim(-1, 1)
+    return taken.float() / 127.5 - 1.0 if images.dtype == torch.uint8 else taken
 
 
 def cropped(images: torch.Tensor, size: int, at_random: bool) -> torch.Tensor:

@@ -16,6 +16,12 @@ MIN_TOUCH = 1e-6
 """Smallest half range by which a force field is divided, in N, or in m with units="tacsl"; set once, not tuned."""
 
 
+MIN_GREY = 1.0
+"""Smallest half range by which a pixel of TacRGB is divided, in grey levels, so that its noise is not magnified."""
+PIXEL_SHARE = 0.1
+"""The same as a share of the largest half range among all pixels; set once, not tuned."""
+
+
 class Normalizer(nn.Module):
     """Affine map of the data's range to [-1, 1], for each component.
 
@@ -43,9 +49,18 @@ class Normalizer(nn.Module):
         """
         return cls((*taxel_shape, 3), MIN_TOUCH, TAXEL_SHARE)
 
+    @classmethod
+    def of_pixels(cls, size: int) -> "Normalizer":
+        """The normaliser of square TacRGB images: every colour of every pixel has its own range, as in `of_taxels`.
+
+        Args:
+            size: Side of the images, pixels.
+        """
+        return cls((size, size, 3), MIN_GREY, PIXEL_SHARE)
+
     def fit(self, data: torch.Tensor) -> None:
         """Take the range from data (..., *shape)."""
-        flat = data.reshape(-1, *self.low.shape).float()
+        flat = data.reshape(-1, *self.low.shape)
         self.low.copy_(flat.amin(0))
         self.high.copy_(flat.amax(0))
 

@@ -45,6 +45,10 @@ class PolicyConfig:
     action_scale: Literal["linear", "root"] = "linear"
     """Scale of the actions in the loss: "linear" as in the paper, or "root", which gives more weight to the small
     actions with which parts are brought together."""
+    tacrgb_scale: Literal["colour", "pixel"] = "colour"
+    """Scale of TacRGB images: "colour" maps 0 to 255 to [-1, 1] as in the paper, and "pixel" the range that every pixel has in
+    the demonstrations, as for force fields, because touch changes most pixels by a few grey levels. For networks that begin
+    with pretrained weights it must be "colour"."""
     action_network: Literal["unet", "mlp"] = "unet"
     """Network over action sequences: the 1-D U-Net of Diffusion Policy, or a residual MLP, which takes less time on a CPU."""
     mlp_width: int = 256
@@ -157,6 +161,10 @@ class VisuotactilePolicy(nn.Module):
         self.encoder, self.action_network = self.make_networks()
         normalizers = {POSE: Normalizer(spec.pose_features)}
         normalizers |= {key: Normalizer.of_taxels(spec.taxel_shape) for key in spec.force_fields}
+        if config.tacrgb_scale == "pixel":
+            self._require_no_pretrained()
+            normalizers |= {key: Normalizer.of_pixels(spec.size_of(key)) for key in spec.images if is_tactile(key)}
+        self.normalized = list(normalizers)
         self.obs_normalizers = nn.ModuleDict({module_name(key): one for key, one in normalizers.items()})
         shape = (config.pred_horizon, action_dim) if config.predicts_targets else action_dim
         self.action_normalizer = ActionNormalizer(shape, config.action_scale == "root", self.action_pairs())
@@ -166,6 +174,12 @@ class VisuotactilePolicy(nn.Module):
         config = self.config
         encoder = ObservationEncoder(config.encoder, self.spec, config.obs_horizon)
         return encoder, make_action_network(config, self.action_dim, encoder.out_features)
+
+    def _require_no_pretrained(self) -> None:
+        if any(isinstance(network, PretrainedEncoder) for network in self.encoder.modules()):
+            raise InvalidArgumentError(
+                f"tacrgb_scale='pixel': {self.config.encoder.tacrgb!r} scales its images as its authors do; leave it 'colour'"
+            )
 
     def action_pairs(self) -> list[tuple[int, int]]:
         """Indices of the components of an action that must be scaled as the x and y of one vector; none by default."""
@@ -186,7 +200,7 @@ class VisuotactilePolicy(nn.Module):
             observations: Observations {key: (S, ...)}.
             actions: Actions (S, A), or targets (S, pred_horizon, A), which have a range for each step of a prediction.
         """
-        for key in (POSE, *self.spec.force_fields):
+        for key in self.normalized:
             self.obs_normalizer(key).fit(observations[key])
         self.action_normalizer.fit(actions)
         for network in self.modules():
@@ -199,7 +213,7 @@ class VisuotactilePolicy(nn.Module):
 
     def condition(self, obs: dict[str, torch.Tensor], pose_noise: float = 0.0) -> torch.Tensor:
         """Features (B, ...) of observations {key: (B, obs_horizon, ...)}."""
-        normalised = {key: self.obs_normalizer(key).normalize(obs[key]) for key in (POSE, *self.spec.force_fields)}
+        normalised = {key: self.obs_normalizer(key).normalize(obs[key]) for key in self.normalized}
         if pose_noise > 0:
             noise = pose_noise * torch.randn_like(normalised[POSE])
             noise[..., HEIGHT] = 0.0

@@ -51,7 +51,7 @@ class EquivariantObservationEncoder(nn.Module):
         super().__init__()
         if spec.pose != "rotation_6d":
             raise InvalidArgumentError(f"pose={spec.pose!r}: this policy rotates poses as vectors; give --pose rotation_6d")
-        self.crop, self.spec = config.crop, spec
+        self.config, self.spec = config, spec
         self.cameras = [key for key in spec.images if not is_tactile(key)]
         self.pads = [key for key in spec.images if is_tactile(key)]
         view = by_name(EQUIVARIANT_IMAGE_ENCODERS, config.image)
@@ -80,7 +80,7 @@ class EquivariantObservationEncoder(nn.Module):
 
     def _view(self, key: str, obs: dict[str, torch.Tensor], pose: torch.Tensor) -> torch.Tensor:
         """Features (B * obs_horizon, fields, 8) of a camera, in the frame of the scene."""
-        fields = self.views[self.cameras.index(key)](network_images(key, obs[key], self.crop, self.training))
+        fields = self.views[self.cameras.index(key)](network_images(obs[key], self.config.crop_of(key), self.training))
         if key not in HAND_CAMERAS:
             return fields
         x, y = POSE_PAIRS[1]  # the hand's own x axis, which is level where the hand points down
@@ -88,7 +88,8 @@ class EquivariantObservationEncoder(nn.Module):
 
     def _touch(self, obs: dict[str, torch.Tensor]) -> torch.Tensor:
         """Features (B * obs_horizon, F) of all tactile observations."""
-        images = [net(network_images(key, obs[key], 0, self.training)) for key, net in zip(self.pads, self.images, strict=True)]
+        crop = self.config.tactile_crop
+        images = [net(network_images(obs[key], crop, self.training)) for key, net in zip(self.pads, self.images, strict=True)]
         fields = [
             net(obs[key].flatten(0, 1).movedim(-1, 1)) for key, net in zip(self.spec.force_fields, self.fields, strict=True)
         ]

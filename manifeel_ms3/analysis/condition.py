@@ -36,6 +36,8 @@ OF_MODALITIES = {
     "policy.encoder.image_features": ("rgb",),
     "tactile_image_size": ("tacrgb",),
     "tacrgb_weights": ("tacrgb",),
+    "policy.tacrgb_scale": ("tacrgb",),
+    "policy.encoder.tactile_crop": ("tacrgb",),
     "policy.encoder.tacrgb": ("tacrgb",),
     "policy.encoder.tacrgb_sensor": ("tacrgb",),
     "policy.encoder.freeze_tacrgb": ("tacrgb",),

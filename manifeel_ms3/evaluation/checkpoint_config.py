@@ -16,7 +16,12 @@ TRAINING_STATE = "training.safetensors"
 TRAINING_LOSS = "losses/total_loss"
 """Name of the training loss in log.jsonl, the log beside the checkpoints."""
 
-IMPLIED = {"num_processes": 1, "policy.action_form": "delta"}
+IMPLIED = {
+    "num_processes": 1,
+    "policy.action_form": "delta",
+    "policy.tacrgb_scale": "colour",
+    "policy.encoder.tactile_crop": 0,
+}
 """Settings that configurations of older versions lack, with the values that they count as having. Dots join nested names."""
 
 

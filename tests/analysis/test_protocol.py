@@ -350,3 +350,15 @@ def test_outcomes_that_never_varied_have_an_interval():
     assert (same.value, same.low, same.high) == (0.0, pytest.approx(-unseen, rel=1e-3), pytest.approx(unseen, rel=1e-3))
     assert p == 1.0
     assert mean_success(always(2, 0)).high > 0.6
+
+
+def test_results_from_before_a_setting_existed_are_of_the_condition_with_its_default():
+    def condition(mode: str, config: dict) -> Condition:
+        return condition_of(result_of(PEG, dict(obs_mode=mode), config | dict(obs_mode=mode), [made_up(1, True)]))
+
+    now, before, other = (config_of("diffusion_policy", "cpu", "PegInsertion", "rgb+tacrgb", 0) for _ in range(3))
+    del before["policy"]["tacrgb_scale"], before["policy"]["encoder"]["tactile_crop"]
+    other["policy"]["tacrgb_scale"] = "pixel"
+    assert condition("rgb+tacrgb", before) == condition("rgb+tacrgb", now)
+    assert condition("rgb+tacrgb", other) != condition("rgb+tacrgb", now)
+    assert condition("rgb", other) == condition("rgb", now)  # nothing to scale

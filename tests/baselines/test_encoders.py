@@ -83,7 +83,7 @@ def test_an_encoder_crops_at_random_in_training_and_in_the_centre_in_evaluation(
 def test_networks_take_colours_in_their_order_from_minus_one_to_one():
     images = torch.zeros(2, 1, 20, 30, 3, dtype=torch.uint8)
     images[1, 0, 3, 5] = torch.tensor([255, 51, 0])
-    seen = network_images("sensor_data/wrist/rgb", images, crop=0, at_random=True)
+    seen = network_images(images, crop=0, at_random=True)
     assert (seen.shape, seen.unique().tolist()) == ((2, 3, 20, 30), pytest.approx([-1.0, -0.6, 1.0]))
     assert seen[1, :, 3, 5].tolist() == pytest.approx([1.0, -0.6, -1.0])
 
@@ -105,17 +105,18 @@ def test_conditions_have_the_sizes_of_the_paper(mode, changes, per_step):
 
 
 @pytest.mark.parametrize("image", ["small_cnn", "fine_cnn", "resnet18", "resnet18_keypoints"])
-@pytest.mark.parametrize("crop", [40, 76])
-def test_crops_are_of_cameras_alone_and_may_be_larger_than_the_images(image, crop):
+@pytest.mark.parametrize(("crop", "tactile_crop"), [(40, 0), (76, 0), (0, 28), (40, 76)])
+def test_cameras_and_pads_have_crops_of_their_own_which_may_be_larger_than_the_images(image, crop, tactile_crop):
     spec = observation_spec("rgb+tacrgb", ("wrist",), ("right",), 48, 32)
-    encoder = ObservationEncoder(EncoderConfig(image, "small_cnn", image_features=8, tactile_features=8, crop=crop), spec, 1)
+    crops = dict(crop=crop, tactile_crop=tactile_crop)
+    encoder = ObservationEncoder(EncoderConfig(image, "small_cnn", image_features=8, tactile_features=8, **crops), spec, 1)
     camera, pad = spec.images
     sizes = {}
     for key, net in zip(spec.images, encoder.images, strict=True):
         net.register_forward_pre_hook(lambda _net, inputs, key=key: sizes.update({key: inputs[0].shape[-1]}))
     obs = {key: torch.zeros(2, 1, spec.size_of(key), spec.size_of(key), 3, dtype=torch.uint8) for key in spec.images}
     assert encoder(obs | {POSE: torch.zeros(2, 1, 7)}).shape == (2, 8 + 8 + 7)
-    assert sizes == {camera: min(crop, 48), pad: 32}
+    assert sizes == {camera: min(crop or 48, 48), pad: min(tactile_crop or 32, 32)}
 
 
 def test_key_points_are_pairs_of_coordinates():

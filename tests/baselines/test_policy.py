@@ -3,10 +3,14 @@
 import pytest
 import torch
 
+from baselines.common.encoders import EncoderConfig
+from baselines.common.observation import POSE, observation_spec
 from baselines.common.policy import PolicyConfig, make_action_network
 from baselines.common.unet import ConditionalUnet1D, ResidualBlock
+from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from manifeel_ms3.errors import InvalidArgumentError
 
+META = torch.device("meta")
 HORIZONS = dict(obs_horizon=2, pred_horizon=16, action_horizon=8)
 
 
@@ -94,3 +98,43 @@ def test_what_the_unet_computes_on_its_way_down_bypasses_its_middle():
     actions, step, condition = torch.randn(2, 16, 6), torch.tensor([3, 3]), torch.randn(1, 10).expand(2, -1)
     first, second = net(actions, step, condition)
     assert not torch.allclose(first, second, atol=1e-3)
+
+
+def tacrgb_policy(**changes) -> DiffusionPolicy:
+    encoder = EncoderConfig("small_cnn", "small_cnn", image_features=8, tactile_features=8, tactile_crop=28)
+    spec = observation_spec("tacrgb", (), ("right",), 48, 32)
+    return DiffusionPolicy(DiffusionConfig(obs_horizon=1, down_dims=(8,), encoder=encoder, **changes), spec, 6).eval()
+
+
+def test_pixels_of_touch_are_scaled_by_their_own_ranges_in_the_demonstrations():
+    torch.manual_seed(0)
+    policy, seen = tacrgb_policy(tacrgb_scale="pixel"), []
+    policy.encoder.images[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    (key,) = policy.spec.images
+    images = torch.randint(100, 120, (50, 32, 32, 3), dtype=torch.uint8)
+    images[:, 5, 6] = 90  # a pixel that never changes
+    poses = torch.rand(50, 7)
+    policy.fit_normalizers({key: images, POSE: poses}, torch.rand(50, 6))
+    policy.condition({key: images[:, None], POSE: poses[:, None]})
+    centre = images[:, 2:30, 2:30].movedim(-1, 1).float()
+    low, high = centre.amin(0), centre.amax(0)
+    expected = (centre - (high + low) / 2) / torch.clamp((high - low) / 2, min=1.0)
+    torch.testing.assert_close(seen[0], expected, rtol=0, atol=1e-5)
+    assert seen[0].shape[2:] == (28, 28)
+    assert (seen[0][:, :, 3, 4] == 0).all()
+    assert float(seen[0].abs().max()) <= 1.0
+
+
+def test_colours_of_touch_are_scaled_alike_unless_told_otherwise():
+    policy, seen = tacrgb_policy(), []
+    policy.encoder.images[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    images = torch.full((1, 1, 32, 32, 3), 255, dtype=torch.uint8)
+    policy.condition({policy.spec.images[0]: images, POSE: torch.zeros(1, 1, 7)})
+    assert (seen[0] == 1.0).all()
+    assert not any("tactile" in name for name in policy.obs_normalizers)
+
+
+def test_pretrained_networks_scale_their_images_themselves():
+    with pytest.raises(InvalidArgumentError, match=r"tacrgb_scale='pixel': 't3' scales its images as its authors do"), META:
+        spec = observation_spec("tacrgb", (), ("right",), 48, 224)
+        DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), tacrgb_scale="pixel"), spec, 6)
