@@ -135,6 +135,7 @@ def test_colours_of_touch_are_scaled_alike_unless_told_otherwise():
 
 
 def test_pretrained_networks_scale_their_images_themselves():
+    spec = observation_spec("tacrgb", (), ("right",), 48, 224)
+    config = DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), tacrgb_scale="pixel")
     with pytest.raises(InvalidArgumentError, match=r"tacrgb_scale='pixel': 't3' scales its images as its authors do"), META:
-        spec = observation_spec("tacrgb", (), ("right",), 48, 224)
-        DiffusionPolicy(DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), tacrgb_scale="pixel"), spec, 6)
+        DiffusionPolicy(config, spec, 6)
