@@ -3,14 +3,13 @@
 import pytest
 import torch
 
-from baselines.common.encoders import EncoderConfig
+from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig, PretrainedEncoder
 from baselines.common.observation import POSE, observation_spec
 from baselines.common.policy import PolicyConfig, make_action_network
 from baselines.common.unet import ConditionalUnet1D, ResidualBlock
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from manifeel_ms3.errors import InvalidArgumentError
 
-META = torch.device("meta")
 HORIZONS = dict(obs_horizon=2, pred_horizon=16, action_horizon=8)
 
 
@@ -134,8 +133,8 @@ def test_colours_of_touch_are_scaled_alike_unless_told_otherwise():
     assert not any("tactile" in name for name in policy.obs_normalizers)
 
 
-def test_pretrained_networks_scale_their_images_themselves():
-    spec = observation_spec("tacrgb", (), ("right",), 48, 224)
-    config = DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), tacrgb_scale="pixel")
-    with pytest.raises(InvalidArgumentError, match=r"tacrgb_scale='pixel': 't3' scales its images as its authors do"), META:
-        DiffusionPolicy(config, spec, 6)
+def test_pretrained_networks_scale_their_images_themselves(monkeypatch):
+    monkeypatch.setitem(TACRGB_ENCODERS, "mine", lambda _size, _features: PretrainedEncoder())
+    spec, config = observation_spec("tacrgb", (), ("right",), 48, 32), EncoderConfig(tacrgb="mine")
+    with pytest.raises(InvalidArgumentError, match=r"tacrgb_scale='pixel': 'mine' scales its images as its authors do"):
+        DiffusionPolicy(DiffusionConfig(encoder=config, tacrgb_scale="pixel"), spec, 6)
