@@ -1,9 +1,12 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
+import logging
+
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
 from manifeel_ms3.errors import InvalidArgumentError
 
+log = logging.getLogger(__name__)
 PAD = "tactile_"
 """Prefix of the names of tactile pads among the sensors of an observation."""
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
@@ -51,14 +54,10 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
 
 
 def pads_to_observe(obs_mode: str, sides: tuple[str, ...]) -> tuple[str, ...]:
-    """The sides of the pads, of which there is at least one if touch is observed.
+    """The sides of the pads; warns if there is none, and touch is observed.
 
-    Raises:
-        InvalidArgumentError: There is none.
+    It is no error, because ManiSkill's tools replay files that were recorded without pads in any observation mode.
     """
     if not sides and split_obs_mode(obs_mode)[1]:
-        raise InvalidArgumentError(
-            f"obs_mode={obs_mode!r} observes touch, and tactile_sensors names no pad; give 'left', 'right' or both, or leave "
-            "'tacrgb' and 'tacff' out"
-        )
+        log.warning("obs_mode=%r observes touch, but tactile_sensors names no pad, so that touch is missing", obs_mode)
     return sides

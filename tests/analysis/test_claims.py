@@ -79,7 +79,7 @@ def test_more_than_one_in_ten_pairs_of_published_runs_differ_by_their_seed_alone
 def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
     for task, seed in product(("PegInsertion", "USBInsertion", "PowerPlugInsertion"), range(3)):
         write_run(tmp_path, VISION, 0.2, seed, task=task)
-        write_run(tmp_path, TACFF, 0.28, seed, task=task)
+        write_run(tmp_path, TACFF, 0.31, seed, task=task)
     write_run(tmp_path, VISION, 0.2, task="GearAssembly")
     write_run(tmp_path, TACFF, 0.9, task="GearAssembly")
     *found, single = [outcome for _, _, outcome in answered(tmp_path)]

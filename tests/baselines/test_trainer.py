@@ -27,7 +27,7 @@ from baselines.studies.planning import OF_THE_MACHINE
 from manifeel_ms3.analysis.condition import NO_SETTINGS, OF_MODALITIES, settings_of
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, MissingExtraError, PluginError, WorkFailedError
-from manifeel_ms3.evaluation.checkpoint_config import CONFIG
+from manifeel_ms3.evaluation.checkpoint_config import CONFIG, IMPLIED
 from manifeel_ms3.evaluation.result import PATHS
 from tests.sample import observed_sample, states_sample
 from tests.tasks_and_marks import PEG
@@ -236,6 +236,13 @@ def test_lists_of_settings_name_settings_that_there_are(trainer_args):
     config = json.loads((checkpoint / CONFIG).read_text())
     known = config.keys() | {field.name for field in dataclasses.fields(TrainArgs)}
     assert known >= {*FREE_ON_RESUME, *NO_SETTINGS, *OF_THE_MACHINE, *PATHS}
+    for name in IMPLIED:  # at these values, settings are left out
+        *places, last = name.split(".")
+        entry = config
+        for place in places:
+            entry = entry[place]
+        assert last in entry
+        entry[last] = "another"
     assert {name for name, _ in settings_of(config, "rgb+tacrgb+tacff")} >= set(OF_MODALITIES)
 
 

@@ -100,13 +100,18 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         split_obs_mode(mode)
 
 
+def test_touch_without_a_pad_is_missing_with_a_warning(make_env, caplog):
+    env = make_env(obs_mode="tacff", tactile_sensors=(), render_backend="none")
+    assert "observes touch, but tactile_sensors names no pad" in caplog.text
+    assert not env.reset(seed=0)[0]["sensor_data"]
+
+
 @pytest.mark.parametrize(
     ("kwargs", "word"),
     [
         (dict(obs_mode="rgb+smell"), "tacrgb"),
         (dict(cameras=("top",)), "wrist"),
         (dict(tactile_sensors=("middle",)), "left"),
-        (dict(obs_mode="rgb+tacff", tactile_sensors=()), "names no pad; give 'left', 'right' or both"),
         (dict(lighting="disco"), "dim"),
         (dict(tactile={"optics.nose": 1.0}), "optics.nose"),
         (dict(tactile={"gel.thickness": 0.0}), "gel.thickness"),
