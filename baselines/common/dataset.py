@@ -11,7 +11,7 @@ import torch
 
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats import Demonstration, format_of
-from manifeel_ms3.demonstrations.formats.h5_checks import POSE_SIZE
+from manifeel_ms3.demonstrations.formats.demonstration_format import require_form
 from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
 from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.progress import progress_bar
@@ -62,7 +62,7 @@ def _prepared(spec: ObservationSpec, file: Path, recorded: Demonstration, number
         DemonstrationError: An observation has another form than networks take, or a number is not finite.
     """
     for key in spec.keys:
-        _require_form(file, number, key, recorded[key])
+        require_form(f"{file}: {key!r} of episode {number}, counted from 0,", key, recorded[key].shape)
     episode = {key: prepare(key, recorded[key], spec) for key in spec.keys}
     episode["actions"] = recorded["actions"].astype(np.float32)  # other programs record other types, too
     for key in ("actions", POSE, *spec.force_fields):
@@ -73,21 +73,6 @@ def _prepared(spec: ObservationSpec, file: Path, recorded: Demonstration, number
                 "again, or leave the file out"
             )
     return episode
-
-
-def _require_form(file: Path, number: int, key: str, values: np.ndarray) -> None:
-    """Check that an observation is a pose, an image with three channels, or a force field with three components, at each step.
-
-    Raises:
-        DemonstrationError: It has another shape.
-    """
-    expected = (POSE_SIZE,) if key == POSE else ("height", "width", 3) if key.endswith("/rgb") else ("rows", "columns", 3)
-    found = values.shape[1:]
-    if len(found) != len(expected) or found[-1] != expected[-1]:
-        raise DemonstrationError(
-            f"{file}: {key!r} of episode {number}, counted from 0, has the shape {found} at a step, expected {expected}; "
-            + ("the pose of the tool is x, y, z and a quaternion wxyz" if key == POSE else "record it again")
-        )
 
 
 def _require_same_shapes(file: Path, first: Demonstration, episodes: list[Demonstration]) -> None:

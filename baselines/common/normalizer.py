@@ -14,8 +14,6 @@ all taxels, so that a taxel that is hardly touched is not magnified to the size 
 shows its effect."""
 MIN_TOUCH = 1e-6
 """Smallest half range by which a force field is divided, in N, or in m with units="tacsl"; set once, not tuned."""
-
-
 MIN_GREY = 1.0
 """Smallest half range by which a pixel of TacRGB is divided, in grey levels, so that its noise is not magnified."""
 PIXEL_SHARE = 0.1

@@ -11,10 +11,8 @@ import numpy as np
 
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.sensors.config import TactileSensorConfig
-from manifeel_ms3.tasks.obs_modes import PAD, split_obs_mode
+from manifeel_ms3.tasks.obs_modes import PAD, POSE, split_obs_mode
 
-POSE = "extra/tcp_pose"
-"""Key of the pose of the tool centre point."""
 PoseForm = Literal["quaternion", "rotation_6d"]
 """Forms in which networks take the pose: its position with a quaternion, or with two columns of the rotation matrix."""
 POSE_FEATURES: dict[PoseForm, int] = {"quaternion": 7, "rotation_6d": 9}

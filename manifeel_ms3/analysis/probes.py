@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.tasks.exploration.object_search import CONTAINER_XY
+from manifeel_ms3.tasks.obs_modes import POSE
 from manifeel_ms3.tasks.registry import task_spec
 
 EpisodeGroup = Any
@@ -93,7 +94,7 @@ def _end_of_first_closing(episode: EpisodeGroup) -> list[int]:
 
 @register_probe("ManiFeel-BallSorting-v1", "ManiFeel-BallSortingDim-v1", question="ball in the hand: golf or table tennis")
 def _golf_ball_held(episode: EpisodeGroup) -> Samples:
-    tool = episode["obs/extra/tcp_pose"][:, :3]
+    tool = episode[f"obs/{POSE}"][:, :3]
     for t in _end_of_first_closing(episode):  # the first grasp takes the wrong ball half of the time
         distance = [np.linalg.norm(_position(episode, f"{ball}_ball")[t] - tool[t]) for ball in ("golf", "tennis")]
         yield t, float(distance[0] < distance[1])
@@ -108,7 +109,7 @@ def _battery_in_far_half(episode: EpisodeGroup) -> Samples:
 
 @register_probe("ManiFeel-ObjectSearch-v1", question="battery between the fingers or not, once closed")
 def _battery_held(episode: EpisodeGroup) -> Samples:
-    tool = episode["obs/extra/tcp_pose"][:, :3]
+    tool = episode[f"obs/{POSE}"][:, :3]
     for t in _end_of_first_closing(episode):
         distance = np.linalg.norm((_position(episode, "battery")[t] - tool[t])[:2])
         yield t, float(distance < BETWEEN_FINGERS)
@@ -118,7 +119,7 @@ def _battery_held(episode: EpisodeGroup) -> Samples:
 def _pitch_in_hand(episode: EpisodeGroup) -> Samples:
     (name,) = [name for name in episode["env_states/actors"] if name.endswith("peg")]
     plug = episode[f"env_states/actors/{name}"][:, 3:7]
-    tool = episode["obs/extra/tcp_pose"][:, 3:7]
+    tool = episode[f"obs/{POSE}"][:, 3:7]
     for t in EARLY:
         held = Rotation.from_quat(tool[t], scalar_first=True).inv() * Rotation.from_quat(plug[t], scalar_first=True)
         yield t, float(np.rad2deg(held.as_rotvec()[1]))

@@ -19,8 +19,8 @@ from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import make_env
 
+from .formats.demonstration_format import POSE_SIZE
 from .formats.folder_checks import require_revision
-from .formats.h5_checks import POSE_SIZE
 from .formats.maniskill_h5 import (
     DemonstrationError,
     actions_of,

@@ -9,6 +9,8 @@ from manifeel_ms3.errors import InvalidArgumentError
 log = logging.getLogger(__name__)
 PAD = "tactile_"
 """Prefix of the names of tactile pads among the sensors of an observation."""
+POSE = "extra/tcp_pose"
+"""Path of the pose of the tool centre point in an observation: x, y, z in m and a quaternion wxyz."""
 TACTILE_TOKENS = {"tacrgb": "rgb", "tacff": "force_field"}
 """Outputs of a tactile sensor by their tokens in an observation mode."""
 STATE_TOKENS = ("state", "state_dict")

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError
+from manifeel_ms3.tasks.obs_modes import POSE
 
 Demonstration = dict[str, np.ndarray]
 """Arrays of one episode: "actions" (T, A), and observations (T + 1, ...) by their keys, such as "sensor_data/wrist/rgb"."""
@@ -18,8 +19,33 @@ MAX_COMPRESSION = 1032
 be larger than its stored bytes times this ratio is refused before it is read."""
 
 
+POSE_SIZE = 7
+"""Number of entries of a pose: 3 of the position, 4 of the quaternion."""
+
+
 class DemonstrationError(InvalidFileError):
     """A file or folder of demonstrations cannot be used as asked."""
+
+
+def require_form(name: str, key: str, shape: tuple[int, ...]) -> None:
+    """Check that an array holds a pose, an image with three channels, or a force field with three components at each step.
+
+    Args:
+        name: Name of the array, for the message.
+        key: Observation that the array holds.
+        shape: Shape of the array; the first axis counts steps.
+
+    Raises:
+        DemonstrationError: The array has another shape.
+    """
+    expected = (POSE_SIZE,) if key == POSE else ("height", "width", 3) if key.endswith("/rgb") else ("rows", "columns", 3)
+    found = shape[1:]
+    if len(found) != len(expected) or found[-1] != expected[-1]:
+        raise DemonstrationError(
+            f"{name} has the shape {found} at a step, expected {expected}"
+            + (", the position and a quaternion" if key == POSE else "")
+            + "; record or export it again"
+        )
 
 
 class ReadEpisodes(Protocol):

@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from manifeel_ms3.command_line import missing_extras_named
-from manifeel_ms3.tasks.obs_modes import PAD
+from manifeel_ms3.tasks.obs_modes import PAD, POSE
 
-from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
+from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress, require_form
 from .folder_checks import broken_if_fails, read_origin, require_task
 from .maniskill_h5 import about_task, observation_keys, read_header, read_trajectories, require_same_form
 from .touch_units import recorded_units
@@ -52,7 +52,7 @@ def is_zarr(path: Path) -> bool:
 
 def array_name(key: str) -> str:
     """The paper's name of an observation, such as "wrist" for "sensor_data/wrist/rgb"."""
-    if key == "extra/tcp_pose":
+    if key == POSE:
         return "state"
     _, sensor, kind = key.split("/")
     if not sensor.startswith(PAD):
@@ -123,7 +123,7 @@ def read_zarr(
     arrays = open_arrays(folder, [ENDS, ACTION, *names.values()])
     ends = _ends(folder, arrays)
     for key, name in names.items():
-        _require_form(folder, key, name, arrays[name].shape)
+        require_form(f"{folder}/{name}", key, arrays[name].shape)
     count = len(ends) if num is None else num
     if not 0 < count <= len(ends):
         raise DemonstrationError(f"{folder} holds {len(ends)} episodes, {count} are wanted; ask for fewer")
@@ -151,13 +151,6 @@ def _ends(folder: Path, arrays: dict[str, Any]) -> list[int]:
             f"(steps, numbers) in {ACTION}; export the data set again"
         )
     return ends.tolist()
-
-
-def _require_form(folder: Path, key: str, name: str, shape: tuple[int, ...]) -> None:
-    """Check the axes of an observation's array."""
-    expected = (len(XYZW),) if key == "extra/tcp_pose" else ("rows", "columns", 3)
-    if len(shape) != 1 + len(expected) or shape[-1] != expected[-1]:
-        raise DemonstrationError(f"{folder}/{name} has the shape {shape}, expected (steps, {expected}); export it again")
 
 
 def write_zarr(path: Path, folder: Path, progress: Progress = iter) -> None:
@@ -203,7 +196,7 @@ def _about(path: Path, keys: list[str]) -> dict[str, Any]:
 
 def _from_paper(key: str, values: np.ndarray) -> np.ndarray:
     """An array of the store (T, ...) as the observation of this key."""
-    if key == "extra/tcp_pose":
+    if key == POSE:
         return values[:, WXYZ].astype(np.float32)
     if not key.endswith("/rgb"):
         return values.astype(np.float32)
@@ -214,7 +207,7 @@ def _from_paper(key: str, values: np.ndarray) -> np.ndarray:
 
 def _to_paper(key: str, values: np.ndarray) -> np.ndarray:
     """The observation of this key (T, ...) as an array of the store."""
-    if key == "extra/tcp_pose":
+    if key == POSE:
         return values[:, XYZW]
     if "/tactile_" in key and key.endswith("/rgb"):
         return np.ascontiguousarray(np.rot90(values, -1, axes=(1, 2))).astype(np.float32) / 255

@@ -12,7 +12,7 @@ from typing import Any
 
 import h5py
 
-from .demonstration_format import MAX_COMPRESSION, DemonstrationError
+from .demonstration_format import MAX_COMPRESSION, POSE_SIZE, DemonstrationError
 
 COMPRESSION = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_LZF}
 """HDF5's compressing filters that may be used, gzip and LZF; neither shrinks data more than `MAX_COMPRESSION` times."""
@@ -24,8 +24,6 @@ GROUPS = ("obs", "obs/sensor_data", "obs/extra", "env_states", "env_states/actor
 """Parts of an episode that hold other parts; each one stands after its parent."""
 PER_STEP = ("success", "fail", "terminated", "truncated", "contact_force", "rewards")
 """Parts of an episode with one number for each step."""
-POSE_SIZE = 7
-"""Number of entries of a pose: 3 of the position, 4 of the quaternion."""
 
 
 def check_trajectories(file: h5py.File, path: Path, episodes: Path) -> None:

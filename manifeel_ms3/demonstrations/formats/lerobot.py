@@ -25,6 +25,7 @@ import numpy as np
 from manifeel_ms3.command_line import missing_extras_named
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.files import read_json
+from manifeel_ms3.tasks.obs_modes import POSE
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
 from .demonstration_format import MAX_COMPRESSION, Demonstration, DemonstrationError, DemonstrationFormat, Progress
@@ -33,8 +34,6 @@ from .lerobot_layout import DATA, INFO, ORIGIN, POSE_AXES, VIDEO, earlier_featur
 from .lerobot_writing import pyarrow, write_lerobot
 
 log = logging.getLogger(__name__)
-POSE = "extra/tcp_pose"
-"""Key of the tool's pose."""
 PLACE = ("chunk_index", "file_index")
 """Numbers that name a file of the layout."""
 MP4 = b"ftyp"

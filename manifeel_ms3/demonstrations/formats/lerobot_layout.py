@@ -1,6 +1,6 @@
 """Where LeRobot's datasets (format 3.0) keep things, and the names of their features."""
 
-from manifeel_ms3.tasks.obs_modes import PAD
+from manifeel_ms3.tasks.obs_modes import PAD, POSE
 
 INFO = "meta/info.json"
 """File that describes a dataset; a folder without it is none."""
@@ -27,7 +27,7 @@ def feature_name(key: str) -> str:
     Args:
         key: Key of the observation, such as "sensor_data/wrist/rgb", "sensor_data/tactile_right/force_field", "extra/tcp_pose".
     """
-    if key == "extra/tcp_pose":
+    if key == POSE:
         return "observation.state"
     _, sensor, kind = key.split("/")
     return f"observation.images.{sensor}" if kind == "rgb" else f"observation.tactile.{sensor.removeprefix(PAD)}.{kind}"
@@ -35,7 +35,7 @@ def feature_name(key: str) -> str:
 
 def earlier_feature_name(key: str) -> str:
     """The name of an observation in datasets that version 0.1.0 exported."""
-    if key == "extra/tcp_pose" or key.endswith("/rgb"):
+    if key == POSE or key.endswith("/rgb"):
         return feature_name(key)
     _, sensor, kind = key.split("/")
     return f"observation.{kind}.{sensor}"

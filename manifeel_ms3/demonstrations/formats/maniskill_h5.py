@@ -15,6 +15,7 @@ import numpy as np
 
 from manifeel_ms3.errors import InvalidFileError, ManifeelError
 from manifeel_ms3.files import read_json
+from manifeel_ms3.tasks.obs_modes import POSE
 
 from .demonstration_format import Demonstration, DemonstrationError, DemonstrationFormat, Progress
 from .folder_checks import require_task
@@ -288,12 +289,12 @@ def observation_keys(path: Path) -> list[str]:
         keys = [
             f"sensor_data/{sensor}/{kind}" for sensor in sensors for kind in ("rgb", "force_field") if kind in sensors[sensor]
         ]
-        if "obs/extra/tcp_pose" not in group:
+        if f"obs/{POSE}" not in group:
             held = "states and actions alone"
             if (mode := header["env_info"]["env_kwargs"].get("obs_mode", "none")) != "none":
                 held = f"observations of obs_mode={mode!r}, in which the pose of the tool is not an array of its own"
             raise DemonstrationError(f"{path} holds {held}; `manifeel render-observations` makes a file with observations")
-    return [*keys, "extra/tcp_pose"]
+    return [*keys, POSE]
 
 
 def observations_beside(path: Path, keys: list[str]) -> list[str]:
