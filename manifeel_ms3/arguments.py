@@ -1,6 +1,7 @@
 """Checks of arguments. The error names the argument, what was given, and what is allowed."""
 
 import math
+import os
 from collections.abc import Iterable, Mapping, Sequence
 from difflib import get_close_matches
 from numbers import Real
@@ -128,18 +129,22 @@ def require_not_negative(**flags: int | None) -> None:
 
 
 def require_file(flag: str, path: Path, example: str) -> None:
-    """Check, before the work begins, that the path of a file that is to be written is not that of a folder.
+    """Check, before the work begins, that a file can be written to a path.
 
     Args:
         flag: Flag with the path.
-        path: The path; a file need not be there yet.
+        path: The path; neither the file nor its folder need be there yet.
         example: Name of a file in the folder, for the message.
 
     Raises:
-        InvalidArgumentError: The path is that of a folder.
+        InvalidArgumentError: The path is that of a folder, or no file can be made there.
     """
     if path.is_dir():
         raise InvalidArgumentError(f"{flag} {path} is a folder; give the path of a file, such as {path / example}")
+    nearest = next(folder for folder in path.absolute().parents if os.access(folder, os.F_OK))
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK):
+        reason = "may not be written to" if nearest.is_dir() else "is a file"
+        raise InvalidArgumentError(f"{flag} {path} cannot be written, because {nearest} {reason}; give another path")
 
 
 def flag_of(name: str) -> str:

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.errors import InvalidFileError, MachineError, ManifeelError, ServerError
+from manifeel_ms3.arguments import require_file
+from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError, MachineError, ManifeelError, ServerError
 from manifeel_ms3.files import (
     ABANDONED_AFTER,
     MOST_UNPACKED,
@@ -223,3 +224,12 @@ def test_what_is_no_npz_is_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(InvalidFileError, match=r"x\.npz is not a table"):
             read_npz(path, "a table")
+
+
+def test_a_file_that_cannot_be_made_is_named_before_the_work(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    require_file("--out", tmp_path / "new/folder/page.html", "page.html")
+    with pytest.raises(InvalidArgumentError, match=rf"--out .* cannot be written, because {tmp_path / 'file'} is a file"):
+        require_file("--out", tmp_path / "file/folder/page.html", "page.html")
+    with pytest.raises(InvalidArgumentError, match=r"--out .* is a folder; give the path of a file, such as .*page\.html"):
+        require_file("--out", tmp_path, "page.html")

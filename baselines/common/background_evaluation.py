@@ -89,8 +89,8 @@ class BackgroundEvaluation:
         path = self._result(checkpoint)
         if code != 0:
             made = path.is_file() and path.stat().st_mtime_ns > self._began
-            what = "video" if made else "evaluation"
-            log.warning("the %s of %s failed; %s says why", what, checkpoint, path.with_suffix(".log"))
+            what = "a part of the evaluation" if made else "the evaluation"
+            log.warning("%s of %s failed; %s says why", what, checkpoint, path.with_suffix(".log"))
             if not made:
                 return []
         step, result = int(checkpoint.name), read_result(path)

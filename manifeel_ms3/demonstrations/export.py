@@ -13,14 +13,21 @@ import tyro
 
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.files import atomic_folder
+from manifeel_ms3.files import atomic_folder, write_json
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.progress import progress_bar
 
 from .formats import FORMATS
 from .formats.demonstration_format import Progress
 from .formats.lerobot_writing import write_lerobot
-from .formats.maniskill_h5 import DemonstrationError, observation_keys, observations_beside, read_header, read_trajectories
+from .formats.maniskill_h5 import (
+    DemonstrationError,
+    about_task,
+    observation_keys,
+    observations_beside,
+    read_header,
+    read_trajectories,
+)
 from .recording import train_command
 
 log = logging.getLogger(__name__)
@@ -35,7 +42,8 @@ class Args:
     """Path of a trajectory file with observations."""
     to: Format
     """Format to write: "lerobot": LeRobot dataset (3.0); "zarr": layout of the paper's data; "npz": one file for each
-    episode, with the arrays `actions` and, for example, `sensor_data.wrist.rgb`; `manifeel train` does not read it."""
+    episode, with the arrays `actions` and, for example, `sensor_data.wrist.rgb`, and episodes.json, which names the task and
+    the seeds; `manifeel train` does not read it."""
     out: Path
     """Folder to write; it must not exist yet."""
     videos: bool = False
@@ -45,12 +53,18 @@ class Args:
 def write_npz(path: Path, folder: Path, progress: Progress = iter) -> None:
     """Write one npz file for each episode, with `actions` (T, A) and the observations (T + 1, ...).
 
-    Observations have their keys as names, with "." for "/".
+    Observations have their keys as names, with "." for "/". The file episodes.json names the task, its arguments, and the seed
+    of each file.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    header, names = read_header(path), []
     for i, episode in enumerate(read_trajectories(path, observation_keys(path), progress=progress)):
         arrays: dict[str, Any] = {key.replace("/", "."): values for key, values in episode.items()}
-        np.savez_compressed(folder / f"episode_{i:05d}.npz", **arrays)
+        names.append(f"episode_{i:05d}.npz")
+        np.savez_compressed(folder / names[-1], **arrays)
+    seeds = [episode["episode_seed"] for episode in header["episodes"]]
+    episodes = [dict(file=name, episode_seed=seed) for name, seed in zip(names, seeds, strict=True)]
+    write_json(folder / "episodes.json", about_task(header) | dict(episodes=episodes))
 
 
 WRITERS: dict[str, Callable[[Path, Path, Progress], None]] = {
@@ -84,7 +98,7 @@ def main(args: Args) -> Path:
 def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     if args.to == "npz":
-        return f"{made} holds one file for each episode; `numpy.load` opens them"
+        return f"{made} holds one file for each episode, which `numpy.load` opens, and their seeds in episodes.json"
     train = train_command(made, read_header(args.file))
     return f"{made} is a data set of the format {args.to}" + (f"; {train} trains on it" if train else "")
 

@@ -25,13 +25,13 @@ import tyro
 
 from manifeel_ms3.arguments import is_number, require_file, require_positive
 from manifeel_ms3.command_line import as_typed, json_object, missing_extras_named, run
-from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.files import SHOWN_LENGTH, atomic_write
+from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.paths import CHECKPOINTS, EVALUATION, LAST_LINK
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 from manifeel_ms3.tasks.checks import check_obs_mode
 from manifeel_ms3.tasks.registry import evaluation_seeds, task_spec
+from manifeel_ms3.text import one_line
 
 from .checkpoint_config import CheckpointError, checkpoint_config
 from .engine import Evaluation, run_episodes
@@ -127,6 +127,7 @@ def main(args: Args) -> Path:
         OtherEvaluationError: Another evaluation of this result was interrupted.
         InUseError: Another process writes this result.
         FileWriteError: The result cannot be written.
+        WorkFailedError: Every episode failed because of an error of the policy; the result is written nevertheless.
     """
     entry = None if args.entry is None else find_entry(args.entry)
     if entry is not None:
@@ -143,11 +144,29 @@ def main(args: Args) -> Path:
         with journal.kept():
             run_episodes(evaluation, journal.remaining, args.workers, journal.add)
             write_result(_result(evaluation, journal.in_order, origin), out)
+    _require_answers(journal.in_order, out)
     if entry is not None:
         log.info("%s", _comparison(entry, out, journal.in_order))
-    for number in args.videos:
-        write_video(evaluation, seeds[number], out.parent / "videos")
+    if args.videos:
+        from .video import write_video
+
+        for number in args.videos:
+            write_video(evaluation, seeds[number], out.parent / "videos")
     return out
+
+
+def _require_answers(outcomes: list[EpisodeOutcome], out: Path) -> None:
+    """Check that a policy has acted to the end of at least one episode.
+
+    Raises:
+        WorkFailedError: Every episode failed because of an error of the policy.
+    """
+    errors = [outcome.error for outcome in outcomes if outcome.error]
+    if len(errors) == len(outcomes):
+        raise WorkFailedError(
+            f"the policy failed in all {len(errors)} episodes, first with: {one_line(errors[0])}; {out} has every reason; "
+            "mend the policy, and give the same command"
+        )
 
 
 def default_out(checkpoint: Path | None) -> Path:
@@ -333,30 +352,12 @@ def _flags(names: list[str]) -> str:
     return " and ".join(f"--{name.replace('_', '-')}" for name in names)
 
 
-def write_video(evaluation: Evaluation, seed: int, folder: Path) -> Path:
-    """Run an episode again with every camera and touch, and write it as an MP4 file into a folder.
-
-    Raises:
-        MissingExtraError: The extra `report`, which encodes videos, is not installed.
-    """
-    with missing_extras_named():
-        from .video import encode_video, record_episode
-
-    policy = evaluation.source.make()
-    _, frames = record_episode(evaluation.env_id, evaluation.env_kwargs, policy, seed, evaluation.step_timeout)
-    path = folder / f"{seed}.mp4"
-    with atomic_write(path) as partial_path:
-        partial_path.write_bytes(encode_video(frames))
-    return path
-
-
 def next_step(args: Args, made: Path) -> str:
     """What the command made, and what one can do with it."""
     episodes = read_result(made)["episodes"]
     outcome = f"{made}: {sum(episode['success_once'] for episode in episodes)} of {len(episodes)} episodes succeed"
     if errors := [episode["error"] for episode in episodes if episode["error"]]:
-        first = " ".join("".join(letter if letter.isprintable() else " " for letter in errors[0]).split())[:SHOWN_LENGTH]
-        outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {first})"
+        outcome = f"{outcome}, and {len(errors)} failed because of an error of the policy (the first: {one_line(errors[0])})"
     film = as_typed("manifeel", "film", made, *_policy_flags(args, made), "--out", "FILE.mp4")
     return f"{outcome}; {film} shows one, {_page_of(args, made)}"
 

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import tyro
 
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.paths import CHECKPOINTS, EVALUATION, LAST_LINK
@@ -154,9 +155,12 @@ def main(args: Args) -> Path:
     Raises:
         ResultError: The run's evaluation.json is missing or broken.
         CheckpointError: The checkpoint of the evaluation is missing or broken.
+        InvalidArgumentError: The page cannot be written to `args.out`.
         MachineError: This machine does not have the device of the evaluation.
     """
     result = read_result(evaluation := args.run_dir / EVALUATION)
+    out = args.out or args.run_dir / "report.html"
+    require_file("--out", out, "report.html")
     succeeded = [episode["seed"] for episode in result["episodes"] if episode["success_once"]]
     seed = (succeeded or [result["episodes"][0]["seed"]])[0]
     policy = PolicySource(evaluated_checkpoint(evaluation, result)).as_in(result).make()
@@ -174,7 +178,6 @@ def main(args: Args) -> Path:
         video=base64.b64encode(encode_video(frames)).decode(),
         curve=Markup(training_curve(args.run_dir / "log.jsonl")),
     )
-    out = args.out or args.run_dir / "report.html"
     write_text(out, page)
     return out
 

@@ -13,10 +13,12 @@ import numpy as np
 import torch
 
 from manifeel_ms3.arguments import names_in
+from manifeel_ms3.files import atomic_write
 from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
 
+from .engine import Evaluation
 from .policy import STEP_TIMEOUT, Policy
 from .rollout import EpisodeOutcome, evaluate_episode
 
@@ -53,6 +55,14 @@ def act_again(
     actions: list[np.ndarray] = []
     with closing(make_env(env_id, **env_kwargs)) as env:
         return evaluate_episode(env, policy, seed, actions.append, step_timeout), actions
+
+
+def write_video(evaluation: Evaluation, seed: int, folder: Path) -> None:
+    """Run an episode again with every camera and touch, and write it into a folder as an MP4 file that is named by its seed."""
+    policy = evaluation.source.make()
+    _, frames = record_episode(evaluation.env_id, evaluation.env_kwargs, policy, seed, evaluation.step_timeout)
+    with atomic_write(folder / f"{seed}.mp4") as partial_path:
+        partial_path.write_bytes(encode_video(frames))
 
 
 def film_env(

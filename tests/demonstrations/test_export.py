@@ -306,8 +306,12 @@ def test_images_of_touch_lie_as_in_the_papers_data():
 
 def test_npz(tmp_path):
     folder = exported("npz", tmp_path)
-    read = [{k.replace(".", "/"): v for k, v in np.load(file).items()} for file in sorted(folder.iterdir())]
+    read = [{k.replace(".", "/"): v for k, v in np.load(file).items()} for file in sorted(folder.glob("*.npz"))]
     require_same(read, last_is_repeated=False)
+    about = json.loads((folder / "episodes.json").read_text())
+    assert (about["env_id"], about["revision"]) == (PEG, task_spec(PEG).revision)
+    seeds = [episode["episode_seed"] for episode in read_header(SAMPLE)["episodes"]]
+    assert about["episodes"] == [dict(file=f"episode_{i:05d}.npz", episode_seed=seed) for i, seed in enumerate(seeds)]
 
 
 def test_npz_holds_the_arrays_of_an_episode_alone(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.errors import InvalidArgumentError, ServerError, UnknownNameError
+from manifeel_ms3.errors import InvalidArgumentError, ServerError, UnknownNameError, WorkFailedError
 from manifeel_ms3.evaluation import entries
 from manifeel_ms3.evaluation.checkpoint_config import CheckpointError
 from manifeel_ms3.evaluation.evaluate import Args, default_out, main, next_step
@@ -27,9 +27,20 @@ SERVER = Path(__file__).parents[2] / "examples/policy_server.py"
 
 
 def evaluated(policy: str, out: Path, **changes) -> dict:
+    return read_result(main(arguments_of(policy, out, **changes)))
+
+
+def failed(policy: str, out: Path, **changes) -> dict:
+    """The result of a policy that fails by an error in every episode."""
+    with pytest.raises(WorkFailedError, match=r"the policy failed in all \d episodes, first with: .*has every reason"):
+        main(args := arguments_of(policy, out, **changes))
+    return read_result(args.out)
+
+
+def arguments_of(policy: str, out: Path, **changes) -> Args:
     settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=2, env_kwargs=BARE, out=out / "evaluation.json")
     name = policy if "://" in policy else f"tests.evaluation.policies:{policy}"
-    return read_result(main(Args(policy=name, **settings | changes)))
+    return Args(policy=name, **settings | changes)
 
 
 def test_a_policy_of_ones_own_is_evaluated(tmp_path):
@@ -98,7 +109,7 @@ def test_a_result_names_the_commit_at_which_its_evaluation_began(tmp_path, monke
     ],
 )
 def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_path):
-    result = evaluated(policy, tmp_path, step_timeout=1.0)
+    result = failed(policy, tmp_path, step_timeout=1.0)
     assert len(result["episodes"]) == 2
     for episode in result["episodes"]:
         assert reason in episode["error"]
@@ -106,13 +117,13 @@ def test_a_bad_policy_fails_its_episodes_with_the_reason(policy, reason, tmp_pat
 
 
 def test_a_wrong_number_of_actions_is_named(tmp_path):
-    result = evaluated("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
+    result = failed("StandStill", tmp_path, policy_kwargs='{"size": 9}', episodes=1)
     assert "shape (9,), the task takes (6,)" in result["episodes"][0]["error"]
 
 
 def test_the_command_says_how_many_episodes_the_policy_failed_by_an_error(tmp_path):
     out = tmp_path / "evaluation.json"
-    evaluated("Raises", tmp_path)
+    failed("Raises", tmp_path)
     said = next_step(Args(), out)
     assert "0 of 2 episodes succeed, and 2 failed because of an error of the policy" in said
     assert "(the first: step 0: RuntimeError: out of ideas)" in said
