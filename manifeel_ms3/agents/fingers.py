@@ -19,6 +19,7 @@ FINGER_MASS, GEL_MASS = 0.08, 0.01  # kg, estimated
 FLATTENED = 5e-4  # m: 2.6 N flatten a dome with a radius of 35 mm so far (F = pi K R d^2)
 CUT = 2e-3  # m under the box's face: more than 30 N on two contact points press the box in, so that the dome carries nothing
 MIDDLE = 0.012  # m: side of the middle box. A golf ball gripped with 20 N slips at 0.073 N m; on a real gel, at 0.093 N m
+MIDDLE_SHARE = 0.6  # largest side of the middle box, as a share of the flat face's shorter side; that of a dome is small
 DRAWN_POINTS, SOLID_POINTS = 41, 13  # points along each side of the dome that is drawn, and of the one that collides (chosen)
 SIZE_DIGITS = 6  # decimals, in m, to which the finger's length is rounded: a micrometre
 HOUSING_COLOUR, GEL_COLOUR = "0.16 0.16 0.18 1", "0.75 0.77 0.8 1"  # RGBA, chosen by eye
@@ -77,8 +78,8 @@ class Finger:
     def solid_boxes(self) -> list[tuple[tuple, tuple]]:
         """Sizes and centres, in the pad frame, m, of the boxes that the gel's face, or the middle of a dome, collides as."""
         across, along, high = self.flat_box
-        middle, z = MIDDLE, -high / 2
-        if not self.grips_round_parts or middle >= min(across, along):
+        middle, z = min(MIDDLE, MIDDLE_SHARE * min(across, along)), -high / 2
+        if not self.grips_round_parts:
             return [(self.flat_box, (0.0, 0.0, z))]
         boxes: list[tuple[tuple, tuple]] = [((middle, middle, high), (0.0, 0.0, z))]
         for side in (-1, 1):

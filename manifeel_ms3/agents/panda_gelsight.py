@@ -50,8 +50,9 @@ HOLD_DAMPING, HOLD_FORCE_LIMIT = 2e2, 100.0
 """Damping, in N s/m, and largest force, in N, of a finger that holds."""
 GRIPPER_FORCE_LIMIT = 40.0
 """Largest force of a finger, in N, that a policy can command. Set once; not tuned."""
-GRASP_FORCE = 0.5
-"""Smallest force of each pad on a body, in N, with which the hand grasps it (ManiSkill's Panda)."""
+GRASP_FORCE, GRASP_ANGLE = 0.5, 85.0
+"""Smallest force of each pad on a body, in N, and largest angle between that force and the direction into the pad, in degrees,
+with which the hand grasps it (ManiSkill's Panda)."""
 STILL = 0.2
 """Largest speed of a joint of an arm that is still, in rad/s (ManiSkill's Panda)."""
 FINGER_RANGE = (-0.01, 0.04)
@@ -162,10 +163,10 @@ class PandaGelSight(BaseAgent):
             action: Actions (N, D) of the control mode.
 
         Raises:
-            InvalidArgumentError: The action has a NaN, in a simulation on the CPU.
+            InvalidArgumentError: The action has a NaN or an infinite number, in a simulation on the CPU.
         """
-        if not self.scene.gpu_sim_enabled and torch.isnan(given := torch.as_tensor(action)).any():
-            raise InvalidArgumentError(f"the action holds NaN: {given.tolist()}; give finite numbers")
+        if not self.scene.gpu_sim_enabled and not torch.isfinite(given := torch.as_tensor(action)).all():
+            raise InvalidArgumentError(f"the action holds NaN or infinity: {given.tolist()}; give finite numbers")
         self.controller.set_action(action)
 
     def get_controller_state(self) -> dict[str, dict[str, torch.Tensor]]:
@@ -360,10 +361,20 @@ class PandaGelSight(BaseAgent):
         forces = joint_forces[..., self._gel_indices, :3]
         return torch.linalg.norm(torch.einsum("...kj,kij->...i", forces, self._joint_to_hand), dim=-1)
 
-    def is_grasping(self, body: Actor, min_force: float = GRASP_FORCE) -> torch.Tensor:
-        """Whether both pads press on a body, each with at least `min_force`, in N; (N,) bool."""
-        forces = [self.scene.get_pairwise_contact_forces(gel, body) for gel in self.gels.values()]
-        return torch.stack([torch.linalg.norm(force, dim=1) >= min_force for force in forces]).all(dim=0)
+    def is_grasping(self, body: Actor, min_force: float = GRASP_FORCE, max_angle: float = GRASP_ANGLE) -> torch.Tensor:
+        """Whether both pads press on a body, as ManiSkill's tasks ask; (N,) bool.
+
+        Args:
+            body: The body.
+            min_force: Least force on each pad, in N.
+            max_angle: Largest angle, in degrees, between the force on a pad and the direction into the pad.
+        """
+        held = []
+        for gel in self.gels.values():
+            force = self.scene.get_pairwise_contact_forces(gel, body)
+            size, inward = torch.linalg.norm(force, dim=1), -quaternion_apply(gel.pose.q, force.new_tensor([[0.0, 0.0, 1.0]]))
+            held.append((size >= min_force) & ((force * inward).sum(1) >= np.cos(np.deg2rad(max_angle)) * size))
+        return torch.stack(held).all(dim=0)
 
     def is_static(self, threshold: float = STILL) -> torch.Tensor:
         """Whether no joint of the arm is faster than `threshold`, in rad/s, for ManiSkill's tasks; (N,) bool."""

@@ -1,9 +1,12 @@
 """Observation modes: ManiSkill's strings, and two tokens for touch."""
 
 import logging
+from collections.abc import Iterable
+from typing import Any
 
 from mani_skill.envs.utils.observations import ALL_VISUAL_TEXTURES
 
+from manifeel_ms3.arguments import several_of
 from manifeel_ms3.errors import InvalidArgumentError
 
 log = logging.getLogger(__name__)
@@ -55,11 +58,20 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     return "+".join(own) or "none", touch
 
 
-def pads_to_observe(obs_mode: str, sides: tuple[str, ...]) -> tuple[str, ...]:
-    """The sides of the pads; warns if there is none, and touch is observed.
+def pads_to_observe(obs_mode: str, tactile_sensors: Any, sides: Iterable[str]) -> tuple[str, ...]:
+    """The sides of the pads that an environment observes; warns if there is none although touch is asked for.
 
     It is no error, because ManiSkill's tools replay files that were recorded without pads in any observation mode.
+
+    Args:
+        obs_mode: Observation mode of the environment.
+        tactile_sensors: The argument of that name: one side, or several.
+        sides: Sides that the robot has.
+
+    Raises:
+        InvalidArgumentError: The robot has no such side.
     """
-    if not sides and split_obs_mode(obs_mode)[1]:
+    pads = several_of("tactile_sensors", tactile_sensors, sides)
+    if not pads and split_obs_mode(obs_mode)[1]:
         log.warning("obs_mode=%r observes touch, but tactile_sensors names no pad, so that touch is missing", obs_mode)
-    return sides
+    return pads

@@ -150,7 +150,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         own_mode, self._tactile_outputs = split_obs_mode(self._full_obs_mode)
         asked = self.policy_cameras if cameras is None else cameras
         self.camera_names = several_of("cameras", asked, (*CAMERAS, *self.own_cameras))
-        self._sides = pads_to_observe(self._full_obs_mode, several_of("tactile_sensors", tactile_sensors, SIDES))
+        self._sides = pads_to_observe(self._full_obs_mode, tactile_sensors, SIDES)
         names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self.camera_names, [names[s] for s in self._sides])
         pad_options = by_name("tactile", tactile or {}, '{"units": "tacsl", "optics.noise": 2.0}')

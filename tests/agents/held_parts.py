@@ -13,6 +13,7 @@ from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 import manifeel_ms3  # noqa: F401
+from manifeel_ms3.sensors.registry import DEFAULT_SENSOR
 
 GRIP = 20.0  # N, force of each pad on parts that the task itself does not put into the hand
 BALL_INDENTATION, BATTERY_INDENTATION = 2.5e-3, 6e-4  # m, under that grip
@@ -66,10 +67,10 @@ KINDS = {
 class HeldPart:
     """One part between the pads, in its task's own scene."""
 
-    def __init__(self, name: str):
+    def __init__(self, name: str, sensor: str = DEFAULT_SENSOR):
         self.name, self.kind = name, KINDS[name]
-        kind = self.kind
-        self._wrapped = gym.make(f"ManiFeel-{kind.task}-v1", obs_mode="none", render_backend="none", sim_backend="physx_cpu")
+        kind, settings = self.kind, dict(obs_mode="none", render_backend="none", sim_backend="physx_cpu", sensor=sensor)
+        self._wrapped = gym.make(f"ManiFeel-{kind.task}-v1", **settings)
         self.env: Any = self._wrapped.unwrapped
         if kind.is_regripped:
             self.env.screw = replace(self.env.screw, grip_force=kind.grip)

@@ -158,10 +158,31 @@ def test_nan_and_infinity_are_refused_before_anything_moves(env, bad):
     assert torch.equal(env.unwrapped.get_state(), before)
 
 
-def test_the_robot_refuses_nan_also_in_tasks_that_do_not(env):
+def test_the_robot_refuses_numbers_that_are_not_finite_also_in_tasks_that_do_not(env):
     env.reset(seed=0)
-    with pytest.raises(InvalidArgumentError, match=r"^the action holds NaN: \[\[nan, 0.5\]\]; give finite numbers$"):
-        env.unwrapped.agent.set_action(torch.tensor([[np.nan, 0.5]]))
+    for bad in (np.nan, np.inf, -np.inf):
+        said = rf"^the action holds NaN or infinity: \[\[{bad}, 0.5\]\]; give finite numbers$"
+        with pytest.raises(InvalidArgumentError, match=said):
+            env.unwrapped.agent.set_action(torch.tensor([[bad, 0.5]]))
+
+
+@pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PullCubeTool-v1"])
+def test_maniskills_own_tasks_can_ask_at_which_angle_the_robot_grasps(task):
+    env = gym.make(task, robot_uids="panda_gelsight", obs_mode="state", reward_mode="dense", render_backend="none")
+    env.reset(seed=0)
+    _, reward, *_ = env.step(env.action_space.sample())
+    env.close()
+    assert np.isfinite(float(reward))
+
+
+def test_a_force_beside_the_pads_is_no_grasp(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    agent, plug = env.unwrapped.agent, env.unwrapped.plug
+    assert agent.is_grasping(plug).all()
+    assert agent.is_grasping(plug, max_angle=20).all()  # the pads' forces are normal but for the part's small weight
+    assert not agent.is_grasping(plug, max_angle=0.01).any()
+    assert not agent.is_grasping(plug, min_force=1e3).any()
 
 
 def test_maniskills_own_tasks_can_have_the_robot():

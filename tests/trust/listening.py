@@ -26,6 +26,14 @@ def listening(process: psutil.Process) -> dict[tuple[str, int], str]:
     return found
 
 
-def hosts_by_port(process: psutil.Process) -> dict[int, str]:
+def hosts_by_port(process: psutil.Process) -> dict[int, set[str]]:
     """Hosts on which a process and its descendants listen, by port."""
-    return {port: host for host, port in listening(process)}
+    found: dict[int, set[str]] = {}
+    for host, port in listening(process):
+        found.setdefault(port, set()).add(host)
+    return found
+
+
+def hosts(process: psutil.Process) -> set[str]:
+    """Hosts on which a process and its descendants listen, on any port."""
+    return {host for host, _ in listening(process)}

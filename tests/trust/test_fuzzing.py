@@ -137,7 +137,8 @@ class Reader:
 
     make: Callable[[Path], Path]
     """Puts a valid file or folder into a folder, and returns its path."""
-    read: Callable[[Path], Any]
+    reads: tuple[Callable[[Path], Any], ...]
+    """What reads it; each of these is called with the path of the file or folder."""
     damage: tuple[Callable[[Path, random.Random, Any], None], ...] = (damage_bytes,)
 
 
@@ -152,6 +153,8 @@ def made_trajectory(folder: Path) -> Path:
         def shorten(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset):
                 values = item[: STEPS + (len(item) > len(sample["traj_0/actions"]))]
+                if name == "success":
+                    values[-1] = True  # without it, the episode is no demonstration
                 chunks = (1, *values.shape[1:]) if values.ndim > 1 else None
                 file.create_dataset(f"traj_0/{name}", data=values, chunks=chunks, compression="gzip" if chunks else None)
 
@@ -189,20 +192,19 @@ def made_checkpoint(folder: Path) -> Path:
     return save_tiny_checkpoint(folder / "00000001")
 
 
-def read_trajectory(path: Path) -> None:
-    for read in (lambda: read_demonstrations(path, KEYS), lambda: summary(path), lambda: read_streams(path, 0),
-                 lambda: list(read_trajectories(path, observation_keys(path)))):  # fmt: skip
-        refused_or_read(read)
+READ_TRAJECTORY: tuple[Callable[[Path], Any], ...] = (
+    lambda path: read_demonstrations(path, KEYS),
+    summary,
+    lambda path: read_streams(path, 0),
+    lambda path: list(read_trajectories(path, observation_keys(path))),
+)
+READ_ZARR = diffusion_policy_zarr.count_episodes, lambda path: list(diffusion_policy_zarr.read_zarr(path, KEYS))
+READ_LEROBOT = lerobot.count_episodes, lambda path: list(lerobot.read_lerobot(path, KEYS))
 
 
-def read_zarr(path: Path) -> None:
-    refused_or_read(lambda: diffusion_policy_zarr.count_episodes(path))
-    list(diffusion_policy_zarr.read_zarr(path, KEYS))
-
-
-def read_lerobot(path: Path) -> None:
-    refused_or_read(lambda: lerobot.count_episodes(path))
-    list(lerobot.read_lerobot(path, KEYS))
+def of_json(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+    """What reads a trajectory file, given the json beside it."""
+    return lambda path: read(path.with_suffix(".h5"))
 
 
 def made_answer(folder: Path) -> Path:
@@ -233,42 +235,46 @@ def read_journal(path: Path) -> None:
 
 
 READERS = {
-    "server's answer": Reader(made_answer, read_answer),
-    "journal": Reader(made_journal, read_journal),
-    "trajectory": Reader(made_trajectory, read_trajectory, (damage_bytes, damage_h5)),
+    "server's answer": Reader(made_answer, (read_answer,)),
+    "journal": Reader(made_journal, (read_journal,)),
+    "trajectory": Reader(made_trajectory, READ_TRAJECTORY, (damage_bytes, damage_h5)),
     "trajectory's json": Reader(
         lambda folder: made_trajectory(folder).with_suffix(".json"),
-        lambda path: read_trajectory(path.with_suffix(".h5")),
+        tuple(map(of_json, READ_TRAJECTORY)),
         (damage_bytes, damage_json),
     ),
-    "manifest": Reader(made_set, lambda path: validate(path.parent), (damage_bytes, damage_json)),
-    "zarr": Reader(made_zarr, read_zarr, (damage_folder,)),
-    "lerobot, images": Reader(made_lerobot("images"), read_lerobot, (damage_folder,)),
-    "lerobot, videos": Reader(made_lerobot("videos"), read_lerobot, (damage_folder,)),
-    "checkpoint": Reader(made_checkpoint, load_policy, (damage_folder,)),
-    "safetensors": Reader(lambda folder: made_checkpoint(folder) / "model.safetensors", read_tensors),
-    "released weights": Reader(made_released, read_released),
+    "manifest": Reader(made_set, (lambda path: validate(path.parent),), (damage_bytes, damage_json)),
+    "zarr": Reader(made_zarr, READ_ZARR, (damage_folder,)),
+    "lerobot, images": Reader(made_lerobot("images"), READ_LEROBOT, (damage_folder,)),
+    "lerobot, videos": Reader(made_lerobot("videos"), READ_LEROBOT, (damage_folder,)),
+    "checkpoint": Reader(made_checkpoint, (load_policy,), (damage_folder,)),
+    "safetensors": Reader(lambda folder: made_checkpoint(folder) / "model.safetensors", (read_tensors,)),
+    "released weights": Reader(made_released, (read_released,)),
     "config.json": Reader(
         lambda folder: made_checkpoint(folder) / "config.json",
-        lambda path: checkpoint_config(path.parent),
+        (lambda path: checkpoint_config(path.parent),),
         (damage_bytes, damage_json),
     ),
-    "result": Reader(copied(RESULT), read_result, (damage_bytes, damage_json)),
-    "shader": Reader(copied(REPOSITORY / "data/gelsight_r15_shader.npz"), Shader.load),
-    "study": Reader(copied(REPOSITORY / "configs/smoke.yaml"), read_study),
+    "result": Reader(copied(RESULT), (read_result,), (damage_bytes, damage_json)),
+    "shader": Reader(copied(REPOSITORY / "data/gelsight_r15_shader.npz"), (Shader.load,)),
+    "study": Reader(copied(REPOSITORY / "configs/smoke.yaml"), (read_study,)),
 }
 CASES = {"lerobot, videos": 30, "checkpoint": 50}
 """Number of cases in the default run, of readers that are slow; the others have `DEFAULT_CASES`."""
 DEFAULT_CASES = 77
 
 
-def refused_or_read(read: Callable[[], Any], path: Path | None = None) -> None:
+def refused_or_read(read: Callable[[Path], Any], path: Path) -> None:
     """Read, or be refused by an error that names the file or its folder; any other error is a fault."""
     try:
-        read()
+        read(path)
     except ManifeelError as error:
-        if path is not None and str(path.parent) not in str(error):
+        if str(path.parent) not in str(error):
             raise AssertionError("the error does not name the file") from error
+
+
+def test_the_set_of_demonstrations_has_no_fault_before_it_is_damaged(tmp_path):
+    assert validate(made_set(tmp_path).parent) == []
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -278,7 +284,8 @@ def test_damaged_files_are_read_or_refused(name, times, tmp_path, monkeypatch, b
     valid = tmp_path / "valid"
     valid.mkdir()
     made = reader.make(valid).relative_to(valid)
-    reader.read(valid / made)  # undamaged, it is read
+    for read in reader.reads:
+        read(valid / made)  # undamaged, it is read
     monkeypatch.chdir(valid)
     before = sorted(path for path in tmp_path.rglob("*"))
 
@@ -295,7 +302,8 @@ def test_damaged_files_are_read_or_refused(name, times, tmp_path, monkeypatch, b
         shutil.copytree(valid, folder)
         try:
             damage(folder / made, chance, value)
-            refused_or_read(lambda: reader.read(folder / made), folder / made)
+            for read in reader.reads:
+                refused_or_read(read, folder / made)
         finally:
             shutil.rmtree(folder)
 

@@ -18,7 +18,7 @@ import pytest
 from tests.browser import wait_until
 from tests.sample import states_sample
 from tests.tasks_and_marks import PEG
-from tests.trust.listening import LOOPBACK, free_port, hosts_by_port
+from tests.trust.listening import LOOPBACK, free_port, hosts, hosts_by_port
 
 REPOSITORY = Path(__file__).parents[2]
 SAMPLE = states_sample(PEG)
@@ -45,14 +45,23 @@ def started():
         process.wait(30)
 
 
+def test_every_address_on_which_a_process_listens_is_seen():
+    with socket.create_server(("127.0.0.1", 0)) as first, socket.socket(socket.AF_INET6) as second:
+        port = first.getsockname()[1]
+        second.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        second.bind(("::", port))
+        second.listen()
+        assert hosts_by_port(psutil.Process())[port] == {"127.0.0.1", "::"}
+        assert not hosts(psutil.Process()) <= LOOPBACK
+
+
 def test_a20_the_viewer_in_a_browser_listens_on_loopback_only(started):
     pytest.importorskip("rerun")
     port = free_port()
     process = started([sys.executable, "-m", "manifeel_ms3.demonstrations.view", str(SAMPLE), "--web", "--port", str(port)])
     wait_until(lambda: port in hosts_by_port(process), 120)
-    addresses = hosts_by_port(process)
-    assert len(addresses) == 2  # the page, and the data
-    assert set(addresses.values()) <= LOOPBACK
+    assert len(hosts_by_port(process)) == 2  # the page, and the data
+    assert hosts(process) <= LOOPBACK
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/") as answer:
         assert b"rerun" in answer.read().lower()
     viewers = process.children(recursive=True)
@@ -71,7 +80,7 @@ def test_a20_the_viewer_in_a_window_listens_on_loopback_only(started, tmp_path):
     recording.disconnect()
     process = started([*viewer_command(tmp_path / "value.rrd", None), "--headless"])  # the same viewer, without a screen
     wait_until(lambda: hosts_by_port(process) or not process.is_running(), 60)
-    assert set(hosts_by_port(process).values()) == {"127.0.0.1"}
+    assert hosts(process) == {"127.0.0.1"}
 
 
 # -------------------------------------------------------------------- the teleoperation page
@@ -113,7 +122,7 @@ def test_a21_the_page_listens_on_loopback_only(page):
 
     port = urlsplit(page.address).port
     assert port is not None
-    assert {hosts_by_port(psutil.Process())[port]} <= LOOPBACK
+    assert hosts_by_port(psutil.Process())[port] <= LOOPBACK
     assert Args.host == "localhost"  # unless it is told otherwise
 
 
@@ -121,7 +130,7 @@ def test_the_example_of_a_policys_server_listens_on_loopback_only(started):
     port = free_port()
     process = started([sys.executable, str(REPOSITORY / "examples/policy_server.py"), "--port", str(port)])
     wait_until(lambda: port in hosts_by_port(process), 60)
-    assert set(hosts_by_port(process).values()) <= LOOPBACK
+    assert hosts(process) <= LOOPBACK
 
 
 def test_a21_the_page_takes_who_has_its_address(page):

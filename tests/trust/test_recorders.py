@@ -52,7 +52,7 @@ def test_a03_the_second_recorder_is_told_who_holds_the_file(undisturbed, tmp_pat
     assert_same(path, undisturbed)
 
 
-def test_a03_everything_that_writes_holds_its_file(make_env, undisturbed, tmp_path):
+def test_a03_all_that_writes_demonstrations_holds_its_file(make_env, undisturbed, tmp_path):
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):
         render_observations.main(render_observations.Args(undisturbed, tmp_path / "t.h5"))
     with owned(tmp_path / "t.h5"), pytest.raises(InUseError):

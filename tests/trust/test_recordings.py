@@ -182,7 +182,7 @@ def test_b09_a_worker_that_outlives_its_session_cannot_write_into_the_next(tmp_p
 
 
 def test_b10_episodes_reach_the_disk_before_they_count(tmp_path):
-    """Every file and folder is flushed before the renaming that makes it count (seen by strace where it is installed)."""
+    """Every file and folder is flushed before the renaming that makes it count, as Python's calls show."""
     trace = """
 import os, sys
 from pathlib import Path
@@ -203,6 +203,7 @@ assert str(Path(sys.argv[1]).parent) in flushed
     command = [sys.executable, "-c", trace, str(tmp_path / "t.h5")]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     assert len(lines) > 20
+    assert any(line.endswith(".partial") for line in lines)
     assert [line for line in lines if not line.startswith("1")] == []
 
 

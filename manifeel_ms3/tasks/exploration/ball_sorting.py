@@ -179,7 +179,7 @@ class BallSortingEnv(VisuotactileEnv):
         body = getattr(self, ball)
         position, middle = body.pose.p, torch.tensor(BOWLS[ball][0], device=self.device)
         within = torch.linalg.norm(position[:, :2] - middle, dim=1) < BOWL_RADIUS
-        return within & (position[:, 2] < BOWL_HEIGHT) & ~self.agent.is_grasping(body)
+        return within & (position[:, 2] < BOWL_HEIGHT) & ~self.agent.is_grasping(body, max_angle=180.0)
 
     def goal_reached(self, measures):
         if self.goal == "bowls":
