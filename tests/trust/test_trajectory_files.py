@@ -59,11 +59,11 @@ HARM = {
 
 
 LINKS, ELSEWHERE = "/traj_0/actions is a link to another place or file", "the numbers of /traj_0/actions are in another file"
-DECLARED, FORM = (
+DECLARED, NUMBERS = (
     r"/traj_0/actions declares \d+ bytes .*, of which 0 are stored",
-    "/traj_0/actions is not what a trajectory file has",
+    "actions holds something other than numbers",
 )
-NUMBERS = "/traj_0/actions holds something other than numbers"
+FORM = "/traj_0/actions is not what a trajectory file has there"
 REASONS = {
     "external storage": ELSEWHERE,
     "external link": LINKS,
