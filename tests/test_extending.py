@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from manifeel_ms3.errors import PluginError
+from manifeel_ms3.tasks.registry import register_task
 from tests.command_process import run_module
 from tests.tasks_and_marks import PEG, needs_renderer
 from tests.third_party import entry_points_of, install
@@ -208,3 +210,17 @@ def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
     said = refusal(tmp_path, "eval", "--checkpoint", tmp_path, "--episodes", 1, "--env-kwargs", NO_RENDERER, *out)
     assert "is unknown: 'knitting' is not registered in manifeel.policies; registered are" in said
     assert "['diffusion_policy', 'equivariant_diffusion_policy', 'flow_matching']" in said
+
+
+@pytest.mark.parametrize(
+    ("env_id", "about", "said"),
+    [
+        ("MyLab-Press", {}, "must end in a version; give one such as 'MyLab-Press-v1'"),
+        ("MyLab-Press-v1", dict(revison=2), r"is registered with \['revison'\]; the fields of a task are .*'revision'"),
+        ("MyLab-Press-v1", dict(paper_demos=-3), "has paper_demos=-3; give a whole number of at least 1"),
+        ("MyLab-Press-v1", dict(max_episode_steps="40"), "has max_episode_steps='40'; give a whole number"),
+    ],
+)
+def test_a_task_with_fields_that_cannot_be_is_refused(env_id, about, said):
+    with pytest.raises(PluginError, match=said):
+        register_task(env_id, **dict(category="insertion", paper_demos=10, max_episode_steps=40) | about)

@@ -6,7 +6,7 @@ each finger by a fixed joint, so that the engine reports the whole wrench on the
 
 Frames (metres). A finger link has its origin 58.4 mm ahead of the hand, x across the finger, z along it towards the tip;
 the gel's face lies in its plane y = 0. A gel link (`gel_left`, `gel_right`) is the pad frame itself: origin at the centre of
-the untouched face, x along image rows (across the finger), y along image columns (towards the tip), z out of the gel.
+the untouched face, x across the finger (rising image rows), y towards the tip (rising image columns), z out of the gel.
 """
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false

@@ -2,9 +2,9 @@
 
 Each claim is a difference of two conditions on the same initial states, with its interval of 95 % and a verdict: the claim
 holds where the whole interval is above zero, does not hold where all of it is below zero, and is undecided otherwise. A claim
-of no gain holds where the interval ends below 5 points and there is success at all, and does not hold where it begins above 0.
-With fewer than three training seeds, there is no verdict. Both conditions have the same preset of their policies and the
-paper's number of demonstrations, except in the claim about that number.
+of no gain holds where the interval ends below 5 points and at least 10 % of the episodes of one of the two succeed, and does
+not hold where it begins above 0. With fewer than three training seeds, there is no verdict. Both conditions have the same
+preset of their policies and the paper's number of demonstrations, except in the claim about that number.
 
 Interval and verdict are those of a single comparison. Of many comparisons without any difference, 5 % exclude zero by chance;
 the p-values after Holm's correction for all comparisons with a verdict say which differences remain.

@@ -32,6 +32,7 @@ NO_SETTINGS = frozenset(
 OF_MODALITIES = {
     "image_size": ("rgb",),
     "camera_view": ("rgb",),
+    "policy.encoder.crop": ("rgb",),
     "policy.encoder.image": ("rgb",),
     "policy.encoder.image_features": ("rgb",),
     "tactile_image_size": ("tacrgb",),

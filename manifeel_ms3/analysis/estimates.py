@@ -76,7 +76,8 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
 
     Both count with equally many checkpoints. The bootstrap draws the same initial states for both, and training seeds for each
     apart. The p-value is twice the share of resamples on the rarer side of zero. Where both have one run with one checkpoint,
-    it is that of McNemar's exact test, and is about these two runs alone.
+    it is that of McNemar's exact test, and is about these two runs alone. The interval, which is the bootstrap's, can exclude
+    zero where the test finds no difference, if the runs differ in five or fewer episodes; then the test is right.
 
     Raises:
         ResultError: The two were evaluated on different episodes.

@@ -1,5 +1,6 @@
 """The paper's protocol: success is the mean over the last ten checkpoints, all episodes and training seeds of a condition."""
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition, condition_of
 
+log = logging.getLogger(__name__)
 LAST = 10
 """Number of checkpoints at the end of training that a mean is taken over (the paper's protocol)."""
 FEWEST_EPISODES = 50
@@ -78,9 +80,12 @@ def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Co
         results: Contents of result files by their paths, one for each checkpoint.
         last: Largest number of checkpoints at the end of training that count.
 
+    A result with fewer than `FEWEST_EPISODES` episodes is left out, with a warning, if its condition has results with more.
+
     Raises:
         ResultError: The results of a condition are of different episodes, or two of them are of the same checkpoint.
     """
+    results = _without_short_ones(results)
     found: dict[Condition, dict[int | None, dict[int, Outcomes]]] = {}
     files: dict[tuple[Condition, int | None, int], Path] = {}
     planned: dict[Condition, int] = {}
@@ -101,10 +106,22 @@ def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Co
             limits[condition] = limit
     return {
         condition: replace(
-            _stacked(condition, by_seed, last, planned.get(condition)), force_limit=limits.get(condition), name=str(condition)
+            _stacked(condition, by_seed, last, planned.get(condition), files),
+            force_limit=limits.get(condition),
+            name=str(condition),
         )
         for condition, by_seed in found.items()
     }
+
+
+def _without_short_ones(results: Mapping[Path, dict[str, Any]]) -> dict[Path, dict[str, Any]]:
+    """The results but for those with too few episodes for the protocol whose condition also has results with enough."""
+    lengths = {path: len(result["episodes"]) for path, result in results.items()}
+    enough = {condition_of(result) for path, result in results.items() if lengths[path] >= FEWEST_EPISODES}
+    short = [path for path, n in lengths.items() if n < FEWEST_EPISODES and condition_of(results[path]) in enough]
+    for path in short:
+        log.warning("%s is left out: it has %d episodes, and others of its condition more", path, lengths[path])
+    return {path: result for path, result in results.items() if path not in short}
 
 
 def in_order_of_seeds(runs: Mapping[int | None, Run]) -> list[Run]:
@@ -118,17 +135,25 @@ def of_the_protocol(found: dict[Condition, ConditionResults]) -> dict[Condition,
 
 
 def _stacked(
-    condition: Condition, by_seed: dict[int | None, dict[int, Outcomes]], last: int, planned: int | None
+    condition: Condition,
+    by_seed: dict[int | None, dict[int, Outcomes]],
+    last: int,
+    planned: int | None,
+    files: Mapping[tuple[Condition, int | None, int], Path],
 ) -> ConditionResults:
     checkpoints = min(last, *(len(steps) for steps in by_seed.values()))
     evaluated = [[steps[step] for step in sorted(steps)[-checkpoints:]] for steps in in_order_of_seeds(by_seed)]
     seeds = sorted(evaluated[0][0])
-    for outcomes in (outcomes for run in evaluated for outcomes in run):
-        if sorted(outcomes) != seeds:
-            raise ResultError(
-                f"the results of {condition} are of different initial states; evaluate all of them with the same "
-                "--num-eval-episodes or --seeds"
-            )
+    if any(sorted(outcomes) != seeds for run in evaluated for outcomes in run):
+        counts = {
+            str(files[condition, seed, step]): len(steps[step])
+            for seed, steps in by_seed.items()
+            for step in sorted(steps)[-checkpoints:]
+        }
+        raise ResultError(
+            f"the results of {condition} are of different initial states (files and numbers of episodes: {counts}); evaluate "
+            "all of them with the same --num-eval-episodes or --seeds, or move those that are not to count elsewhere"
+        )
     episodes = [outcomes[seed] for run in evaluated for outcomes in run for seed in seeds]
     success = np.array([episode["success_once"] for episode in episodes], float)
     trained = min(max(steps) for steps in by_seed.values())

@@ -32,7 +32,7 @@ TEXT = """
 
 Whether our results rank the paper's conditions as the paper does, by Kendall's tau (1: the same order, -1: the reverse) and
 the mean maximum rank violation (MMRV; 0: the same order), with 95 % intervals from a bootstrap over our training seeds and
-initial states; conditions with one training seed, such as most of Table II, add no variation over training to it. "Within
+initial states; conditions with one training seed add no variation over training to it. "Within
 tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
 difficult the tasks are.
 

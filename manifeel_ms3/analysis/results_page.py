@@ -71,8 +71,7 @@ CHART = """
 Success in the tasks of the paper's Table I by what the policy senses; the preset of its training is below each task: the first
 of {presets} with which all sensings were run with as many training seeds as with any other. The thin lines are 95 % intervals,
 which cover the variation over training only in tasks with several training seeds. Black lines are the paper's rates, which
-come from larger networks and from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the
-numbers.
+come from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
 """
 AGAIN = """
 The success rate of each run links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is

@@ -120,7 +120,7 @@ def main(args: Args) -> Similarity:
     sim_images, real_images = (images_of(folder, args) for folder in (args.sim, args.real))
     sim, real = _features_of([sim_images, real_images], features_by_name(args.features))
     result = Similarity(
-        bootstrapped(fid, sim, real, args.resamples),
+        bootstrapped(fid, sim, real, args.resamples, least=0.0),
         bootstrapped(kid, sim, real, args.resamples),
         args.modality,
         args.object,
@@ -143,7 +143,7 @@ def _features_of(sets: list[list[np.ndarray]], extract: Features) -> list[np.nda
     """Features (N, D) of each set of images.
 
     Raises:
-        SimilarityError: The function gives something else than finite numbers (N, D).
+        SimilarityError: The function gives something else than finite numbers (N, D), or another D for each side.
     """
     features = []
     with progress_bar() as bar:
@@ -161,6 +161,11 @@ def _features_of(sets: list[list[np.ndarray]], extract: Features) -> list[np.nda
                 parts.append(part)
                 bar.advance(task, len(part))
             features.append(np.concatenate(parts))
+    if len(sizes := sorted({side.shape[1] for side in features})) > 1:
+        raise SimilarityError(
+            f"--features makes {sizes} features for the images of the two sides; it must make "
+            "equally many for images of every size"
+        )
     return features
 
 
@@ -190,7 +195,7 @@ def kid(sim: np.ndarray, real: np.ndarray) -> float:
     return float(within(sim) + within(real) - 2 * kernel(sim, real).mean())
 
 
-def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resamples: int) -> Estimate:
+def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resamples: int, least: float = -np.inf) -> Estimate:
     """A distance, with its interval of 95 % from halves of both sets.
 
     The halves are drawn without replacement, since repeated images would look like modes of their own.
@@ -200,6 +205,7 @@ def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resample
         sim: Features (N, D) of simulated images.
         real: Features (M, D) of real images.
         resamples: Number of halves that are drawn.
+        least: Smallest value that the distance can have, below which the interval does not reach.
     """
     rng = np.random.default_rng(0)
 
@@ -209,7 +215,7 @@ def bootstrapped(distance: Distance, sim: np.ndarray, real: np.ndarray, resample
     value = distance(sim, real)
     drawn = np.array([distance(half(sim), half(real)) for _ in range(resamples)])
     low, high = np.quantile(drawn - drawn.mean(), TAILS)  # halves of a sample vary as samples do
-    return Estimate(value, value + float(low), value + float(high))
+    return Estimate(value, max(value + float(low), least), value + float(high))
 
 
 # -------------------------------------------------------------------- images
@@ -227,6 +233,8 @@ def images_of(source: Path, args: Args) -> list[np.ndarray]:
     if source.suffix in RECORDINGS:
         found, kind = _recorded(source, args), f"moments at which the {args.pad} pad is in contact"
     else:
+        if not source.is_dir():
+            raise SimilarityError(f"{source} is no folder; give a folder of images or force fields, or a trajectory file")
         files = sorted(path for path in source.rglob("*") if path.suffix.lower() in suffixes)
         if len(files) > args.limit:
             files = [files[k] for k in np.random.default_rng(0).choice(len(files), args.limit, replace=False)]
@@ -250,8 +258,11 @@ def _image(path: Path) -> np.ndarray:
             field = np.load(path)
     except (*NOT_NPZ, InvalidFileError) as error:
         raise SimilarityError(f"{path} cannot be read as a force field ({error}); repair or remove it") from error
-    if field.ndim != 3 or field.shape[-1] != 3:
-        raise SimilarityError(f"{path} holds an array {field.shape}; a force field is (rows, columns, 3), in N")
+    is_finite = field.dtype.kind in "fiu" and bool(np.isfinite(field).all())
+    if field.ndim != 3 or field.shape[-1] != 3 or field.size == 0 or not is_finite:
+        raise SimilarityError(
+            f"{path} holds an array {field.shape} of {field.dtype}; a force field is (rows, columns, 3) finite numbers, in N"
+        )
     return _drawn(field)
 
 

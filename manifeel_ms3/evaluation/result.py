@@ -187,6 +187,8 @@ def results_in(*folders: Path) -> dict[Path, dict[str, Any]]:
     Raises:
         ResultError: There is no result, or one is broken.
     """
+    if missing := [str(folder) for folder in folders if not folder.is_dir()]:
+        raise ResultError(f"{missing} is no folder; give the folders that hold the results")
     found = [path for folder in folders for path in visible_files(folder, "*.json") if path.stem.isdigit()]
     if not found:
         raise ResultError(

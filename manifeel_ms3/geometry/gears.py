@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, DARK_PLASTIC, STEEL, Look
 
 from .fits import Fit, MeetingFaces
@@ -125,7 +126,7 @@ def neighbour_gear(name: str, fit: str = "paper") -> Part:
     """
     return Part(
         f"{name}_gear",
-        (gear_hulls(TEETH[name], SHAFTS[fit].bore, 0.0, THICKNESS[name]),),
+        (gear_hulls(TEETH[name], SHAFTS[one_of("fit", fit, SHAFTS)].bore, 0.0, THICKNESS[name]),),
         LOOKS[name],
         density=ALUMINIUM,
         friction=GEAR_FRICTION,
@@ -138,7 +139,7 @@ def gear_fit(fit: str = "paper") -> Fit:
     Args:
         fit: "paper" for bores with 0.5 mm of play on each side and chamfered shafts; "tight" for 0.15 mm and blunt shafts.
     """
-    sizes = SHAFTS[fit]
+    sizes = SHAFTS[one_of("fit", fit, SHAFTS)]
     top = HANDLE_SIZE[2] / 2 + RING_HEIGHT
     reach = top + THICKNESS["medium"]
     body = gear_hulls(TEETH["medium"], sizes.bore, top, reach)
@@ -173,7 +174,7 @@ def gear_base(fit: str = "paper") -> Part:
     Args:
         fit: Name of the fit, which decides the shafts.
     """
-    sizes = SHAFTS[fit]
+    sizes = SHAFTS[one_of("fit", fit, SHAFTS)]
     plate = Box(BASE_SIZE, (-BASE_SHIFT, 0.0, BASE_SIZE[2] / 2))
     shafts = [piece for x in SHAFT_X.values() for piece in _shaft(sizes, x)]
     return Part(

@@ -1,7 +1,7 @@
 """A part: one description of a rigid body's shape that yields both what is drawn and what collides."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from mani_skill.utils.structs import Actor
 from sapien.physx import PhysxMaterial
 from sapien.render import RenderMaterial
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.paths import derived_file
 from manifeel_ms3.rendering.looks import Look
@@ -156,6 +157,18 @@ class Part:
     """Surface that the pads touch, where it has details too fine for cameras and contacts, or not all pieces."""
 
     def __post_init__(self):
+        if not self.pieces:
+            raise InvalidArgumentError(f"part {self.name!r} has no pieces; give at least one shape")
+        densities = (self.density, *self.other_densities.values())
+        if wrong := [number for piece in self.pieces for number in _sizes(piece) if not number > 0]:
+            raise InvalidArgumentError(f"part {self.name!r} has sizes of {wrong} m; they must be above 0")
+        if wrong := [density for density in densities if not density > 0]:
+            raise InvalidArgumentError(f"part {self.name!r} has densities of {wrong} kg/m^3; they must be above 0")
+        for name in ("other_looks", "other_densities", "other_frictions", "springs", "undrawn"):
+            if wrong := sorted(set(getattr(self, name)).difference(range(len(self.pieces)))):
+                raise InvalidArgumentError(
+                    f"part {self.name!r} has {name} of the pieces {wrong}, but its pieces are 0 to {len(self.pieces) - 1}"
+                )
         if self.undrawn and self.relief is None:  # without a renderer, pads touch what collides
             raise InvalidArgumentError(
                 f"part {self.name!r} has undrawn={sorted(self.undrawn)} and no relief; give the surface of its other pieces "
@@ -169,7 +182,13 @@ class Part:
             scene: Scene in which the actor is made.
             body_type: "dynamic", "kinematic" or "static".
             initial_pose: Pose of the actor when the scene starts.
+
+        Raises:
+            InvalidArgumentError: The body type is unknown, or the part has a `Solid`, which cannot move, and is to be dynamic.
         """
+        one_of("body_type", body_type, ("dynamic", "kinematic", "static"))
+        if body_type == "dynamic" and any(isinstance(piece, Solid) for piece in self.pieces):
+            raise InvalidArgumentError(f"part {self.name!r} has a Solid, which cannot move; give Hulls of convex parts")
         builder = scene.create_actor_builder()
         for k, piece in enumerate(self.pieces):
             look = None
@@ -185,6 +204,15 @@ class Part:
         if self.relief is not None:
             give_relief(actor, self.relief)
         return actor
+
+
+def _sizes(piece: Piece) -> tuple[float, ...]:
+    """Sizes of a piece, in m, that must be above 0."""
+    if isinstance(piece, Box):
+        return piece.size
+    if isinstance(piece, Cylinder):
+        return piece.radius, piece.length
+    return (piece.radius,) if isinstance(piece, Ball) else ()
 
 
 def lofted(sections: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
@@ -218,20 +246,21 @@ def ring_of_wedges(
     return wedges
 
 
-def bevelled_box(box: Box, bevels: dict[str, float]) -> Box | Hulls:
-    """Box whose upper edges on some sides are cut off at 45 degrees; the box itself if no cut has a width.
+def bevelled_box(box: Box, width: float, sides: Collection[str]) -> Box | Hulls:
+    """Box whose upper edges on some sides are cut off at 45 degrees; the box itself if the cut has no width.
 
     Args:
         box: The whole box.
-        bevels: Width of the cut, in m, by side: "-x", "+x", "-y" or "+y".
+        width: Width of the cut, in m.
+        sides: Sides of the edges: "-x", "+x", "-y", "+y".
     """
-    if not any(bevels.values()):
+    if width == 0 or not sides:
         return box
     low, high = np.array(box.centre) - np.array(box.size) / 2, np.array(box.centre) + np.array(box.size) / 2
-    shift = np.array([[bevels.get("-x", 0.0), bevels.get("-y", 0.0)], [-bevels.get("+x", 0.0), -bevels.get("+y", 0.0)]])
+    shift = width * np.array([["-x" in sides, "-y" in sides], [-("+x" in sides), -("+y" in sides)]])
     corners = np.array([low[:2], high[:2]])
     points = []
-    for z, inset in ((low[2], 0.0), (high[2] - np.abs(shift).max(), 0.0), (high[2], 1.0)):
+    for z, inset in ((low[2], 0.0), (high[2] - width, 0.0), (high[2], 1.0)):
         (left, front), (right, back) = corners + inset * shift
         points += [(x, y, z) for x in (left, right) for y in (front, back)]
     return Hulls((np.array(points),))
@@ -251,7 +280,7 @@ def block_with_holes(outer: tuple[float, float], depth: float, holes: Holes, bot
         bottom: Height of the underside, in m.
 
     Raises:
-        ValueError: Holes overlap or reach beyond the slab.
+        InvalidArgumentError: Holes overlap along x, or reach beyond the slab.
     """
     return tuple(box for box, _ in _walls(outer, depth, holes, bottom, 0.0))
 
@@ -269,24 +298,35 @@ def block_with_chamfered_holes(
         chamfer: Width of the chamfer, in m; 0 for none.
 
     Raises:
-        ValueError: Holes overlap or reach beyond the slab.
+        InvalidArgumentError: Holes overlap along x, or reach beyond the slab, or the chamfers are wider than the walls.
     """
-    return tuple(bevelled_box(box, bevels) for box, bevels in _walls(outer, depth, holes, bottom, chamfer))
+    return tuple(bevelled_box(box, chamfer, sides) for box, sides in _walls(outer, depth, holes, bottom, chamfer))
 
 
 def _walls(
     outer: tuple[float, float], depth: float, holes: Holes, bottom: float, chamfer: float
-) -> list[tuple[Box, dict[str, float]]]:
-    """Boxes of a slab around its holes, and the bevels of each, by side."""
-    z, walls, left, cut = bottom + depth / 2, [], -outer[0] / 2, dict[str, float]()
+) -> list[tuple[Box, list[str]]]:
+    """Boxes of a slab around its holes, and the sides of each that have chamfers."""
+    z, walls, left, cut = bottom + depth / 2, [], -outer[0] / 2, list[str]()
     for (size_x, size_y), (x, y) in sorted(holes, key=lambda hole: hole[1][0]):
         if x - size_x / 2 <= left or x + size_x / 2 >= outer[0] / 2 or abs(y) + size_y / 2 >= outer[1] / 2:
-            raise ValueError(f"hole {size_x} x {size_y} m at ({x}, {y}) overlaps another or the rim of a slab of {outer} m")
+            raise InvalidArgumentError(
+                f"hole {size_x} x {size_y} m at ({x}, {y}) overlaps another along x, or the rim of a slab of {outer} m; "
+                "move it, or make it smaller"
+            )
         strip = Box((x - size_x / 2 - left, outer[1], depth), ((x - size_x / 2 + left) / 2, 0.0, z))
-        walls.append((strip, cut | {"+x": chamfer}))
+        walls.append((strip, [*cut, "+x"]))
         for low, high, side in ((-outer[1] / 2, y - size_y / 2, "+y"), (y + size_y / 2, outer[1] / 2, "-y")):
             # as wide as the chamfers beside it, so that they end at the hole's corners
             wall = Box((size_x + 2 * chamfer, high - low, depth), (x, (low + high) / 2, z))
-            walls.append((wall, {side: chamfer}))
-        left, cut = x + size_x / 2, {"-x": chamfer}
-    return [*walls, (Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut)]
+            walls.append((wall, [side]))
+        left, cut = x + size_x / 2, ["-x"]
+    walls.append((Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut))
+    for wall, sides in walls:
+        room = {axis: wall.size["xyz".index(axis)] for axis in "xyz"}
+        needed = {axis: chamfer * sum(axis in side for side in sides) for axis in "xy"} | dict(z=chamfer)
+        if any(needed[axis] > room[axis] for axis in "xyz"):
+            raise InvalidArgumentError(
+                f"chamfer {chamfer} m is wider than a wall of {wall.size} m; make it narrower, or the slab larger"
+            )
+    return walls

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.rendering.looks import BLUE_PLASTIC, BRASS
 
 from . import materials
@@ -44,7 +45,7 @@ def peg_fit(fit: str = "paper") -> Fit:
     Args:
         fit: "paper" for a hole of 13 x 9 mm with a chamfer, 25 mm deep; "tight" for one of 12 x 8 mm, 9 mm deep.
     """
-    socket = PEG_SOCKETS[fit]
+    socket = PEG_SOCKETS[one_of("fit", fit, PEG_SOCKETS)]
     side, floor = socket.plate
     block = block_with_chamfered_holes(PEG_BLOCK, socket.depth, [(socket.hole, (0.0, 0.0))], floor, socket.chamfer)
     plate = (Box((side, side, floor), (0.0, 0.0, floor / 2)),) if floor else ()

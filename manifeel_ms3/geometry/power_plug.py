@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.rendering import looks
 
 from . import materials
@@ -92,7 +93,7 @@ def power_fit(fit: str = "paper") -> Fit:
     Args:
         fit: "paper" for 1.8 times the standard's size with 0.5 to 0.8 mm of play on each side; "tight" for the standard's size.
     """
-    sizes = SIZES[fit]
+    sizes = SIZES[one_of("fit", fit, SIZES)]
     half = sizes.handle[2] / 2
     head = [Box(sizes.head, (0.0, 0.0, half - sizes.head[2] / 2))] if sizes.head else []
     rim, floor = sizes.block[2], sizes.block[2] - sizes.depth
@@ -155,4 +156,4 @@ def _outlet(sizes: PowerPlugSizes) -> tuple[Piece, ...]:
     holes: Holes = [((x, sizes.spacing + y), (at, 0.0)), (sizes.ground_hole, (sizes.offset / 2, 0.0))]
     bar = Box((x + 2 * sizes.chamfer, sizes.spacing - y, sizes.depth), (at, 0.0, middle))
     slab = block_with_chamfered_holes(sizes.block[:2], sizes.depth, holes, rim - sizes.depth, sizes.chamfer)
-    return (*slab, bevelled_box(bar, {"-y": sizes.chamfer, "+y": sizes.chamfer}))
+    return (*slab, bevelled_box(bar, sizes.chamfer, ("-y", "+y")))

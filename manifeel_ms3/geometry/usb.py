@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.rendering import looks
 
 from .fits import UNSEATED_SHARE, Fit, MeetingFaces
@@ -79,7 +80,7 @@ def usb_fit(fit: str = "paper") -> Fit:
     Args:
         fit: "paper" for 1.8 times the standard's size with 0.4 to 0.7 mm of play on each side; "tight" for the standard's size.
     """
-    sizes = SIZES[fit]
+    sizes = SIZES[one_of("fit", fit, SIZES)]
     floor = RIM - sizes.port[2]
     shell = _shell(sizes)
     hole, prong = _along(sizes, *sizes.port[:2]), _along(sizes, *sizes.shell[:2])

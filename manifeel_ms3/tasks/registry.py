@@ -12,8 +12,9 @@ tasks are found through the entry point group `manifeel.tasks`.
 
 import inspect
 import logging
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import Any, TypeVar
 
@@ -98,6 +99,8 @@ class TaskSpec:
 
 
 _SPECS: dict[str, TaskSpec] = {}
+COUNTS = ("max_episode_steps", "paper_demos", "revision")
+"""Fields of a task that are whole numbers."""
 
 
 def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Callable[[Class], Class]:
@@ -109,8 +112,16 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
         about: The other fields of `TaskSpec`.
 
     Raises:
-        PluginError: Another class has registered the id.
+        PluginError: Another class has registered the id, or the id or a field is not allowed.
     """
+    if not re.fullmatch(r"[\w.-]+-v\d+", env_id):
+        raise PluginError(f"the id {env_id!r} of a task must end in a version; give one such as 'MyLab-Press-v1'")
+    known_fields = [field.name for field in fields(TaskSpec)[1:]]
+    if unknown := sorted(about.keys() - set(known_fields)):
+        raise PluginError(f"the task {env_id!r} is registered with {unknown}; the fields of a task are {known_fields}")
+    for name, number in (dict(max_episode_steps=max_episode_steps) | about).items():
+        if name in COUNTS and not (isinstance(number, int) and number >= 1):
+            raise PluginError(f"the task {env_id!r} has {name}={number!r}; give a whole number of at least 1")
 
     def register(env_class: Class) -> Class:
         known = _SPECS.get(env_id)

@@ -156,7 +156,7 @@ class Press:
 
         Args:
             normal: Normal force into the gel, N.
-            rows: Shear along rows, N.
+            rows: Shear in the direction of rising row numbers, N.
             cols: Shear along columns, N.
             twist: Moment about the normal, N m.
             seconds: Time in which the load changes, s.

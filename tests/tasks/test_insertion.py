@@ -11,9 +11,10 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.geometry import block_with_holes, gear_fit, peg_fit, power_fit, usb_fit
 from manifeel_ms3.geometry.gears import BASE_SIZE, SHAFT_X
-from manifeel_ms3.geometry.part import Cylinder, Hulls
+from manifeel_ms3.geometry.part import Cylinder, Hulls, block_with_chamfered_holes
 from manifeel_ms3.geometry.plugs import PEG_SOCKETS
 from manifeel_ms3.tasks.checks import checked_randomization
 from manifeel_ms3.tasks.exploration.peg_reorientation import BOX_HEIGHT, PegReorientationEnv
@@ -282,6 +283,17 @@ def test_impossible_holes_are_refused():
         block_with_holes((0.02, 0.02), 0.01, [((0.01, 0.01), (0.006, 0.0))])
     with pytest.raises(ValueError, match="overlaps"):
         block_with_holes((0.05, 0.02), 0.01, [((0.01, 0.01), (-0.004, 0.0)), ((0.01, 0.01), (0.004, 0.0))])
+    hole = [((0.01, 0.01), (0.0, 0.0))]
+    assert len(block_with_chamfered_holes((0.02, 0.02), 0.01, hole, 0.0, 0.005)) == 4  # as wide as the walls
+    for outer, depth, chamfer in (((0.02, 0.02), 0.01, 0.006), ((0.04, 0.04), 0.005, 0.006)):
+        with pytest.raises(InvalidArgumentError, match="is wider than a wall of"):
+            block_with_chamfered_holes(outer, depth, hole, 0.0, chamfer)
+
+
+@pytest.mark.parametrize("fit_of", [gear_fit, peg_fit, power_fit, usb_fit])
+def test_an_unknown_fit_is_named(fit_of):
+    with pytest.raises(InvalidArgumentError, match=r"fit='loose'.*paper"):
+        fit_of("loose")
 
 
 def test_dropped_plug_fails(make_env):

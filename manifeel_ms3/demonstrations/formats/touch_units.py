@@ -9,7 +9,7 @@ from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 from manifeel_ms3.tasks.checks import split_sensor_configs
 
 MEANING: dict[Units, str] = {
-    "newton": "the forces on the taxels, in newtons, in the pad's frame: normal, and shear along rows and columns",
+    "newton": "the forces on the taxels, in newtons, in the pad's frame: normal, shear across the finger, and shear along it",
     "tacsl": "TacSL's quantities at the taxels, in the pad's frame: penetration (m), and a tenth of the speed (m/s) at "
     "which the object slides along rows and columns",
 }
