@@ -144,8 +144,8 @@ def check_seed(seed: Any) -> None:
         )
 
 
-def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) -> torch.Tensor:
-    """Check the arguments of a reset, and return the indices (n,) of the environments that it resets.
+def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) -> tuple[Any, torch.Tensor]:
+    """Check the arguments of a reset; return the seeds as ManiSkill takes them, and the indices (n,) of what is reset.
 
     Args:
         seed: Seed, or one seed for each environment.
@@ -162,9 +162,11 @@ def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) 
         raise InvalidArgumentError(
             f"seed={seed!r} has {len(seed)} numbers; give one number, or one for each environment: {num_envs} in all"
         )
+    if isinstance(seed, tuple | np.ndarray):
+        seed = np.atleast_1d(seed).tolist()
     every = torch.arange(num_envs, device=device)
     if env_idx is None:
-        return every
+        return seed, every
     try:
         chosen = torch.as_tensor(env_idx, device=device)
     except (TypeError, ValueError, RuntimeError):
@@ -175,7 +177,7 @@ def checked_reset(seed: Any, env_idx: Any, num_envs: int, device: torch.device) 
             f"the option env_idx={env_idx!r} must list environments to reset by their indices, from 0 to {num_envs - 1}, each "
             "at most once; of a mask, give mask.nonzero()[:, 0]"
         )
-    return chosen
+    return seed, chosen
 
 
 def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[str]) -> tuple[dict, dict]:

@@ -43,7 +43,14 @@ class RestorableEnv(SensingEnv):
         depend. Contact forces are no part of a state either. On the CPU, a physics step in the new state finds them, and then
         the state is set again; on a GPU, touch has the forces of the last state until the next step. Shear is that of a motion
         from the last state to this one.
+
+        Args:
+            state: Tree of tensors (n, D).
+            env_idx: Indices (n,) of the environments whose states they are, in any order; all environments if None.
         """
+        if env_idx is not None and len(env_idx) > 1:  # ManiSkill assigns the rows in rising order
+            order = env_idx.argsort()
+            env_idx, state = env_idx[order], rows(common.to_tensor(state, self.device), order)
         if self.num_envs == 1 and is_part_of(state, self.get_state_dict()):
             return
         self._set_all_of_state(state, env_idx)
@@ -64,6 +71,9 @@ class RestorableEnv(SensingEnv):
         if "controller" in state:  # ManiSkill's controllers take the states of all environments
             changed = slice(None) if env_idx is None else env_idx
             self.agent.set_controller_state(with_rows(self.agent.get_controller_state(), changed, state["controller"]))
+            if self.gpu_sim_enabled:  # ManiSkill hands targets to the engine only with an action
+                engine: Any = self.scene.px
+                engine.gpu_apply_articulation_target_position()
 
     @contextmanager
     def _others_unchanged(self, env_idx: torch.Tensor) -> Iterator[None]:

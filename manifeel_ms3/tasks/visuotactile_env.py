@@ -30,7 +30,7 @@ from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 from .checks import check_argument_names, check_base_arguments, checked_randomization, checked_reset, split_sensor_configs
 from .obs_modes import PAD, has_images, pads_to_observe, split_obs_mode
 from .registry import gym_id, instruction_of
-from .scenery import SceneryEnv
+from .scenery import SPACING, SceneryEnv
 from .states import RestorableEnv, take_given_state
 
 CONTROL_FREQ = 10
@@ -269,6 +269,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
     @property
     def _default_sim_config(self):
         return SimConfig(
+            spacing=SPACING,
             sim_freq=self.physics_rate,
             control_freq=CONTROL_FREQ,
             gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=MAX_CONTACTS, max_rigid_patch_count=MAX_PATCHES),
@@ -297,7 +298,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
     # ---------------------------------------------------------------- episode
 
     def reset(self, seed: int | list[int] | None = None, options: dict | None = None):
-        """Reset as ManiSkill does; with a seed, on the CPU, also build the scene anew.
+        """Reset as ManiSkill does; with a seed, a single environment also builds its scene anew.
 
         The engine's solver remembers earlier episodes. Only in a new scene is an episode a function of its seed alone, bit for
         bit. Where several environments share a process, ManiSkill seeds the draws of their initial states with the first
@@ -307,14 +308,14 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         would take a given one.
         """
         options = dict(by_name("options", options or {}, "dict(reconfigure=True)"))
-        env_idx = checked_reset(seed, options.get("env_idx"), self.num_envs, self.device)
+        seed, env_idx = checked_reset(seed, options.get("env_idx"), self.num_envs, self.device)
         state = take_given_state(options, self)
         if seed is not None:
             self._episodes_of_seed = np.zeros(self.num_envs, np.int64)
             if self.num_envs == 1:
                 options["reconfigure"] = True
         if "env_idx" in options:
-            options["env_idx"] = env_idx  # a list is accepted, too
+            options["env_idx"] = env_idx.sort().values  # any list is accepted; ManiSkill assigns rows in rising order
         with self._others_unchanged(env_idx):
             with self._nothing_observed():  # before the grip has settled
                 _, info = super().reset(seed=seed, options=options)

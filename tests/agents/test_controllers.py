@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.utils.geometry.rotation_conversions import quaternion_multiply
 from mani_skill.utils.structs import Pose
 from scipy.spatial.transform import Rotation
 
@@ -273,3 +274,7 @@ def test_a_reset_of_some_environments_on_a_gpu_finds_the_joint_angles_of_these(m
     for joints in solve_ik(kinematics, Pose.create(wanted.raw_pose.repeat(2, 1)), near, iterations=10):
         reached = agent.tool_pose_at(joints[None])
         assert torch.allclose(reached.to_transformation_matrix(), wanted.to_transformation_matrix(), atol=1e-5)
+    turn = torch.tensor([[np.cos(0.045), np.sin(0.045), 0.0, 0.0]], dtype=torch.float32)  # by 0.09 rad
+    ahead = Pose.create_from_pq(wanted.p + torch.tensor([[0.01, 0.01, 0.008]]), quaternion_multiply(turn, wanted.q))
+    reached = agent.tool_pose_at(solve_ik(kinematics, ahead, agent.robot.get_qpos()))  # an action's steps suffice
+    assert torch.allclose(reached.to_transformation_matrix(), ahead.to_transformation_matrix(), atol=1e-4)

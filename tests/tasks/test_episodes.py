@@ -82,7 +82,10 @@ def test_what_is_no_seed_is_refused(seed):
 
 def test_seeds_that_are_not_one_for_each_of_several_environments_are_refused():
     for seed in (7, [7], [7, 8, 9]):
-        assert checked_reset(seed, None, 3, torch.device("cpu")).tolist() == [0, 1, 2]
+        seeds, env_idx = checked_reset(seed, None, 3, torch.device("cpu"))
+        assert (seeds, env_idx.tolist()) == (seed, [0, 1, 2])
+    for seed in ((7, 8, 9), np.array([7, 8, 9])):  # which ManiSkill does not take for a seed of each environment
+        assert checked_reset(seed, None, 3, torch.device("cpu"))[0] == [7, 8, 9]
     with pytest.raises(InvalidArgumentError, match=r"seed=\[3, 4\] has 2 numbers.*3 in all"):
         checked_reset([3, 4], None, 3, torch.device("cpu"))
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from sapien import physx
 
 pytestmark = [
     pytest.mark.gpu,
@@ -13,6 +14,10 @@ NUM_ENVS = 4
 
 @pytest.fixture(scope="module")
 def env(make_env):
+    try:
+        physx.enable_gpu()
+    except RuntimeError:
+        pytest.skip("this process has simulated on the CPU; run `pytest -m gpu tests/tasks/test_gpu.py` in one of its own")
     return make_env(
         obs_mode="state_dict+tacff",
         num_envs=NUM_ENVS,

@@ -21,6 +21,17 @@ def raw_pose(position: np.ndarray, rotation: Rotation) -> Pose:
     return Pose.create_from_pq(torch.tensor(position[None]).float(), quaternion)
 
 
+def test_the_box_moves_with_its_rim(make_env):
+    env = make_env(TASK, obs_mode="none", render_backend="none", randomization=dict(socket_xy=0.05)).unwrapped
+    places = set()
+    for seed in range(3):
+        env.reset(seed=seed)
+        places.add(tuple(env.socket.pose.p[0, :2].tolist()))
+        assert torch.equal(env.box.pose.p[:, :2], env.socket.pose.p[:, :2])
+        assert float(env.box.pose.p[0, 2]) == 0.0
+    assert len(places) == 3
+
+
 @pytest.mark.parametrize(("hand_tilt", "wins"), [(0.0, True), (4.0, False), (10.0, False), (25.0, False)])
 def test_only_a_turned_peg_wins(env, hand_tilt, wins):
     """The peg stands in the rim, and the hand holds it at an angle, as after an insertion with a hand that tilts."""

@@ -56,11 +56,13 @@ def scene_surfaces(scene: ManiSkillScene, excluded: set[str], robot: Articulatio
         InvalidFileError: A body has a mesh without triangles.
         InvalidArgumentError: A body has a shape of a type that has no mesh.
     """
+    # by the bodies of its links, since a robot whose environments were built apart is no articulation of the scene itself
+    own = None if robot is None else {body for link in robot.links for body in link._objs}
     links = [
         link
         for articulation in scene.articulations.values()
         for link in articulation.links
-        if link.name not in excluded or (robot is not None and articulation is not robot)
+        if link.name not in excluded or (own is not None and own.isdisjoint(link._objs))
     ]
     surfaces = []
     for body in [*scene.actors.values(), *links]:

@@ -6,6 +6,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.utils.geometry.rotation_conversions import quaternion_apply
+from mani_skill.utils.structs import Pose
 
 from manifeel_ms3.geometry import reorientation_fit
 from manifeel_ms3.geometry.containers import open_box
@@ -101,7 +102,15 @@ class PegReorientationEnv(InsertionEnv):
 
     def _load_task(self):
         super()._load_task()
-        self.box = open_box(BOX_OUTER, BOX_HEIGHT, self.occlusion).build(self.scene, "static", sapien.Pose([*SOCKET_XY, 0]))
+        kind = "kinematic" if self.randomization.socket_xy > 0 else "static"  # a static body cannot be moved on a GPU
+        self.box = open_box(BOX_OUTER, BOX_HEIGHT, self.occlusion).build(self.scene, kind, sapien.Pose([*SOCKET_XY, 0]))
+
+    def _initialize_task(self, env_idx):
+        super()._initialize_task(env_idx)
+        if self.randomization.socket_xy > 0:
+            place = self.socket.pose.p[env_idx]
+            place[:, 2] = 0.0
+            self.box.set_pose(Pose.create_from_pq(place))
 
     def measure(self):
         tool = self.agent.tcp.pose
