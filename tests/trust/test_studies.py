@@ -22,8 +22,7 @@ from baselines.studies.jobs import DONE, FAILED, STARTED, is_done, perform
 from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import Resources, StudyError, read_study
 from manifeel_ms3.command_line import INTERRUPTED, PACKAGE
-from manifeel_ms3.errors import InUseError, MachineError
-from manifeel_ms3.evaluation.policy import PolicyError
+from manifeel_ms3.errors import InUseError, MachineError, WorkFailedError
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.ownership import owned
 from manifeel_ms3.tasks.registry import full_id, task_spec
@@ -82,9 +81,8 @@ def test_a04_errors_in_all_episodes_are_no_result(tmp_path):
     job = Job("evaluate", "an evaluation", settings, (trained,))
     train(tiny_args(trained.folder(tmp_path), steps=2))
     for _ in range(2):  # also where the result is there already
-        with pytest.raises(
-            PolicyError, match=r"all 2 episodes ended in an error .*tactile_right.*; mend its cause, delete .*2\.json"
-        ):
+        said = r"the policy failed in all 2 episodes, first with: .*tactile_right.*2\.json has every reason; mend"
+        with pytest.raises(WorkFailedError, match=said):
             perform(job, tmp_path, Resources())
         assert not is_done(job, tmp_path)
 
