@@ -116,12 +116,15 @@ def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Co
 
 def _without_short_ones(results: Mapping[Path, dict[str, Any]]) -> dict[Path, dict[str, Any]]:
     """The results but for those with too few episodes for the protocol whose condition also has results with enough."""
-    lengths = {path: len(result["episodes"]) for path, result in results.items()}
-    enough = {condition_of(result) for path, result in results.items() if lengths[path] >= FEWEST_EPISODES}
-    short = [path for path, n in lengths.items() if n < FEWEST_EPISODES and condition_of(results[path]) in enough]
-    for path in short:
-        log.warning("%s is left out: it has %d episodes, and others of its condition more", path, lengths[path])
-    return {path: result for path, result in results.items() if path not in short}
+    short = {path: condition_of(result) for path, result in results.items() if len(result["episodes"]) < FEWEST_EPISODES}
+    if not short:
+        return dict(results)
+    enough = {condition_of(result) for path, result in results.items() if path not in short}
+    left_out = [path for path, condition in short.items() if condition in enough]
+    for path in left_out:
+        episodes = len(results[path]["episodes"])
+        log.warning("%s is left out: it has %d episodes, and others of its condition more", path, episodes)
+    return {path: result for path, result in results.items() if path not in left_out}
 
 
 def in_order_of_seeds(runs: Mapping[int | None, Run]) -> list[Run]:

@@ -323,9 +323,8 @@ def _walls(
         left, cut = x + size_x / 2, ["-x"]
     walls.append((Box((outer[0] / 2 - left, outer[1], depth), ((left + outer[0] / 2) / 2, 0.0, z)), cut))
     for wall, sides in walls:
-        room = {axis: wall.size["xyz".index(axis)] for axis in "xyz"}
-        needed = {axis: chamfer * sum(axis in side for side in sides) for axis in "xy"} | dict(z=chamfer)
-        if any(needed[axis] > room[axis] for axis in "xyz"):
+        cuts = [sum(axis in side for side in sides) for axis in "xy"] + [1]
+        if any(chamfer * count > size for count, size in zip(cuts, wall.size, strict=True)):
             raise InvalidArgumentError(
                 f"chamfer {chamfer} m is wider than a wall of {wall.size} m; make it narrower, or the slab larger"
             )

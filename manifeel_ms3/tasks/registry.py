@@ -116,8 +116,8 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
     """
     if not re.fullmatch(r"[\w.-]+-v\d+", env_id):
         raise PluginError(f"the id {env_id!r} of a task must end in a version; give one such as 'MyLab-Press-v1'")
-    known_fields = [field.name for field in fields(TaskSpec)[1:]]
-    if unknown := sorted(about.keys() - set(known_fields)):
+    known_fields = [known.name for known in fields(TaskSpec)[1:]]
+    if unknown := sorted(about.keys() - known_fields):
         raise PluginError(f"the task {env_id!r} is registered with {unknown}; the fields of a task are {known_fields}")
     for name, number in (dict(max_episode_steps=max_episode_steps) | about).items():
         if name in COUNTS and not (isinstance(number, int) and number >= 1):

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from manifeel_ms3.arguments import one_of, require_file
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.command_line import json_object, missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.folder_checks import require_revision
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
@@ -145,7 +145,6 @@ def _check(args: Args) -> None:
     """
     if not args.files:
         raise InvalidArgumentError("no file is given; give a trajectory file (.h5) or a result of `manifeel eval` (.json)")
-    require_file("--out", args.out, "episode.mp4")
     one_of("--pad", args.pad, SIDES)
     json_object("--policy-kwargs", args.policy_kwargs)
     if args.checkpoint and args.policy:

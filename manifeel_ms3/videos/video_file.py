@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.video import encode_mp4
 from manifeel_ms3.files import atomic_write
@@ -26,13 +27,14 @@ END_SECONDS = 1.5
 
 
 def check_video(path: Path, fps: int) -> None:
-    """Check that a path ends in a known suffix and is not a folder, and that its format has the number of frames per second.
+    """Check that a path ends in a known suffix and can be written, and that its format has the number of frames per second.
 
     Raises:
-        InvalidArgumentError: The path has another suffix, or is a folder, or the frames of a GIF would not last a whole number,
-            of two or more, of hundredths of a second.
+        InvalidArgumentError: The path has another suffix, or is a folder, or no file can be made there, or the frames of a GIF
+            would not last a whole number, of two or more, of hundredths of a second.
     """
-    if path.suffix.lower() not in SUFFIXES or path.is_dir():
+    require_file("--out", path, "episode.mp4")
+    if path.suffix.lower() not in SUFFIXES:
         raise InvalidArgumentError(f"--out {path} is not a path of a video; give a file that ends in {', '.join(SUFFIXES)}")
     if path.suffix.lower() == ".gif" and (GIF_CLOCK % fps or fps > GIF_CLOCK // 2):
         rates = [rate for rate in range(1, GIF_CLOCK // 2 + 1) if GIF_CLOCK % rate == 0]
