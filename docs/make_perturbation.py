@@ -12,8 +12,10 @@ from manifeel_ms3.analysis.estimates import difference, holm, mean_success, p_te
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper_tables import linked
 from manifeel_ms3.analysis.protocol import ConditionResults, collect
+from manifeel_ms3.evaluation.floors import highest_floor
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.files import write_text
+from manifeel_ms3.tasks.registry import task_spec
 
 PAGE = Path(__file__).with_name("perturbation.md")
 FOLDER = Path(__file__).with_name("perturbation")
@@ -48,8 +50,15 @@ the correction.
 def page() -> str:
     """The Markdown page."""
     policies = [folder for task in sorted(FOLDER.iterdir()) for folder in map(task.joinpath, SENSING) if folder.is_dir()]
-    tables = [f"## {folder.parent.name}, {SENSING[folder.name]}\n\n{_table(folder)}" for folder in policies]
+    tables = [f"## {_heading(folder)}\n\n{_table(folder)}" for folder in policies]
     return "\n".join([HEAD, *tables, f"A row is made by\n\n```bash\n{COMMAND}\n```\n"])
+
+
+def _heading(folder: Path) -> str:
+    """The heading of a policy's table, and the highest failure floor of its task below it."""
+    spec = task_spec(folder.parent.name)
+    floor = highest_floor(spec.env_id, spec.revision)
+    return f"{spec.name}, {SENSING[folder.name]}\n\nFailure floor under the usual appearance: {floor or 'not measured'}."
 
 
 def _table(folder: Path) -> str:

@@ -15,8 +15,10 @@ from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
 from manifeel_ms3.analysis.paper_tables import HEADINGS, overview_of_table_one
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
+from manifeel_ms3.evaluation.floors import highest_floor
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.files import write_text
+from manifeel_ms3.tasks.registry import task_spec
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -42,7 +44,8 @@ trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the pape
 {episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds;
 rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are
 significantly above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates with three seeds).
-The paper's rates, in brackets, come from much larger networks.
+Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks. The paper's rates, in brackets, come from
+much larger networks.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""
@@ -71,6 +74,7 @@ def block() -> str:
         seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
         tests=len(gains),
+        floor=100 * max(floor.rate for spec in map(task_spec, ROWS) if (floor := highest_floor(spec.env_id, spec.revision))),
     )
     raised = {place for place, p_holm in gains.items() if p_holm < SIGNIFICANT}
     presets = {task: f"`{settings.preset}`" for task, (settings, _) in overview.items()}
