@@ -50,6 +50,8 @@ def test_from_demonstrations_to_a_report(tmp_path: Path):
     page = report.main(report.Args(tmp_path)).read_text()
     for needed in ("data:video/mp4;base64,", "data:image/png;base64,", "Wilson", "socket_xy", "TacFF", "plotly"):
         assert needed in page
+    for of_the_forces in ("gentle success", "contact force allowed"):
+        assert of_the_forces in page
     assert 'src="http' not in page
 
 

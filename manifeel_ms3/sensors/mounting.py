@@ -39,18 +39,20 @@ def pad_pose(facing: Sequence[float], tip: Sequence[float], at: Sequence[float])
     return sapien.Pose(matrix)
 
 
-def grids_for(size: Sequence[float]) -> dict[str, Any]:
-    """`image_shape` and `taxel_shape` of a `TactileSensorConfig` that cover a gel, at the pixels and taxels of the R1.5.
+def grids_for(size: Sequence[float], sensor: TactileSensorConfig | None = None) -> dict[str, Any]:
+    """`image_shape` and `taxel_shape` of a `TactileSensorConfig` that cover a gel, at the pixels and taxels of a sensor.
 
         TactileSensorConfig("touch", "finger", pose, GelConfig(size=(0.016, 0.020)), **grids_for((0.016, 0.020)))
 
     Args:
         size: Extent of the gel across and along the finger, in m.
+        sensor: Sensor whose pixels and taxels are taken; the R1.5 if not given.
 
     Raises:
         InvalidArgumentError: The gel is smaller than one taxel.
     """
-    pitches = dict(image_shape=TactileSensorConfig.pixel_size, taxel_shape=TactileSensorConfig.taxel_pitch)
+    cells = TactileSensorConfig if sensor is None else sensor
+    pitches = dict(image_shape=cells.pixel_size, taxel_shape=cells.taxel_pitch)
     shapes = {name: tuple(int(extent / pitch + CELL_ROUNDING) for extent in size) for name, pitch in pitches.items()}
     if min(shapes["taxel_shape"]) < 1:
         raise InvalidArgumentError(f"a gel of {tuple(size)} m is smaller than a taxel, {pitches['taxel_shape']} m; give metres")

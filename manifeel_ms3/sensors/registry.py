@@ -4,12 +4,13 @@ An entry point is a function that returns the configuration of one pad. `docs/se
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from manifeel_ms3 import plugins
+from manifeel_ms3.arguments import is_number
 from manifeel_ms3.errors import InvalidArgumentError, PluginError, UnknownNameError
 from manifeel_ms3.paths import data_dir
 
@@ -22,6 +23,7 @@ from .config import (
     TactileSensorConfig,
 )
 from .config_fields import with_options
+from .mounting import grids_for
 
 MakeSensor = Callable[[str, str], TactileSensorConfig]
 """Function from the name of a pad in observations, and the name of the link that carries its gel, to its configuration."""
@@ -132,7 +134,8 @@ def task_sensor(
     """
     if own := {"uid", "link"} & set(options or {}):
         raise InvalidArgumentError(f"tactile options {sorted(own)} are set by the robot; leave them out")
-    config = with_options(sensor_config(name, uid, link), options or {})
+    standard = sensor_config(name, uid, link)
+    config = with_options(standard, _fitting_the_gel(standard, options or {}))
     if "optics.calibration" in (options or {}) and config.optics.lights is not None:
         raise InvalidArgumentError(
             f"tactile option 'optics.calibration': the colours of sensor {name!r} are computed from its lamps, and no "
@@ -144,3 +147,20 @@ def task_sensor(
     if unknown := [str(one) for one in imperfections or {} if one not in known]:
         raise UnknownNameError(f"imperfections {unknown} are unknown; choose from {known}")
     return with_options(config, {f"imperfections.{one}": value for one, value in (imperfections or {}).items()})
+
+
+def _fitting_the_gel(standard: TactileSensorConfig, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The options of a pad, with an image and a force field that fit a smaller gel, unless the options give these, too.
+
+    Args:
+        standard: Configuration of the sensor without the options.
+        options: Fields to change, by dotted name; values of wrong types are left as they are.
+
+    Raises:
+        InvalidArgumentError: The gel is smaller than one taxel.
+    """
+    size = options.get("gel.size")
+    if not (isinstance(size, Sequence) and len(size) == 2 and all(map(is_number, size))):
+        return options
+    shapes = {name: tuple(map(min, shape, getattr(standard, name))) for name, shape in grids_for(size, standard).items()}
+    return shapes | dict(options)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from baselines.common import background_evaluation, training
 from baselines.common.background_evaluation import BackgroundEvaluation
@@ -114,6 +115,8 @@ def test_loss_falls(run, checkpoint):
     log = log_of(run.args.run_dir)
     assert [entry["step"] for entry in log] == [15, 30, 45, 60]
     assert {"losses/total_loss", "charts/learning_rate"} <= set(log[0])
+    events = EventAccumulator(str(run.args.run_dir)).Reload()
+    assert {"time/total_seconds", "time/iterations_per_second"} < set(events.Tags()["scalars"])
     consistency = getattr(run.args.policy, "consistency", False)  # its loss is a small disagreement, and noisy
     assert min(entry["losses/total_loss"] for entry in log) < (0.9 if consistency else 0.8) * log[0]["losses/total_loss"]
 

@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -17,6 +19,11 @@ from tests.tasks_and_marks import PEG, needs_renderer
 
 SMALL = dict(sensor_configs=dict(width=32, height=32))
 HAS_LEROBOT = importlib.util.find_spec("lerobot") is not None
+
+
+def test_the_file_of_the_envhub_has_the_function_that_lerobot_calls():
+    path = Path(__file__).parents[2] / "examples/lerobot_envhub/env.py"
+    assert runpy.run_path(str(path))["make_env"] is make_env
 
 
 @pytest.fixture(scope="module")

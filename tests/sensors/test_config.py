@@ -1,5 +1,6 @@
 """Bad configurations are refused by name."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from manifeel_ms3.sensors import (
 from manifeel_ms3.sensors.optics.shader import Shader
 from manifeel_ms3.sensors.optics.taxim_table import read_table
 from manifeel_ms3.sensors.registry import task_sensor
+from tests.tasks_and_marks import PEG
 
 
 @pytest.mark.parametrize(
@@ -79,6 +81,25 @@ def test_options_are_changed_together_in_any_order():
     assert (whole.thickness, whole.size) == (0.003, (0.03, 0.04))
     with pytest.raises(InvalidArgumentError, match="taxel_shape x taxel_pitch"):
         with_options(config, {"image_shape": (180, 224), "gel.size": (0.016, 0.020)})
+
+
+def test_a_smaller_gel_has_an_image_and_a_force_field_that_fit_it():
+    size = {"gel.size": [0.016, 0.020]}
+    small = task_sensor("gelsight_r15", "a", "b", size, None)
+    assert (small.image_shape, small.taxel_shape) == ((182, 228), (9, 12))
+    assert task_sensor("gelsight_r15", "a", "b", {"gel.size": [0.03, 0.04]}, None).taxel_shape == (10, 14)
+    assert task_sensor("gelsight_r15", "a", "b", size | {"taxel_shape": [4, 5]}, None).taxel_shape == (4, 5)
+    with pytest.raises(InvalidArgumentError, match="smaller than a taxel"):
+        task_sensor("gelsight_r15", "a", "b", {"gel.size": [1e-4, 1e-4]}, None)
+    with pytest.raises(InvalidArgumentError, match=r"gel\.size"):
+        task_sensor("gelsight_r15", "a", "b", {"gel.size": "small"}, None)
+
+
+def test_a_task_has_a_smaller_gel_by_one_option():
+    env = gym.make(PEG, obs_mode="tacff", tactile={"gel.size": (0.016, 0.020)}, render_backend="none")
+    obs, _ = env.reset(seed=0)
+    assert obs["sensor_data"]["tactile_right"]["force_field"].shape == (1, 9, 12, 3)
+    env.close()
 
 
 def test_a_sensor_with_lamps_takes_a_calibration_only_instead_of_them():
