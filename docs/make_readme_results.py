@@ -13,6 +13,7 @@ from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds, holm
 from manifeel_ms3.analysis.markdown import markdown_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
+from manifeel_ms3.analysis.paper_comparison import gpu_of_training
 from manifeel_ms3.analysis.paper_tables import HEADINGS, overview_of_table_one
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
 from manifeel_ms3.evaluation.floors import highest_floor
@@ -40,12 +41,12 @@ ROWS = {
 TEXT = """
 **What touch adds, in numbers:** success rates of Diffusion Policy with small networks. Each row has one preset: of those with
 which all three sensings were run with most training seeds, the last of `cpu`, `cpu_long` and `cpu_targets`. Each policy was
-trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core, with the paper's number of demonstrations, and evaluated on
-{episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds} training seeds;
-rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in bold letters are
-significantly above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates with three seeds).
-Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks. The paper's rates, in brackets, come from
-much larger networks.
+trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of demonstrations, and
+evaluated on {episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds}
+training seeds; rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in
+bold letters are significantly above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates
+with three seeds). Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks. The paper's rates, in
+brackets, come from much larger networks.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""
@@ -66,10 +67,13 @@ def block() -> str:
     here = {place: found[condition] for place, condition in conditions.items()}
     gains = _corrected_gains(here)
     trained = [result["config"] for result in results.values() if condition_of(result) in conditions.values()]
-    minutes = [config["training_seconds"] / 60 for config in trained if "training_seconds" in config]
+    timed = [config for config in trained if "training_seconds" in config]
+    minutes = [config["training_seconds"] / 60 for config in timed if not gpu_of_training(config)]
+    on_gpu = [config["training_seconds"] / 60 for config in timed if gpu_of_training(config)]
     text = TEXT.format(
         fastest=min(minutes),
         slowest=max(minutes),
+        on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {max(on_gpu):.0f} minutes)" if on_gpu else "",
         episodes=min(len(ours.episode_seeds) for ours in here.values()),
         seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,

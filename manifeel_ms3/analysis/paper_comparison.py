@@ -75,7 +75,12 @@ def _timed(result: dict[str, Any]) -> tuple[float, float, str]:
     assert samples, "results of unknown batch size are left out"
     step_seconds = config["training_seconds"] / config["step"]
     epoch = step_seconds * math.ceil(config["num_samples"] / samples)
-    return epoch, samples / step_seconds, shown(config["trained_on"]["gpu"] or config["trained_on"]["cpu"])
+    return epoch, samples / step_seconds, shown(gpu_of_training(config) or config["trained_on"]["cpu"])
+
+
+def gpu_of_training(config: dict[str, Any]) -> str | None:
+    """Name of the GPU that trained a policy; None if a CPU did, also on a machine with a GPU."""
+    return None if config.get("device") == "cpu" else config["trained_on"]["gpu"]
 
 
 def similarity_table(files: Sequence[Path]) -> str:

@@ -33,7 +33,7 @@ from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
 from .markdown import markdown_table, shown
 from .matching import Found
-from .paper_comparison import runtime_table, similarity_table
+from .paper_comparison import gpu_of_training, runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
 from .presets import FULLEST, training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
@@ -362,7 +362,7 @@ def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
         seed = result["training_seed"]
         longest[seed] = max(longest.get(seed, 0.0), config.get("training_seconds", 0.0))
         if trained_on := config.get("trained_on"):
-            machines.add(shown(trained_on["gpu"] or f"{trained_on['cores']} cores of an {trained_on['cpu']}"))
+            machines.add(shown(gpu_of_training(config) or f"{trained_on['cores']} cores of an {trained_on['cpu']}"))
     hours = sum(longest.values()) / SECONDS_PER_HOUR
     return f"{hours:.2f} h" if hours else None, ", ".join(sorted(machines)) or None
 
