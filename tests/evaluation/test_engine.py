@@ -18,6 +18,7 @@ import torch
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from baselines.diffusion_policy.train import SPEC
+from baselines.registry import policy_spec
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, WorkFailedError
 from manifeel_ms3.evaluation import policy_process
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
@@ -159,7 +160,7 @@ def checkpoint(tmp_path_factory):
     return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "00000001")
 
 
-def requests(count: int) -> list[PolicyRequest]:
+def requests(count: int, pose_features: int = 7) -> list[PolicyRequest]:
     chance = np.random.default_rng(0)
     return [
         PolicyRequest(
@@ -167,17 +168,28 @@ def requests(count: int) -> list[PolicyRequest]:
             2 * k,
             {
                 "sensor_data/tactile_right/force_field": chance.random((2, 10, 14, 3), np.float32),
-                "extra/tcp_pose": chance.random((2, 7), np.float32),
+                "extra/tcp_pose": chance.random((2, pose_features), np.float32),
             },
         )
         for k in range(count)
     ]
 
 
-@pytest.mark.parametrize("steps", [20, 4])  # DDPM, which draws noise at every step, and DDIM
-@pytest.mark.parametrize("batch_size", [1, 4])
-def test_an_answer_does_not_depend_on_the_other_requests_of_its_batch(checkpoint, batch_size, steps):
-    agent, asked = SPEC.load(checkpoint, batch_size=batch_size, inference_steps=steps), requests(6)
+@pytest.mark.parametrize(
+    ("policy", "steps", "batch_size"),
+    [
+        ("diffusion_policy", 20, 1),  # DDPM, which draws noise at every step
+        ("diffusion_policy", 20, 4),
+        ("diffusion_policy", 4, 1),  # DDIM
+        ("diffusion_policy", 4, 4),
+        ("equivariant_diffusion_policy", 4, 4),
+        ("flow_matching", 4, 4),
+    ],
+)
+def test_an_answer_does_not_depend_on_the_other_requests_of_its_batch(tmp_path, policy, steps, batch_size):
+    checkpoint = save_tiny_checkpoint(tmp_path / "1", policy=policy)
+    agent = policy_spec(policy).load(checkpoint, batch_size=batch_size, inference_steps=steps)
+    asked = requests(6, agent.policy.spec.pose_features)
     together = agent.answer(asked)
     assert len({answer.tobytes() for answer in together}) == 6
     for order in ([5, 3, 1], [2], [4, 0], [0, 4, 2, 1, 3, 5]):
