@@ -31,11 +31,13 @@ from tests.evaluation.batch_policies import (
     CRASHES,
     FINE,
     HANGS,
+    KILLED,
     MISCOUNTS,
     RAISES,
     CannotBeMade,
     CrashesOnce,
     DiesWhenMade,
+    KillsASimulation,
     Moody,
     Single,
     source_of,
@@ -238,6 +240,18 @@ def test_the_number_of_workers_changes_no_outcome(checkpoint, outcomes_with_one_
     assert outcomes_with(checkpoint, workers) == expected
     assert all(outcome.error is None and outcome.episode_len == 6 for outcome in expected)
     assert len({outcome.return_ for outcome in expected}) == 3
+
+
+def test_a_simulating_process_that_is_killed_fails_its_episode_alone(checkpoint, outcomes_with_one_worker):
+    """Two processes simulate, so that one of the first two episodes has finished when the third begins."""
+    source, told = replace(source_of(KillsASimulation), kwargs=json.dumps(dict(checkpoint=str(checkpoint)))), []
+    outcomes = run_episodes(Evaluation(source, PEG, BARE, {}), [100_000, 100_001, KILLED, 100_005], 2, told.append)
+    killed = outcomes.pop(2)
+    assert killed.error == "the simulating process ended with exit code -9: it crashed, or hung for good"
+    assert not killed.success_once
+    assert [replace(outcome, inference_ms=0.0) for outcome in outcomes] == outcomes_with_one_worker
+    assert told[0].error is None
+    assert len(told) == 4
 
 
 class Watched:
