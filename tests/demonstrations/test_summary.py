@@ -3,14 +3,20 @@
 import io
 import json
 import re
+import shutil
+from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from mani_skill.utils.wrappers import RecordEpisode
 from rich.console import Console
 
+from baselines.common.dataset import read_episodes
+from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.demonstrations.recording import STATES_FILE, observed_file
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
@@ -82,6 +88,29 @@ def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
     Console(width=160, file=page).print(summary(tmp_path / "theirs.h5"))
     assert "2 on average" in page.getvalue()
     assert validate(tmp_path / "theirs.h5") == ["seed 3: it does not end in success"]
+
+
+@pytest.fixture
+def old(tmp_path) -> Path:
+    """The sample as earlier versions wrote it: `trajectory.h5` has observations, and some of what is known today is missing."""
+    path = Path(shutil.copy(SAMPLE, tmp_path / STATES_FILE))
+    with h5py.File(path, "r+") as file:
+        for trajectory in file.values():
+            del trajectory["rewards"], trajectory["env_states/controller/gripper"]
+    header = {name: value for name, value in read_header(SAMPLE).items() if name not in ("commit_info", "revision")}
+    path.with_suffix(".json").write_text(json.dumps(header))
+    return path
+
+
+def test_a_file_of_an_earlier_version_is_read(old):
+    assert observed_file(old.parent) == old
+    spec = observation_spec("rgb+tacff", ("wrist",), ("right",), 32)
+    np.testing.assert_equal(*(read_episodes([path], PEG, spec, None) for path in (old, SAMPLE)))
+    assert validate(old) == []
+    page = io.StringIO()
+    Console(width=160, file=page).print(summary(old))
+    assert f"{PEG}, revision not known" in page.getvalue()
+    assert "2, 2 successes" in page.getvalue()
 
 
 def test_episodes_are_found_by_their_numbers(tmp_path):
