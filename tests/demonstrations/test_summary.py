@@ -116,6 +116,16 @@ def test_maniskill_replays_a_file_of_its_recorder_though_nobody_imports_our_task
         np.testing.assert_allclose(second[name], first[name], atol=1e-6, err_msg=name)
 
 
+@needs_renderer
+def test_a_file_of_maniskills_recorder_holds_what_pads_and_cameras_see(make_env, tmp_path):
+    theirs = recorded_by_maniskill(make_env(PEG, obs_mode="rgb+tacrgb+tacff"), tmp_path)
+    shapes = {name: array.shape for name, array in arrays_of(theirs).items()}
+    assert shapes["traj_0/obs/sensor_data/wrist/rgb"] == (3, 256, 256, 3)
+    assert shapes["traj_0/obs/sensor_data/tactile_right/rgb"] == (3, 240, 320, 3)
+    assert shapes["traj_0/obs/sensor_data/tactile_right/force_field"] == (3, 10, 14, 3)
+    assert validate(theirs) == ["seed 3: it does not end in success"]
+
+
 @pytest.fixture
 def old(tmp_path) -> Path:
     """The sample as earlier versions wrote it: `trajectory.h5` has observations, and some of what is known today is missing."""

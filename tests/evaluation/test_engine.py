@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from imageio.v3 import imread
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from baselines.diffusion_policy.train import SPEC
@@ -411,6 +412,17 @@ def test_evaluation_environments_are_made_as_in_maniskills_baselines(num_envs):
     assert np.array_equal(obs[:, 0], obs[:, 1])
     assert not np.array_equal(after[:, 0], after[:, 1])
     assert info_after["elapsed_steps"].tolist() == [1] * num_envs
+
+
+@needs_renderer
+def test_an_evaluation_environment_makes_a_video_of_each_episode(tmp_path):
+    kwargs = dict(obs_mode="state", render_mode="rgb_array", max_episode_steps=2)
+    envs = make_eval_envs(PEG, 1, env_kwargs=kwargs, video_dir=tmp_path)
+    envs.reset(seed=[1])
+    for _ in range(4):
+        envs.step(np.zeros((1, 6), np.float32))
+    envs.close()
+    assert [len(imread(video)) for video in tmp_path.glob("*.mp4")] == [3, 3]  # images of the reset and of both steps
 
 
 @pytest.mark.parametrize("wrappers", [[], [CPUGymWrapper]], ids=["plain", "CPUGymWrapper"])
