@@ -97,6 +97,6 @@ def _run(
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
-    sys.path[:0] = path
+    sys.path[:] = [*path, *filter(None, sys.path)]  # an empty name is that of the working folder, which `-P` leaves out
     sys.argv[1:] = arguments
     do()

@@ -72,9 +72,14 @@ def _wrapped(env: gym.Env, wrappers: Sequence[Wrapper], video_dir: str | None) -
     for wrapper in wrappers:
         env = wrapper(env)
     if video_dir:
-        # of several environments, ManiSkill ends a video after a number of steps, since they may be reset one by one
-        steps = find_max_episode_steps_value(env) if cast(Any, env.unwrapped).num_envs > 1 else None
+        several = cast(Any, env.unwrapped).num_envs > 1
         env = RecordEpisode(
-            cast(Any, env), output_dir=video_dir, save_trajectory=False, info_on_video=True, max_steps_per_video=steps
+            cast(Any, env),
+            output_dir=video_dir,
+            save_trajectory=False,
+            # of one environment, ManiSkill takes the reward for a number, which numpy 2.4 refuses of an array of one
+            info_on_video=several,
+            # of several, ManiSkill ends a video after a number of steps, since they may be reset one by one
+            max_steps_per_video=find_max_episode_steps_value(env) if several else None,
         )
     return env

@@ -3,21 +3,29 @@
 import io
 import json
 import re
+import shutil
+from pathlib import Path
 
+import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 from mani_skill.utils.wrappers import RecordEpisode
 from rich.console import Console
 
+from baselines.common.dataset import read_episodes
+from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
+from manifeel_ms3.demonstrations.recording import STATES_FILE, observed_file
 from manifeel_ms3.demonstrations.replay import replay
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.demonstrations.view import read_streams
+from tests.command_process import run_code
 from tests.sample import observed_sample, states_sample
-from tests.tasks_and_marks import PEG
-from tests.trajectories import renumbered
+from tests.tasks_and_marks import PEG, needs_renderer
+from tests.trajectories import arrays_of, renumbered
 
 SAMPLE = observed_sample(PEG)
 
@@ -67,21 +75,78 @@ def test_a_file_that_is_not_there_is_said(tmp_path):
         summary(tmp_path / "none.h5")
 
 
-@pytest.mark.parametrize("obs_mode", ["state", "state+tacff"])
-def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
-    """It has no contact forces, its observations may be vectors, and its id names the module that registers the task."""
-    env = make_env(PEG, obs_mode=obs_mode, render_backend="none")
-    recorder = RecordEpisode(env, str(tmp_path), trajectory_name="theirs", save_video=False)
+def recorded_by_maniskill(env: gym.Env, folder: Path) -> Path:
+    """The file of ManiSkill's recorder of an episode of two steps, of the seed 3."""
+    recorder = RecordEpisode(env, str(folder), trajectory_name="theirs", save_video=False)
     recorder.reset(seed=3)
     for _ in range(2):
         recorder.step(recorder.action_space.sample())
     recorder.flush_trajectory()
     recorder._h5_file.close()
-    assert read_header(tmp_path / "theirs.h5")["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
+    return folder / "theirs.h5"
+
+
+@pytest.mark.parametrize("obs_mode", ["state", "state+tacff"])
+def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
+    """It has no contact forces, its observations may be vectors, and its id names the module that registers the task."""
+    theirs = recorded_by_maniskill(make_env(PEG, obs_mode=obs_mode, render_backend="none"), tmp_path)
+    assert read_header(theirs)["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
     page = io.StringIO()
-    Console(width=160, file=page).print(summary(tmp_path / "theirs.h5"))
+    Console(width=160, file=page).print(summary(theirs))
     assert "2 on average" in page.getvalue()
-    assert validate(tmp_path / "theirs.h5") == ["seed 3: it does not end in success"]
+    assert validate(theirs) == ["seed 3: it does not end in success"]
+
+
+REPLAY = """
+from mani_skill.trajectory.replay_trajectory import main, parse_args
+main(parse_args(["--traj-path", "theirs.h5", "--save-traj", "--allow-failure"]))
+"""
+
+
+@needs_renderer
+def test_maniskill_replays_a_file_of_its_recorder_though_nobody_imports_our_tasks(make_env, tmp_path):
+    theirs = recorded_by_maniskill(make_env(PEG, obs_mode="state+tacff"), tmp_path)
+    done = run_code(REPLAY, folder=tmp_path)
+    assert "1/1=100.00%" in done.stdout, done.stderr
+    (again,) = tmp_path.glob("theirs.*.h5")
+    first, second = arrays_of(theirs), arrays_of(again)
+    poses = [name for name in first if "/env_states/" in name]
+    assert poses
+    for name in poses:
+        np.testing.assert_allclose(second[name], first[name], atol=1e-6, err_msg=name)
+
+
+@needs_renderer
+def test_a_file_of_maniskills_recorder_holds_what_pads_and_cameras_see(make_env, tmp_path):
+    theirs = recorded_by_maniskill(make_env(PEG, obs_mode="rgb+tacrgb+tacff"), tmp_path)
+    shapes = {name: array.shape for name, array in arrays_of(theirs).items()}
+    assert shapes["traj_0/obs/sensor_data/wrist/rgb"] == (3, 256, 256, 3)
+    assert shapes["traj_0/obs/sensor_data/tactile_right/rgb"] == (3, 240, 320, 3)
+    assert shapes["traj_0/obs/sensor_data/tactile_right/force_field"] == (3, 10, 14, 3)
+    assert validate(theirs) == ["seed 3: it does not end in success"]
+
+
+@pytest.fixture
+def old(tmp_path) -> Path:
+    """The sample as earlier versions wrote it: `trajectory.h5` has observations, and some of what is known today is missing."""
+    path = Path(shutil.copy(SAMPLE, tmp_path / STATES_FILE))
+    with h5py.File(path, "r+") as file:
+        for trajectory in file.values():
+            del trajectory["rewards"], trajectory["env_states/controller/gripper"]
+    header = {name: value for name, value in read_header(SAMPLE).items() if name not in ("commit_info", "revision")}
+    path.with_suffix(".json").write_text(json.dumps(header))
+    return path
+
+
+def test_a_file_of_an_earlier_version_is_read(old):
+    assert observed_file(old.parent) == old
+    spec = observation_spec("rgb+tacff", ("wrist",), ("right",), 32)
+    np.testing.assert_equal(*(read_episodes([path], PEG, spec, None) for path in (old, SAMPLE)))
+    assert validate(old) == []
+    page = io.StringIO()
+    Console(width=160, file=page).print(summary(old))
+    assert f"{PEG}, revision not known" in page.getvalue()
+    assert "2, 2 successes" in page.getvalue()
 
 
 def test_episodes_are_found_by_their_numbers(tmp_path):

@@ -1,17 +1,21 @@
 """Policies that answer several episodes at once, good and bad; the policy's process imports them by name."""
 
 import os
+import signal
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from manifeel_ms3.evaluation.policy import PolicyRequest, PolicySource
+from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest, PolicySource, load_policy
 from tests.evaluation.policies import CannotBeMade as CannotBeMade  # found by its name in this module
 
 FINE, RAISES, CRASHES, HANGS, MISCOUNTS = 10, 20, 30, 40, 50
 """First seeds of ten episodes each, in which the policy behaves in this way."""
+KILLED = 60
+"""Seed of the episode whose simulating process `KillsASimulation` kills."""
 
 
 class Part:
@@ -62,6 +66,32 @@ class CrashesOnce(Moody):
         if (marker := Path(os.environ["CRASHES_ONCE"])).exists():
             raise RuntimeError("out of memory")
         marker.touch()
+
+
+class KillingPart(PolicyOfPart):
+    """The part of another policy, which kills its own process at the second step of the episode `KILLED`."""
+
+    def __init__(self, make_part, ask):
+        self._part = make_part(ask)
+
+    def begin_episode(self, seed):
+        self.seed, self.step = seed, 0
+        super().begin_episode(seed)
+
+    def act(self, obs):
+        self.step += 1
+        if (self.seed, self.step) == (KILLED, 2):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().act(obs)
+
+
+class KillsASimulation:
+    """A checkpoint's policy with another part beside its episodes."""
+
+    def __init__(self, checkpoint: str):
+        agent = load_policy(Path(checkpoint), device="cpu", batch_size=2)
+        self.answer, self.batch_size = agent.answer, agent.batch_size
+        self.make_episode_part = partial(KillingPart, agent.make_episode_part)
 
 
 class DiesWhenMade:

@@ -15,9 +15,11 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from imageio.v3 import imread
 from mani_skill.utils.wrappers import CPUGymWrapper
 
 from baselines.diffusion_policy.train import SPEC
+from baselines.registry import policy_spec
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, WorkFailedError
 from manifeel_ms3.evaluation import policy_process
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
@@ -30,11 +32,13 @@ from tests.evaluation.batch_policies import (
     CRASHES,
     FINE,
     HANGS,
+    KILLED,
     MISCOUNTS,
     RAISES,
     CannotBeMade,
     CrashesOnce,
     DiesWhenMade,
+    KillsASimulation,
     Moody,
     Single,
     source_of,
@@ -159,7 +163,7 @@ def checkpoint(tmp_path_factory):
     return save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "00000001")
 
 
-def requests(count: int) -> list[PolicyRequest]:
+def requests(count: int, pose_features: int = 7) -> list[PolicyRequest]:
     chance = np.random.default_rng(0)
     return [
         PolicyRequest(
@@ -167,17 +171,28 @@ def requests(count: int) -> list[PolicyRequest]:
             2 * k,
             {
                 "sensor_data/tactile_right/force_field": chance.random((2, 10, 14, 3), np.float32),
-                "extra/tcp_pose": chance.random((2, 7), np.float32),
+                "extra/tcp_pose": chance.random((2, pose_features), np.float32),
             },
         )
         for k in range(count)
     ]
 
 
-@pytest.mark.parametrize("steps", [20, 4])  # DDPM, which draws noise at every step, and DDIM
-@pytest.mark.parametrize("batch_size", [1, 4])
-def test_an_answer_does_not_depend_on_the_other_requests_of_its_batch(checkpoint, batch_size, steps):
-    agent, asked = SPEC.load(checkpoint, batch_size=batch_size, inference_steps=steps), requests(6)
+@pytest.mark.parametrize(
+    ("policy", "steps", "batch_size"),
+    [
+        ("diffusion_policy", 20, 1),  # DDPM, which draws noise at every step
+        ("diffusion_policy", 20, 4),
+        ("diffusion_policy", 4, 1),  # DDIM
+        ("diffusion_policy", 4, 4),
+        ("equivariant_diffusion_policy", 4, 4),
+        ("flow_matching", 4, 4),
+    ],
+)
+def test_an_answer_does_not_depend_on_the_other_requests_of_its_batch(tmp_path, policy, steps, batch_size):
+    checkpoint = save_tiny_checkpoint(tmp_path / "1", policy=policy)
+    agent = policy_spec(policy).load(checkpoint, batch_size=batch_size, inference_steps=steps)
+    asked = requests(6, agent.policy.spec.pose_features)
     together = agent.answer(asked)
     assert len({answer.tobytes() for answer in together}) == 6
     for order in ([5, 3, 1], [2], [4, 0], [0, 4, 2, 1, 3, 5]):
@@ -226,6 +241,18 @@ def test_the_number_of_workers_changes_no_outcome(checkpoint, outcomes_with_one_
     assert outcomes_with(checkpoint, workers) == expected
     assert all(outcome.error is None and outcome.episode_len == 6 for outcome in expected)
     assert len({outcome.return_ for outcome in expected}) == 3
+
+
+def test_a_simulating_process_that_is_killed_fails_its_episode_alone(checkpoint, outcomes_with_one_worker):
+    """Two processes simulate, so that one of the first two episodes has finished when the third begins."""
+    source, told = replace(source_of(KillsASimulation), kwargs=json.dumps(dict(checkpoint=str(checkpoint)))), []
+    outcomes = run_episodes(Evaluation(source, PEG, BARE, {}), [100_000, 100_001, KILLED, 100_005], 2, told.append)
+    killed = outcomes.pop(2)
+    assert killed.error == "the simulating process ended with exit code -9: it crashed, or hung for good"
+    assert not killed.success_once
+    assert [replace(outcome, inference_ms=0.0) for outcome in outcomes] == outcomes_with_one_worker
+    assert told[0].error is None
+    assert len(told) == 4
 
 
 class Watched:
@@ -385,6 +412,17 @@ def test_evaluation_environments_are_made_as_in_maniskills_baselines(num_envs):
     assert np.array_equal(obs[:, 0], obs[:, 1])
     assert not np.array_equal(after[:, 0], after[:, 1])
     assert info_after["elapsed_steps"].tolist() == [1] * num_envs
+
+
+@needs_renderer
+def test_an_evaluation_environment_makes_a_video_of_each_episode(tmp_path):
+    kwargs = dict(obs_mode="state", render_mode="rgb_array", max_episode_steps=2)
+    envs = make_eval_envs(PEG, 1, env_kwargs=kwargs, video_dir=tmp_path)
+    envs.reset(seed=[1])
+    for _ in range(4):
+        envs.step(np.zeros((1, 6), np.float32))
+    envs.close()
+    assert [len(imread(video)) for video in tmp_path.glob("*.mp4")] == [3, 3]  # images of the reset and of both steps
 
 
 @pytest.mark.parametrize("wrappers", [[], [CPUGymWrapper]], ids=["plain", "CPUGymWrapper"])

@@ -18,6 +18,7 @@ from manifeel_ms3.evaluation.policy import PolicyError
 from manifeel_ms3.evaluation.remote_policy import RemotePolicy, flat_observation
 from manifeel_ms3.evaluation.result import ResultError, read_result, results_in
 from manifeel_ms3.tasks.registry import evaluation_seeds
+from tests.command_process import run_module
 from tests.tasks_and_marks import PEG
 from tests.trust.files_of_strangers import rewrite_json
 from tests.trust.listening import free_port
@@ -275,13 +276,27 @@ def test_results_that_are_not_of_the_published_form_are_refused(result_file):
         read_result(result_file)
 
 
-def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
+@pytest.fixture
+def example(tmp_path) -> str:
+    """The policy of the documentation, which lies in the folder of the test."""
     page = (SERVER.parents[1] / "docs/evaluation.md").read_text()
     (code,) = re.findall(r"```python\n# my_module.py\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "my_module.py").write_text(code)
+    return code
+
+
+def test_the_example_of_the_documentation_runs(example, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     settings = dict(env_id=PEG, obs_mode="tacff", cameras=(), episodes=1, env_kwargs=BARE, policy_kwargs='{"gain": 0.3}')
     result = read_result(main(Args(policy="my_module:MyPolicy", out=tmp_path / "evaluation.json", **settings)))
     assert result["episodes"][0]["error"] is None
-    assert len([line for line in code.splitlines() if line.strip()]) <= 20
+    assert len([line for line in example.splitlines() if line.strip()]) <= 20
+
+
+@pytest.mark.usefixtures("example")
+def test_the_command_finds_a_policy_in_its_working_folder(tmp_path):
+    flags = ("--policy", "my_module:MyPolicy", "--env-id", PEG, "--obs-mode", "tacff", "--episodes", 1, "--env-kwargs", BARE)
+    done = run_module("manifeel_ms3.cli", "eval", *flags, folder=tmp_path, on_path=False)
+    assert done.returncode == 0, done.stderr
+    assert [episode["error"] for episode in read_result(tmp_path / "evaluation.json")["episodes"]] == [None]
