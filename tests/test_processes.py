@@ -186,7 +186,9 @@ def test_ten_thousand_steps_with_all_sensors(make_env, figure):
     figure("memory after 100 episodes more than after 5, MB", sizes[-1] - sizes[4], at_most=50)
 
 
-@pytest.mark.parametrize(("mode", "shape"), [("tacff", "(2, 10, 14, 3)"), ("state", "(2, 39)")])
+@pytest.mark.parametrize(
+    ("mode", "shape"), [("tacff", "(2, 10, 14, 3)"), ("state+tacff", "(2, 10, 14, 3)"), ("state", "(2, 39)")]
+)
 def test_gymnasiums_vector_env_runs_in_its_default_mode_with_no_other_environment_alive(mode, shape):
     """It forks, after it has made and closed an environment of its own; in a process of its own, which has no other."""
     program = f"""
