@@ -326,7 +326,8 @@ def test_flags_have_maniskills_names_and_their_old_ones():
     theirs = "--demo-path a.h5 --total-iters 7 --save-freq 3 --log-freq 2 --num-eval-episodes 4 --num-eval-envs 2 --track"
     ours = "--demos a.h5 --steps 7 --save-every 3 --log-every 2 --eval-episodes 4 --eval-workers 2 --track"
     named = "--exp-name x --num-demos 5 --eval-freq 6 --wandb-project-name y --wandb-entity z --capture-video"
-    theirs, ours = f"{theirs} {named}", f"{ours} {named}"
+    theirs += f" {named} --obs-horizon 3 --act-horizon 5 --pred-horizon 12"
+    ours += f" {named} --policy.obs-horizon 3 --policy.action-horizon 5 --policy.pred-horizon 12"
     assert parse(args=["flow_matching", "cpu", *theirs.split()]) == parse(args=["flow_matching", "cpu", *ours.split()])
     evaluate = partial(tyro.cli, cli.command_module("eval").Args)
     assert evaluate(args=["--num-eval-episodes", "3", "--num-eval-envs", "2"]) == evaluate(

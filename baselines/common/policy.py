@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, cast
+from typing import Annotated, ClassVar, Literal, cast
 
 import torch
 import torch.nn as nn
+from tyro.conf import arg
 
 from manifeel_ms3.arguments import require_amount, require_at_least, require_choices
 from manifeel_ms3.errors import InvalidArgumentError
@@ -31,11 +32,11 @@ class PolicyConfig:
             network can have these sizes.
     """
 
-    obs_horizon: int = 2
+    obs_horizon: Annotated[int, arg(aliases=["--obs-horizon"])] = 2
     """Number of observations, the present one included, that condition a prediction."""
-    pred_horizon: int = 16
+    pred_horizon: Annotated[int, arg(aliases=["--pred-horizon"])] = 16
     """Number of actions in a prediction."""
-    action_horizon: int = 8
+    action_horizon: Annotated[int, arg(aliases=["--act-horizon"])] = 8
     """Number of actions of a prediction that are executed before the next prediction."""
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     """Networks that encode the observations."""
