@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest, PolicySource, load_policy
+from baselines.registry import policy_spec
+from manifeel_ms3.evaluation.policy import PolicyOfPart, PolicyRequest, PolicySource
 from tests.evaluation.policies import CannotBeMade as CannotBeMade  # found by its name in this module
 
 FINE, RAISES, CRASHES, HANGS, MISCOUNTS = 10, 20, 30, 40, 50
@@ -89,7 +90,7 @@ class KillsASimulation:
     """A checkpoint's policy with another part beside its episodes."""
 
     def __init__(self, checkpoint: str):
-        agent = load_policy(Path(checkpoint), device="cpu", batch_size=2)
+        agent = policy_spec("diffusion_policy").load(Path(checkpoint), batch_size=2)
         self.answer, self.batch_size = agent.answer, agent.batch_size
         self.make_episode_part = partial(KillingPart, agent.make_episode_part)
 

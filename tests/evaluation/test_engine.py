@@ -418,7 +418,7 @@ def test_evaluation_environments_are_made_as_in_maniskills_baselines(num_envs):
 def test_an_evaluation_environment_makes_a_video_of_each_episode(tmp_path):
     kwargs = dict(obs_mode="state", render_mode="rgb_array", max_episode_steps=2)
     envs = make_eval_envs(PEG, 1, env_kwargs=kwargs, video_dir=tmp_path)
-    envs.reset(seed=[1])
+    envs.reset(seed=1)
     for _ in range(4):
         envs.step(np.zeros((1, 6), np.float32))
     envs.close()
