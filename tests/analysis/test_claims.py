@@ -139,7 +139,7 @@ def test_a_claim_stands_beside_the_papers_difference(tmp_path):
 
 def test_the_page_of_results_holds_what_was_run_beside_the_papers(tmp_path):
     for seed, rate in enumerate((0.1, 0.2, 0.3)):
-        write_run(tmp_path, VISION, rate, seed, checkpoints=12, training_seconds=1800.0, trained_on=TRAINED_ON)
+        write_run(tmp_path, VISION, rate, seed, checkpoints=12, training_seconds=1800.0, device="cuda", trained_on=TRAINED_ON)
     page = page_of(tmp_path)
     (ran,) = (line for line in page.splitlines() if "3 x 10 x 50" in line)
     mean = r"20% \[\d+%, \d+%\] \(\[10%\]\(\S+\), \[20%\]\(\S+\), \[30%\]\(\S+\)\)"
