@@ -12,7 +12,6 @@ control step are compared, since the ends of episodes and the time limits differ
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -51,7 +50,6 @@ class Args:
 @dataclass
 class Run:
     seconds: float
-    cpu_seconds: float
     steps: int
     succeeded: int
 
@@ -63,15 +61,14 @@ def timed(root: Path, module: str, checkpoint: Path, args: Args, *flags: str) ->
         command = [sys.executable, "-m", module, "--checkpoint", str(checkpoint.absolute()), "--out", str(out)]
         command += ["--episodes", str(args.episodes), "--workers", str(args.workers), *flags]
         environment = os.environ | dict(PYTHONPATH=str(root.absolute()), OMP_NUM_THREADS="1")
-        before, begin = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        begin = time.perf_counter()
         done = subprocess.run(command, cwd=root, env=environment, stderr=subprocess.PIPE, text=True)
-        seconds, after = time.perf_counter() - begin, resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds = time.perf_counter() - begin
         if done.returncode != 0:
             raise RuntimeError(f"{' '.join(command)} ended with exit code {done.returncode}:\n{done.stderr}")
         episodes = json.loads(out.read_text())["episodes"]
-    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     steps = sum(episode.get("episode_len", episode.get("length")) for episode in episodes)
-    return Run(seconds, used, steps, sum(episode["success_once"] for episode in episodes))
+    return Run(seconds, steps, sum(episode["success_once"] for episode in episodes))
 
 
 def untrained(root: Path, folder: Path) -> Path:
@@ -98,11 +95,11 @@ def main(args: Args) -> None:
         for _ in range(args.rounds):
             for name, (root, module, checkpoint, *flags) in commands.items():
                 runs[name].append(timed(root, module, checkpoint, args, *flags))
-    table = Table("evaluation", "s", "CPU s", "control steps", "ms per step", "succeeded")
+    table = Table("evaluation", "s", "control steps", "ms per step", "succeeded")
     for name, done in runs.items():
-        seconds, cpu = np.mean([run.seconds for run in done]), np.mean([run.cpu_seconds for run in done])
+        seconds = np.mean([run.seconds for run in done])
         per_step = 1e3 * seconds / done[0].steps
-        table.add_row(name, f"{seconds:.0f}", f"{cpu:.0f}", str(done[0].steps), f"{per_step:.1f}", str(done[0].succeeded))
+        table.add_row(name, f"{seconds:.0f}", str(done[0].steps), f"{per_step:.1f}", str(done[0].succeeded))
     Console().print(f"{args.episodes} episodes, {args.workers} workers, {args.rounds} rounds, {os.cpu_count()} cores")
     Console().print(table)
 
