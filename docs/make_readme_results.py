@@ -4,6 +4,7 @@ It shows Table I with the results of the folders that `make results` reads, each
 among those that were run with most training seeds. A test fails where README does not have what this makes.
 """
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -73,7 +74,7 @@ def block() -> str:
     text = TEXT.format(
         fastest=min(minutes),
         slowest=max(minutes),
-        on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {max(on_gpu):.0f} minutes)" if on_gpu else "",
+        on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {math.ceil(max(on_gpu))} minutes)" if on_gpu else "",
         episodes=min(len(ours.episode_seeds) for ours in here.values()),
         seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
