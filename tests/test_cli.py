@@ -310,7 +310,7 @@ def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["record", PEG, "--obs-moed", "tacff"])
     said = " ".join(re.sub(r"[^\w.-]+", " ", capsys.readouterr().err).split())
-    assert "Perhaps you meant" in said
+    assert "Perhaps you meant --obs-mode" in said
     assert cli.main(["recrod", PEG]) == 1
     said = capsys.readouterr().err
     assert "'recrod' is not a command; choose from ['tasks'" in said
