@@ -50,15 +50,15 @@ the correction.
 def page() -> str:
     """The Markdown page."""
     policies = [folder for task in sorted(FOLDER.iterdir()) for folder in map(task.joinpath, SENSING) if folder.is_dir()]
-    tables = [f"## {_heading(folder)}\n\n{_table(folder)}" for folder in policies]
-    return "\n".join([HEAD, *tables, f"A row is made by\n\n```bash\n{COMMAND}\n```\n"])
+    return "\n".join([HEAD, *map(_section, policies), f"A row is made by\n\n```bash\n{COMMAND}\n```\n"])
 
 
-def _heading(folder: Path) -> str:
-    """The heading of a policy's table, and the highest failure floor of its task below it."""
+def _section(folder: Path) -> str:
+    """The part of the page on one policy: its name, the highest failure floor of its task, and its table."""
     spec = task_spec(folder.parent.name)
     floor = highest_floor(spec.env_id, spec.revision)
-    return f"{spec.name}, {SENSING[folder.name]}\n\nFailure floor under the usual appearance: {floor or 'not measured'}."
+    floor_text = f"Failure floor under the usual appearance: {floor or 'not measured'}."
+    return f"## {spec.name}, {SENSING[folder.name]}\n\n{floor_text}\n\n{_table(folder)}"
 
 
 def _table(folder: Path) -> str:
