@@ -4,7 +4,7 @@ The position of a target is relative to the tool's at the last observation, in m
 that points down, as a rotation vector in rad. Both are along the axes of the robot's base. A hand that is to be upright thus
 has the same orientation as its target wherever it is, and the sum of many small predicted motions need not be exact. Diffusion
 Policy (Chi et al. 2023) learns positions better than velocities, and UMI (Chi et al. 2024) predicts poses relative to the
-present one. docs/training.md has the trials.
+present one. docs/trials.md has the trials.
 
 The environment's actions stay motions. A `Command` follows the controller's own target, and so turns one into the other.
 """

@@ -17,7 +17,7 @@ def for_cpu(
 ) -> Args:
     """Settings for small networks that learn a task with the paper's ranges and demonstrations on one CPU core in minutes.
 
-    docs/training.md has the measurements by which they were chosen.
+    docs/trials.md has the measurements by which they were chosen.
 
     Args:
         args: Settings of the paper.
@@ -60,7 +60,7 @@ def for_cpu(
 def in_epochs(small: Args, epochs: int = 30) -> Args:
     """Settings for small networks that learn long tasks for longer, with less noise on the pose.
 
-    docs/training.md has the trials in which the nut is learned far more often with them.
+    docs/trials.md has the trials in which the nut is learned far more often with them.
 
     Args:
         small: Settings that `for_cpu` has made, whose number of gradient steps becomes the smallest.
@@ -74,7 +74,7 @@ def in_epochs(small: Args, epochs: int = 30) -> Args:
 def with_targets(args: Args) -> Args:
     """Settings with which a policy predicts the poses that the hand is to have, instead of its motions.
 
-    docs/training.md has the trials in which the USB plug is inserted far more often with them.
+    docs/trials.md has the trials in which the USB plug is inserted far more often with them.
 
     Args:
         args: Settings of a training whose policy predicts motions.
