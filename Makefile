@@ -3,7 +3,7 @@
 # make data             Record the paper's number of demonstrations of every task, in hours; it continues where it was stopped.
 # make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
 # make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
-# make results          Make the pages with published results anew, from the result files in leaderboard/cpu and docs/.
+# make results          Make the pages with published results anew, from the result files in leaderboard/ and docs/.
 # make lock             Pin the newest versions that pyproject.toml allows in requirements.lock.
 # Every target first installs what is missing. Demonstrations and a trained policy that are there are kept, also after a change
 # of TASK_ARGS or of the code: delete runs/demo to begin anew.
@@ -66,7 +66,7 @@ docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
 
 results: $(READY)
-	$(PYTHON) -m manifeel_ms3.analysis.results_page --results leaderboard/cpu docs/cpu docs/cpu_long docs/cpu_targets --out docs/results.md
+	$(PYTHON) -m manifeel_ms3.analysis.results_page --results leaderboard/cpu leaderboard/cpu_targets docs/cpu docs/cpu_long docs/cpu_targets --out docs/results.md
 	$(PYTHON) -m docs.make_readme_results
 	$(PYTHON) -m docs.make_fidelity
 	$(PYTHON) -m docs.make_task_cards

@@ -24,7 +24,8 @@ from manifeel_ms3.tasks.registry import task_spec
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-RESULTS = [ROOT / folder for folder in ("leaderboard/cpu", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")]
+FOLDERS = ("leaderboard/cpu", "leaderboard/cpu_targets", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")
+RESULTS = [ROOT / folder for folder in FOLDERS]
 BLOCK = re.compile(r"(<!-- --8<-- \[start:results\] -->\n).*(?=<!-- --8<-- \[end:results\] -->)", re.DOTALL)
 """README's part between the marks with which the home page of the documentation includes it."""
 ROWS = {
