@@ -3,6 +3,7 @@
 import os
 
 import pytest
+import torch
 
 from manifeel_ms3.rendering.backend import available_render_backend
 
@@ -10,3 +11,4 @@ PEG = "ManiFeel-PegInsertion-v1"
 needs_renderer = pytest.mark.skipif(
     available_render_backend() == "none" and not os.environ.get("CI"), reason="no Vulkan renderer on this machine"
 )
+ON_GPU = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU on this machine")]

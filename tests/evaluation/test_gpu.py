@@ -4,15 +4,13 @@ import json
 
 import numpy as np
 import pytest
-import torch
 
 from manifeel_ms3.evaluation.evaluate import Args, main
 from manifeel_ms3.evaluation.result import read_result
-from tests.tasks_and_marks import PEG
+from tests.tasks_and_marks import ON_GPU, PEG
 from tests.trust.tiny_checkpoint import save_tiny_checkpoint
 
 BARE = json.dumps(dict(render_backend="none", max_episode_steps=6))
-ON_GPU = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU on this machine")]
 
 
 @pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_GPU)])

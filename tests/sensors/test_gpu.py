@@ -7,8 +7,9 @@ from manifeel_ms3.sensors import with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
 from manifeel_ms3.sensors.touch_model import TouchModel, pixel_grid
 from tests.sensors.pads import CONFIG, EVERYTHING, LOADS, meshes
+from tests.tasks_and_marks import ON_GPU
 
-pytestmark = [pytest.mark.gpu, pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")]
+pytestmark = ON_GPU
 
 
 def rays(device: str) -> MeshRays:
