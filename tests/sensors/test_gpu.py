@@ -1,6 +1,5 @@
 """Ray casting and the touch model on CUDA agree with the CPU."""
 
-import pytest
 import torch
 
 from manifeel_ms3.sensors import with_options

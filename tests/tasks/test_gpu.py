@@ -5,10 +5,9 @@ import pytest
 import torch
 from sapien import physx
 
-pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA GPU on this machine"),
-]
+from tests.tasks_and_marks import ON_GPU
+
+pytestmark = ON_GPU
 NUM_ENVS = 4
 
 
