@@ -115,11 +115,9 @@ def policy_spec(name: str) -> PolicySpec:
     return known[name]
 
 
-def next_step(args: TrainArgs, made: Path) -> str:
+def next_step(_args: TrainArgs, made: Path) -> str:
     """What training made, and what one can do with it."""
-    # another command does not know the module of a task that was typed with one
-    task = ["--env-id", args.env_id] if args.env_id and ":" in args.env_id else []
-    return f"{made} is the trained policy; {as_typed('manifeel', 'eval', '--checkpoint', made, *task)} evaluates it"
+    return f"{made} is the trained policy; {as_typed('manifeel', 'eval', '--checkpoint', made)} evaluates it"
 
 
 def preset_cli(spec: PolicySpec, args: list[str] | None = None) -> Any:

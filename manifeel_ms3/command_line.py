@@ -21,7 +21,7 @@ from packaging.requirements import Requirement
 
 from .errors import InvalidArgumentError, ManifeelError, MissingExtraError
 from .paths import troubleshooting
-from .typed_modules import import_typed_tasks
+from .typed_modules import MODULES, import_typed_tasks, imported
 
 log = logging.getLogger(__name__)
 TRACEBACK = "MANIFEEL_TRACEBACK"
@@ -100,8 +100,13 @@ def _extra_with(module: str) -> tuple[str, bool] | None:
 
 
 def as_typed(*words: object) -> str:
-    """A command as one types it in a shell, in backquotes; paths with spaces are quoted."""
-    return f"`{shlex.join(map(str, words))}`"
+    """A command as one types it in a shell, in backquotes; paths with spaces are quoted.
+
+    Modules of tasks that the user named to this command are named to that one, too, where no word does it.
+    """
+    needed = [module for module in imported() if not any(str(word).startswith(f"{module}:") for word in words)]
+    modules = f"{MODULES}={','.join(needed)} " if needed else ""
+    return f"`{modules}{shlex.join(map(str, words))}`"
 
 
 def json_object(flag: str, given: str) -> dict[str, Any]:

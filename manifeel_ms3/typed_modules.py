@@ -1,8 +1,10 @@
-"""Modules that a user names on a command line, such as that of a task in the working folder: `my_task:MyLab-Press-v1`.
+"""Modules that a user names to a command, such as that of a task in the working folder.
 
-Only what a user types is imported, never a name that comes from a file.
+They stand before the id of a task, as in `my_task:MyLab-Press-v1`, or in an environment variable, for commands that take the
+task from a file. Only what a user types is imported, never a name that comes from a file.
 """
 
+import os
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -12,12 +14,14 @@ from .errors import UnknownNameError
 
 FIELDS = ("env_id", "task", "tasks")
 """Arguments of commands that hold ids of tasks."""
+MODULES = "MANIFEEL_TASKS"
+"""Environment variable that names modules of tasks, separated by commas, which every command imports."""
 _imported: list[str] = []
 """Names of the modules that were imported. Worker processes import them again."""
 
 
 def import_typed_tasks(args: Any) -> None:
-    """Import the modules before the colons of the tasks' ids that the arguments of a command name.
+    """Import the modules that the environment variable names, and those before the colons of tasks' ids among the arguments.
 
     Args:
         args: Arguments as they were typed. Those that a program makes, from a file for example, must not be given.
@@ -25,15 +29,17 @@ def import_typed_tasks(args: Any) -> None:
     Raises:
         UnknownNameError: There is no such module, neither installed nor in the working folder.
     """
+    for module in filter(None, os.environ.get(MODULES, "").split(",")):
+        _import_typed(module.strip(), f"the variable {MODULES}")
     for field in FIELDS:
         given = getattr(args, field, None) or ()
         for env_id in (given,) if isinstance(given, str) else given:
             module, colon, _ = env_id.rpartition(":")
             if colon:
-                _import_typed(module, env_id)
+                _import_typed(module, f"the task {env_id!r}")
 
 
-def _import_typed(module: str, env_id: str) -> None:
+def _import_typed(module: str, named_by: str) -> None:
     look_in_working_folder()
     try:
         import_module(module)
@@ -41,9 +47,10 @@ def _import_typed(module: str, env_id: str) -> None:
         if error.name is None or not f"{module}.".startswith(f"{error.name}."):
             raise  # the module exists, and imports another one that does not
         raise UnknownNameError(
-            f"the module {module!r} of the task {env_id!r} is neither installed nor in the working folder {Path.cwd()}"
+            f"the module {module!r} of {named_by} is neither installed nor in the working folder {Path.cwd()}"
         ) from error
-    _imported.append(module)
+    if module not in _imported:
+        _imported.append(module)
 
 
 def imported() -> tuple[str, ...]:

@@ -49,7 +49,21 @@ def test_it_is_recorded_by_worker_processes_and_its_file_imports_nothing(folder)
     bare = ("--obs-mode", "tacff", "--env-kwargs", json.dumps(dict(render_backend="none")))
     recorded = manifeel(folder, "record", "my_task:MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)
     assert recorded.returncode == 0, recorded.stderr
-    assert "--env-id my_task:MyLab-Press-v1 --obs-mode tacff" in recorded.stderr  # the command that trains on it
+    assert "`MANIFEEL_TASKS=my_task manifeel train " in recorded.stderr  # the command that trains on it
     assert json.loads((folder / "press.json").read_text())["env_info"]["env_id"] == "my_task:MyLab-Press-v1"
     replayed = manifeel(folder, "replay", "press.h5")
     assert "'MyLab-Press-v1' is not registered" in replayed.stderr
+    assert "MANIFEEL_TASKS=MODULE before a command names the module" in replayed.stderr
+
+
+def test_the_variable_names_it_to_commands_that_read_the_task_from_a_file(folder, monkeypatch):
+    monkeypatch.setenv("MANIFEEL_TASKS", "my_task")
+    bare = ("--obs-mode", "tacff", "--env-kwargs", json.dumps(dict(render_backend="none")))
+    recorded = manifeel(folder, "record", "MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)
+    assert recorded.returncode == 0, recorded.stderr
+    for module in ("manifeel_ms3.cli", "manifeel_ms3.demonstrations.replay"):
+        replayed = manifeel(folder, *(["replay"] if module.endswith("cli") else []), "press.h5", module=module)
+        assert (replayed.returncode, "1 of 1" in replayed.stderr) == (0, True), replayed.stderr
+    monkeypatch.setenv("MANIFEEL_TASKS", "no_task")
+    missing = manifeel(folder, "replay", "press.h5")
+    assert "the module 'no_task' of the variable MANIFEEL_TASKS is neither installed nor in the working" in missing.stderr

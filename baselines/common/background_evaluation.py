@@ -8,9 +8,8 @@ import time
 from collections import deque
 from pathlib import Path
 
-from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.result import MEANS, RATES, read_result
-from manifeel_ms3.typed_modules import imported
+from manifeel_ms3.typed_modules import MODULES, imported
 
 log = logging.getLogger(__name__)
 SUCCESS = "eval/success_once"
@@ -78,10 +77,10 @@ class BackgroundEvaluation:
         command = [sys.executable, *NOT_FROM_HERE, "-m", "manifeel_ms3.evaluation.evaluate"]
         # an interrupted run may have evaluated another checkpoint of this step
         command += ["--checkpoint", str(checkpoint.absolute()), "--out", str(result), "--overwrite-other", *self._arguments]
-        if modules := imported():  # of the task that was typed with its module, which a checkpoint does not name
-            command += ["--env-id", f"{modules[-1]}:{checkpoint_config(checkpoint)['env_id']}"]
+        modules = imported()  # of tasks that were typed with their module, which a checkpoint does not name
         folder = None if NOT_FROM_HERE or modules else self.folder  # a folder that only this package writes into
-        environment = os.environ | dict(PYTHONSAFEPATH="1")  # the same for the processes that the evaluation starts
+        environment = os.environ | {MODULES: ",".join(modules)}
+        environment |= dict(PYTHONSAFEPATH="1")  # the same as NOT_FROM_HERE for the processes that the evaluation starts
         with result.with_suffix(".log").open("w") as output:
             return checkpoint, subprocess.Popen(command, cwd=folder, env=environment, stdout=output, stderr=output)
 

@@ -18,7 +18,6 @@ from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import git_commit, package_versions
 from manifeel_ms3.tasks.obs_modes import TACTILE_TOKENS, split_obs_mode
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, make_env, task_spec
-from manifeel_ms3.typed_modules import imported
 
 from .formats.maniskill_h5 import HEADER, ORIGIN, DemonstrationError, read_header, task_of
 from .formats.maniskill_h5_writing import (
@@ -378,10 +377,8 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
     seen = header["env_info"]["env_kwargs"]
     if not (obs_mode := _learnable(seen.get("obs_mode", "none"))):
         return ""
-    with_module = header["env_info"]["env_id"]
-    typed = with_module.rpartition(":")[0] in imported()  # without its module, another command would not find the task
     words = ["manifeel", "train", "diffusion_policy", "cpu", "--demo-path", demonstrations]
-    words += ["--env-id", with_module if typed else task_of(header), "--obs-mode", obs_mode]
+    words += ["--env-id", task_of(header), "--obs-mode", obs_mode]
     if cameras := names_in(seen.get("cameras")):  # other programs name them only where they are not the task's policy camera
         words += ["--cameras", *cameras]
     pads = names_in(seen.get("tactile_sensors"))

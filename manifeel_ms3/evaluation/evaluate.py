@@ -171,8 +171,8 @@ def _require_answers(outcomes: list[EpisodeOutcome], out: Path) -> None:
 
 def default_out(checkpoint: Path | None) -> Path:
     """Path of a result for which none is given: in the run folder of a checkpoint, or else in the working folder."""
-    folder = checkpoint.resolve().parent.parent if checkpoint else Path()  # a relative path may be as short as `last` or `.`
-    return folder / EVALUATION
+    checkpoints = checkpoint.resolve().parent if checkpoint else Path()  # a relative path may be as short as `last` or `.`
+    return checkpoints.parent / EVALUATION if checkpoints.name == CHECKPOINTS else Path(EVALUATION)
 
 
 def _like_entry(args: Args, entry: Entry) -> Args:

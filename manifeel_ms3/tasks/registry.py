@@ -24,6 +24,7 @@ from mani_skill.utils.registration import register_env
 from manifeel_ms3 import plugins
 from manifeel_ms3.arguments import is_number, meant
 from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, PluginError, UnknownNameError
+from manifeel_ms3.typed_modules import MODULES
 
 log = logging.getLogger(__name__)
 Class = TypeVar("Class", bound=type)
@@ -278,7 +279,8 @@ def full_id(name: str) -> str:
 def _known(env_id: str) -> TaskSpec:
     if env_id not in _SPECS:
         near = meant(short_name(env_id), map(short_name, _SPECS))
-        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{near}{_left_out()}")
+        own = "" if near else f"; {MODULES}=MODULE before a command names the module of a task that is not installed"
+        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{near}{_left_out()}{own}")
     return _SPECS[env_id]
 
 

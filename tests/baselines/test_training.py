@@ -297,12 +297,12 @@ def test_checkpoints_are_evaluated_one_after_the_other(evaluation, tmp_path):
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
 def test_a_task_that_was_typed_with_its_module_is_evaluated_with_it(evaluation, tmp_path, monkeypatch):
     """A checkpoint names no module: nothing is imported because a file says so."""
-    monkeypatch.setattr(typed_modules, "_imported", ["tests.task_of_mine"])
-    monkeypatch.setattr(background_evaluation.subprocess, "Popen", lambda command, **_: commands.append(command))
-    commands, (checkpoint, _) = [], sorted((tmp_path / "checkpoints").iterdir())
+    monkeypatch.setattr(typed_modules, "_imported", ["tests.task_of_mine", "tests.another"])
+    monkeypatch.setattr(background_evaluation.subprocess, "Popen", lambda _command, **given: environments.append(given["env"]))
+    environments, (checkpoint, _) = [], sorted((tmp_path / "checkpoints").iterdir())
     evaluation.submit(checkpoint)
     evaluation._start(checkpoint)
-    assert commands[0][-2:] == ["--env-id", f"tests.task_of_mine:{PEG}"]
+    assert environments[0]["MANIFEEL_TASKS"] == "tests.task_of_mine,tests.another"
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)

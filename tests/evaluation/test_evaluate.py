@@ -77,7 +77,7 @@ def test_a_result_does_not_replace_a_recording(name, tmp_path):
     assert {path.read_text() for path in tmp_path.iterdir()} == {"episodes", "their json"}
 
 
-def test_the_result_of_a_checkpoint_comes_into_its_run_folder_from_whatever_folder_it_is_named(tmp_path, monkeypatch):
+def test_the_result_of_a_runs_checkpoint_comes_into_the_runs_folder_from_whatever_folder_it_is_named(tmp_path, monkeypatch):
     checkpoint = tmp_path / "run/checkpoints/00000002"
     checkpoint.mkdir(parents=True)
     checkpoint.with_name("last").symlink_to(checkpoint.name)
@@ -85,7 +85,9 @@ def test_the_result_of_a_checkpoint_comes_into_its_run_folder_from_whatever_fold
     for folder, name in names.items():
         monkeypatch.chdir(folder)
         assert default_out(Path(name)).absolute() == tmp_path / "run/evaluation.json"
-    assert default_out(None) == Path("evaluation.json")
+    monkeypatch.chdir(tmp_path)
+    for elsewhere in (None, Path("run"), Path("run/zero")):  # in no run's folder of checkpoints
+        assert default_out(elsewhere) == Path("evaluation.json")
 
 
 def test_a_result_names_the_commit_at_which_its_evaluation_began(tmp_path, monkeypatch):
