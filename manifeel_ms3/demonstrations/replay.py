@@ -1,4 +1,4 @@
-"""Replay episodes from their actions, to see if they succeed again: `manifeel replay FILE`."""
+"""Replay episodes from their actions, to see if they end as they were recorded: `manifeel replay FILE`."""
 
 import logging
 import sys
@@ -54,6 +54,8 @@ class Replay:
     """Seed of the reset."""
     success: bool
     """Whether the episode succeeded at some step."""
+    succeeded: bool
+    """Whether it had succeeded when it was recorded."""
     deviation: float
     """Largest difference of any object's last pose from the recorded one: positions in m, quaternions without unit."""
 
@@ -85,7 +87,7 @@ def replay(path: Path, num: int | None = None) -> list[Replay]:
             if missing := sorted(set(actors) - set(ends)):
                 raise DemonstrationError(f"{path} lacks the states of {missing} in traj_{info['episode_id']}; record it again")
             deviation = max(pose_difference(ends[name], state[0]) for name, state in actors.items())
-            results.append(Replay(info["episode_seed"], success, deviation))
+            results.append(Replay(info["episode_seed"], success, bool(info["success"]), deviation))
     return results
 
 
@@ -144,8 +146,9 @@ def main(args: Args) -> int:
     require_positive(num_demos=args.num)
     results = replay(args.path, args.num)
     failures = [result.seed for result in results if not result.success and result.deviation > 0]
-    worst, successes = max((result.deviation for result in results), default=0.0), sum(result.success for result in results)
-    log.info("%d of %d episodes succeed again; %s", successes, len(results), _comparison(worst))
+    worst = max((result.deviation for result in results), default=0.0)
+    now, then = sum(result.success for result in results), sum(result.succeeded for result in results)
+    log.info("%d of %d episodes succeed, and %d did when recorded; %s", now, len(results), then, _comparison(worst))
     if failures:
         log.error("seeds that failed: %s", failures)
     return int(bool(failures))

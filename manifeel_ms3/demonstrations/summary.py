@@ -96,7 +96,7 @@ def _file_table(path: Path, header: dict) -> Table:
     table = Table(title=_shown(path), show_header=False)
     table.add_row("task", _shown(f"{task_of(header)}, revision {header.get('revision', 'not known')}"))
     table.add_row("observations", _shown(env["env_kwargs"].get("obs_mode")))
-    table.add_row("source", _shown(", ".join(map(str, origins(header, "source_type")))))
+    table.add_row("source", _shown(", ".join(map(str, filter(None, origins(header, "source_type")))) or "not known"))
     versions = versions_of(header) or {}
     recorded_with = ", ".join(f"{name} {number}" for name, number in versions.items())
     table.add_row("recorded with", _shown(recorded_with or "not known"))

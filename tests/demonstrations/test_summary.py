@@ -18,7 +18,7 @@ from baselines.common.observation import observation_spec
 from manifeel_ms3.demonstrations import DemonstrationError, read_header
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import open_trajectories
 from manifeel_ms3.demonstrations.recording import STATES_FILE, observed_file
-from manifeel_ms3.demonstrations.replay import replay
+from manifeel_ms3.demonstrations.replay import Args, main, replay
 from manifeel_ms3.demonstrations.summary import sparkline, summary
 from manifeel_ms3.demonstrations.validate import validate
 from manifeel_ms3.demonstrations.view import read_streams
@@ -87,13 +87,17 @@ def recorded_by_maniskill(env: Any, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("obs_mode", ["state", "state+tacff"])
-def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode):
+def test_a_file_of_maniskills_recorder_is_sound(make_env, tmp_path, obs_mode, caplog):
     """It has no contact forces, its observations may be vectors, and its id names the module that registers the task."""
+    caplog.set_level("INFO")
     theirs = recorded_by_maniskill(make_env(PEG, obs_mode=obs_mode, render_backend="none"), tmp_path)
     assert read_header(theirs)["env_info"]["env_id"] == f"manifeel_ms3:{PEG}"
     page = io.StringIO()
     Console(width=160, file=page).print(summary(theirs))
     assert "2 on average" in page.getvalue()
+    assert re.search(r"source +│ not known", page.getvalue())
+    assert main(Args(theirs)) == 0  # its replay
+    assert "0 of 1 episodes succeed, and 0 did when recorded" in caplog.text
     assert validate(theirs) == ["seed 3: it does not end in success"]
 
 
