@@ -17,7 +17,7 @@ FIELDS = ("env_id", "task", "tasks")
 MODULES = "MANIFEEL_TASKS"
 """Environment variable that names modules of tasks, separated by commas, which every command imports."""
 _imported: list[str] = []
-"""Names of the modules that were imported. Worker processes import them again."""
+"""Names of the modules that were imported, but not this package's. Worker processes import them again."""
 
 
 def import_typed_tasks(args: Any) -> None:
@@ -49,7 +49,7 @@ def _import_typed(module: str, named_by: str) -> None:
         raise UnknownNameError(
             f"the module {module!r} of {named_by} is neither installed nor in the working folder {Path.cwd()}"
         ) from error
-    if module not in _imported:
+    if module not in (__package__, *_imported):
         _imported.append(module)
 
 

@@ -3,10 +3,14 @@
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from manifeel_ms3 import typed_modules
+from manifeel_ms3.command_line import as_typed
 from tests.command_process import run_module
+from tests.tasks_and_marks import PEG
 
 MODULE = '''
 from manifeel_ms3.experts.object_search import ObjectSearchExpert
@@ -69,3 +73,11 @@ def test_the_variable_names_it_to_commands_that_read_the_task_from_a_file(folder
     monkeypatch.setenv("MANIFEEL_TASKS", "no_task")
     missing = manifeel(folder, "replay", "press.h5")
     assert "the module 'no_task' of the variable MANIFEEL_TASKS is neither installed nor in the working" in missing.stderr
+
+
+def test_a_command_that_is_suggested_names_the_modules_of_the_users_tasks_alone(monkeypatch):
+    monkeypatch.setattr(typed_modules, "_imported", [])
+    typed_modules.import_typed_tasks(SimpleNamespace(env_id=f"manifeel_ms3:{PEG}"))
+    assert as_typed("manifeel", "film", "my file.h5") == "`manifeel film 'my file.h5'`"
+    typed_modules.import_typed_tasks(SimpleNamespace(env_id="json:MyLab-Press-v1"))
+    assert as_typed("manifeel", "film", "peg.h5") == "`MANIFEEL_TASKS=json manifeel film peg.h5`"
