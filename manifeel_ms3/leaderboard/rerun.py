@@ -23,8 +23,9 @@ from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.agreement import differences
 from manifeel_ms3.evaluation.checkpoint_config import CONFIG, WEIGHTS, checkpoint_config, published_hash
 from manifeel_ms3.evaluation.engine import Evaluation, run_episodes
-from manifeel_ms3.evaluation.policy import PolicySource
+from manifeel_ms3.evaluation.policy import INFERENCE_STEPS, PolicySource
 from manifeel_ms3.evaluation.redaction import redacted
+from manifeel_ms3.evaluation.result import published_config
 from manifeel_ms3.evaluation.rollout import EpisodeOutcome
 from manifeel_ms3.files import visible_files
 from manifeel_ms3.provenance import package_versions
@@ -44,8 +45,8 @@ one of ObjectSearch with rgb, 13 episodes do, all of them failures. An invented 
 succeeds, too."""
 SEED_BITS = 63
 """Number of random bits in the seed of a draw, which fits into a signed integer of 64 bits."""
-NAMED_BY = ("step", "seed", "policy_name", "env_id", "obs_mode", "cameras", "num_demos", "policy")
-"""Entries of a policy's configuration that a result must share with its checkpoint."""
+SET_BY_EVALUATION = (INFERENCE_STEPS, "policy_kwargs")
+"""Entries of a policy's configuration in a result that may differ from those of its checkpoint."""
 SHOWN_AS = {"obs_mode": "obs_mode", "policy": "policy_name", "training_seed": "seed"}
 """Entries of a result that the page shows, and the entries of its checkpoint's configuration that they must be equal to."""
 
@@ -180,8 +181,9 @@ def policy_sources(submission: Submission, policy: str, kwargs: str) -> dict[Pat
 
 def _differing_settings(result: dict[str, Any], config: dict[str, Any]) -> list[str]:
     """Names of what a result says of its policy, and what the configuration of a checkpoint does not."""
+    evaluated, trained = result["config"], published_config(config)
     return [
-        *(name for name in NAMED_BY if result["config"].get(name) != config.get(name)),
+        *(name for name in evaluated | trained if name not in SET_BY_EVALUATION and evaluated.get(name) != trained.get(name)),
         *(shown for shown, name in SHOWN_AS.items() if result[shown] != config.get(name)),
     ]
 

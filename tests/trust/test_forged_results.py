@@ -180,6 +180,16 @@ def test_a16_what_the_page_shows_is_what_the_checkpoint_says(folder, tmp_path, f
         main(Submit(folder, checkpoint=(runs,), board=tmp_path / "board"))
 
 
+@pytest.mark.parametrize("forged", [dict(num_demos=10), dict(lr=0.5), dict(taught_by="hand")], ids=str)
+def test_a16_every_setting_of_a_result_is_that_of_its_checkpoint(folder, tmp_path, forged):
+    runs = checkpoints_of(folder, tmp_path / "runs")
+    main(Hash(folder, checkpoint=(runs,)))
+    rewrite_json(folder / FIRST, lambda result: result["config"].update(forged))
+    (name,) = forged
+    with pytest.raises(SubmissionError, match=rf"differ in \['{name}'\]"):
+        main(Submit(folder, checkpoint=(runs,), board=tmp_path / "board"))
+
+
 def test_a16_one_checkpoint_cannot_stand_for_two_results(folder, tmp_path):
     runs = checkpoints_of(folder, tmp_path / "runs")
     main(Hash(folder, checkpoint=(runs,)))
