@@ -71,6 +71,9 @@ def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> li
         episodes = read_header(path)["episodes"]
         problems = _manifest_problems(describe(path), entry) if entry else []
         with open_trajectories(path) as file:
+            named = {f"traj_{episode['episode_id']}" for episode in episodes}
+            if more := sorted(name for name in file if name.startswith("traj_") and name not in named):
+                problems.append(f"it holds {more}, which its json file does not name; the two may be of different recordings")
             for episode in episodes:
                 problems += [f"seed {episode['episode_seed']}: {problem}" for problem in _episode_problems(file, episode)]
     except (ManifeelError, OSError) as error:
@@ -112,6 +115,8 @@ def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:
     problems = []
     if not group["success"][-1]:
         problems.append("it does not end in success")
+    elif not episode.get("success", True):
+        problems.append("it ends in success, and its json file says that it does not")
     if "delta" in str(episode.get("control_mode", "delta")) and np.abs(group["actions"][()]).max() > 1:
         problems.append("an action is beyond its limits")
 

@@ -168,6 +168,23 @@ def test_seeds_that_no_demonstrations_may_have_are_said(tmp_path, seeds, said):
     assert said is None or re.match(said, problems[0])
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda episodes: episodes.pop(), r"it holds \['traj_1'\], which its json file does not name"),
+        (lambda episodes: episodes[0].update(success=False), "seed 0: it ends in success, and its json file says that it does"),
+    ],
+    ids=["an episode less", "another outcome"],
+)
+def test_a_json_file_of_another_recording_is_said(tmp_path, change, said):
+    copy = copy_of_the_sample(tmp_path)
+    header = json.loads(copy.with_suffix(".json").read_text())
+    change(header["episodes"])
+    copy.with_suffix(".json").write_text(json.dumps(header))
+    (problem,) = validate.validate(copy)
+    assert re.match(said, problem)
+
+
 def copy_of_the_sample(tmp_path: Path) -> Path:
     for suffix in (".json", ".h5"):
         copy = Path(shutil.copy(states_sample(PEG).with_suffix(suffix), tmp_path / f"trajectory{suffix}"))
