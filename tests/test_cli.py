@@ -75,6 +75,8 @@ def test_a_command_ends_with_what_it_made_and_what_takes_it(tmp_path, caplog):
     header = read_header(observed_sample(PEG))
     header["env_info"]["env_kwargs"]["tactile_sensors"] = ["left"]
     assert train_command(path, header).endswith("--cameras wrist --tactile-sensors left`")
+    header["env_info"]["env_kwargs"]["obs_mode"] = "tacff"
+    assert train_command(path, header).endswith("--obs-mode tacff --tactile-sensors left`")
 
 
 @pytest.mark.parametrize(

@@ -379,7 +379,8 @@ def train_command(demonstrations: Path, header: dict[str, Any]) -> str:
         return ""
     words = ["manifeel", "train", "diffusion_policy", "cpu", "--demo-path", demonstrations]
     words += ["--env-id", task_of(header), "--obs-mode", obs_mode]
-    if cameras := names_in(seen.get("cameras")):  # other programs name them only where they are not the task's policy camera
+    cameras = names_in(seen.get("cameras"))  # other programs name them only where they are not the task's policy camera
+    if cameras and "rgb" in obs_mode.split("+"):
         words += ["--cameras", *cameras]
     pads = names_in(seen.get("tactile_sensors"))
     if pads and "right" not in pads:  # policies observe the right one unless told otherwise

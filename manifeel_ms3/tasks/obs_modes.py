@@ -58,6 +58,23 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     return "+".join(own) or "none", touch
 
 
+def cameras_to_observe(obs_mode: str, cameras: Any, known: Iterable[str]) -> tuple[str, ...]:
+    """The names of the cameras that an environment renders; warns if there is none although images are asked for.
+
+    Args:
+        obs_mode: Observation mode of the environment.
+        cameras: The argument of that name: one camera, or several.
+        known: Cameras that the task has.
+
+    Raises:
+        InvalidArgumentError: The task has no such camera.
+    """
+    names = several_of("cameras", cameras, known)
+    if not names and has_images(split_obs_mode(obs_mode)[0]):
+        log.warning("obs_mode=%r observes images, but cameras names no camera, so that images are missing", obs_mode)
+    return names
+
+
 def pads_to_observe(obs_mode: str, tactile_sensors: Any, sides: Iterable[str]) -> tuple[str, ...]:
     """The sides of the pads that an environment observes; warns if there is none although touch is asked for.
 

@@ -278,9 +278,9 @@ def full_id(name: str) -> str:
 
 def _known(env_id: str) -> TaskSpec:
     if env_id not in _SPECS:
-        near = meant(short_name(env_id), map(short_name, _SPECS))
-        own = "" if near else f"; {MODULES}=MODULE before a command names the module of a task that is not installed"
-        raise UnknownNameError(f"the task {env_id!r} is not registered; registered are {list(_SPECS)}{near}{_left_out()}{own}")
+        known = f"registered are {list(_SPECS)}{meant(short_name(env_id), map(short_name, _SPECS))}{_left_out()}"
+        own = f"; {MODULES}=MODULE before a command names the module of a task that is not installed"
+        raise UnknownNameError(f"the task {env_id!r} is not registered; {known}{own if known.endswith(']') else ''}")
     return _SPECS[env_id]
 
 

@@ -14,7 +14,7 @@ from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConf
 
 from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.agents.fingers import Finger
-from manifeel_ms3.arguments import by_name, checked_action, one_of, several_of
+from manifeel_ms3.arguments import by_name, checked_action, one_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import (
     FORKED,
@@ -28,7 +28,7 @@ from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
 from .checks import check_argument_names, check_base_arguments, checked_randomization, checked_reset, split_sensor_configs
-from .obs_modes import PAD, has_images, pads_to_observe, split_obs_mode
+from .obs_modes import PAD, cameras_to_observe, has_images, pads_to_observe, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SPACING, SceneryEnv
 from .states import RestorableEnv, take_given_state
@@ -149,7 +149,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         self._full_obs_mode, self.sensor = obs_mode or "state", sensor
         own_mode, self._tactile_outputs = split_obs_mode(self._full_obs_mode)
         asked = self.policy_cameras if cameras is None else cameras
-        self.camera_names = several_of("cameras", asked, (*CAMERAS, *self.own_cameras))
+        self.camera_names = cameras_to_observe(self._full_obs_mode, asked, (*CAMERAS, *self.own_cameras))
         self._sides = pads_to_observe(self._full_obs_mode, tactile_sensors, SIDES)
         names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self.camera_names, [names[s] for s in self._sides])

@@ -100,6 +100,13 @@ def test_bad_obs_modes_name_what_is_known(mode, word):
         split_obs_mode(mode)
 
 
+@needs_renderer
+def test_images_without_a_camera_are_missing_with_a_warning(make_env, caplog):
+    env = make_env(obs_mode="rgb", cameras=())
+    assert "observes images, but cameras names no camera" in caplog.text
+    assert not env.reset(seed=0)[0]["sensor_data"]
+
+
 def test_touch_without_a_pad_is_missing_with_a_warning(make_env, caplog):
     env = make_env(obs_mode="tacff", tactile_sensors=(), render_backend="none")
     assert "observes touch, but tactile_sensors names no pad" in caplog.text
