@@ -22,7 +22,9 @@ FORCES = 200
 CURVE_WIDTH = 1.8
 """Width of a curve, in points."""
 MARGIN = 1.1
-"""Ratio of the end of the force axis to the largest force that is drawn."""
+"""Ratio of the end of the force axis to the largest force that it must show."""
+SHOWN = 0.95
+"""Share of a panel's successes whose forces the axis must show; a few at ten times the limit would squeeze the others."""
 
 
 def gentle_cell(results: ConditionResults) -> str | None:
@@ -54,28 +56,35 @@ def draw_success_under_force(found: Found, out: Path) -> bool:
     rows = -(-len(overview) // columns)
     fig = Figure(figsize=(PANEL[0] * columns, PANEL[1] * rows), layout="constrained")
     panels = fig.subplots(rows, columns, squeeze=False).ravel()
+    legend: dict[str, Any] = {}
     for ax, (task, (settings, conditions)) in zip(panels, overview.items(), strict=False):
-        _draw_task(ax, found, conditions)
-        ax.set_title(f"{task}: Diffusion Policy, {settings.preset}")
+        legend |= _draw_task(ax, found, conditions)
+        ax.set_title(f"{task}, {settings.preset}")
+    fig.suptitle("Success of Diffusion Policy up to a contact force")
+    fig.legend(legend.values(), legend.keys(), fontsize=LEGEND_SIZE, ncols=len(legend), loc="outside lower center")
     for ax in panels[len(overview) :]:
         ax.set_axis_off()
     save_figure(fig, out, DPI)
     return True
 
 
-def _draw_task(ax: Any, found: Found, by_mode: dict[str, Condition]) -> None:
+def _draw_task(ax: Any, found: Found, by_mode: dict[str, Condition]) -> dict[str, Any]:
+    """Draw the panel of a task, and return its lines by their names in the legend."""
     results = {mode: found[condition] for mode, condition in by_mode.items()}
     limits = {here.force_limit for here in results.values() if here.force_limit is not None}
-    forces = np.linspace(0, MARGIN * max([1.0, *limits, *map(_largest_force, results.values())]), FORCES)
+    needed = [force for here in results.values() for force in _forces_of_successes(here)]
+    shown = float(np.quantile(needed, SHOWN)) if needed else 0.0
+    forces = np.linspace(0, MARGIN * max(1.0, shown, *limits), FORCES)
+    lines = {}
     for mode, here in results.items():
         curve = success_under_force(here.episodes, forces)
-        ax.plot(forces, curve, drawstyle="steps-post", color=COLOURS[mode], label=HEADINGS[mode], lw=CURVE_WIDTH)
+        (lines[HEADINGS[mode]],) = ax.plot(forces, curve, drawstyle="steps-post", color=COLOURS[mode], lw=CURVE_WIDTH)
     for limit in limits:
-        ax.axvline(limit, color="black", ls="--", lw=1, label=f"limit of the task, {limit:g} N")
+        lines["limit of the task"] = ax.axvline(limit, color="black", ls="--", lw=1)
     ax.set(xlabel="contact force allowed, N", ylabel="success", xlim=(0, forces[-1]), ylim=(0, 1))
-    ax.legend(fontsize=LEGEND_SIZE, loc="upper left")
+    return lines
 
 
-def _largest_force(results: ConditionResults) -> float:
-    """The largest force that a success of a condition needed, in N; 0 without success."""
-    return max((episode["force_until_success"] for episode in results.episodes if episode["success_once"]), default=0.0)
+def _forces_of_successes(results: ConditionResults) -> list[float]:
+    """The largest force until each success of a condition, in N."""
+    return [episode["force_until_success"] for episode in results.episodes if episode["success_once"]]
