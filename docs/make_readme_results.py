@@ -40,15 +40,17 @@ ROWS = {
     "PegReorientation": "PegReorientation, a peg turned in the hand",
 }
 """First cells of the rows, in the order of the table."""
-TEXT = """
-**What touch adds, in numbers:** success rates of Diffusion Policy with small networks. Each row has one preset: of those with
-which all three sensings were run with most training seeds, the last of `cpu`, `cpu_long` and `cpu_targets`. Each policy was
-trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of demonstrations, and
-evaluated on {episodes} initial states that no demonstration has. The number after ± is the standard deviation over {seeds}
-training seeds; rows without it have one seed, so that their differences of less than about 35 points may be chance. Rates in
-bold letters are significantly above those of vision alone (p < {p}, corrected for the table's {tests} comparisons of rates
-with three seeds). Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks. The paper's rates, in
-brackets, come from much larger networks.
+LEAD = """
+**What touch adds, in numbers:** success rates of Diffusion Policy with small networks, with the standard deviation (±) over
+{seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks. Bold rates are significantly
+above those of vision alone. Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks.
+"""
+DETAILS = """
+Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of
+demonstrations, and evaluated on {episodes} initial states that no demonstration has. Each row has one
+preset: the last of `cpu`, `cpu_long` and `cpu_targets` among those with which all three sensings were run with most training
+seeds. Rows without ± have one seed, so that their differences of less than about 35 points may be chance.
+"Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""
@@ -72,7 +74,7 @@ def block() -> str:
     timed = [config for config in trained if "training_seconds" in config]
     minutes = [config["training_seconds"] / 60 for config in timed if not gpu_of_training(config)]
     on_gpu = [config["training_seconds"] / 60 for config in timed if gpu_of_training(config)]
-    text = TEXT.format(
+    figures = dict(
         fastest=min(minutes),
         slowest=max(minutes),
         on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {math.ceil(max(on_gpu))} minutes)" if on_gpu else "",
@@ -85,7 +87,8 @@ def block() -> str:
     raised = {place for place, p_holm in gains.items() if p_holm < SIGNIFICANT}
     presets = {task: f"`{settings.preset}`" for task, (settings, _) in overview.items()}
     rows = [(label, presets.get(task), *_cells(task, here, raised)) for task, label in ROWS.items()]
-    return f"{fill(text.strip(), WIDTH)}\n\n{markdown_table(('', 'preset', *HEADINGS.values()), rows)}"
+    lead, details = (fill(text.format(**figures).strip(), WIDTH) for text in (LEAD, DETAILS))
+    return f"{lead}\n\n{markdown_table(('', 'preset', *HEADINGS.values()), rows)}\n{details}\n"
 
 
 Results = dict[tuple[str, str], ConditionResults]
