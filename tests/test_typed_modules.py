@@ -54,6 +54,7 @@ def test_it_is_recorded_by_worker_processes_and_its_file_imports_nothing(folder)
     recorded = manifeel(folder, "record", "my_task:MyLab-Press-v1", "-n", "1", "--out", "press.h5", *bare)
     assert recorded.returncode == 0, recorded.stderr
     assert "`MANIFEEL_TASKS=my_task manifeel train " in recorded.stderr  # the command that trains on it
+    assert "--env-id MyLab-Press-v1 --obs-mode tacff" in recorded.stderr
     assert json.loads((folder / "press.json").read_text())["env_info"]["env_id"] == "my_task:MyLab-Press-v1"
     replayed = manifeel(folder, "replay", "press.h5")
     assert "'MyLab-Press-v1' is not registered" in replayed.stderr
