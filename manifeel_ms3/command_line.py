@@ -11,6 +11,7 @@ import logging
 import os
 import platform
 import shlex
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ log = logging.getLogger(__name__)
 TRACEBACK = "MANIFEEL_TRACEBACK"
 """Environment variable; if it is not empty, commands also show the traceback of a `ManifeelError`."""
 INTERRUPTED = 130
-"""Exit code of a command that was interrupted with Ctrl-C: 128 + SIGINT, the convention of shells."""
+"""Exit code of a command that was interrupted with Ctrl-C or SIGTERM: 128 + SIGINT, the convention of shells."""
 PACKAGE = "manifeel-ms3"
 """Name of this package's distribution."""
 DISTRIBUTIONS = {"PIL": "pillow", "sklearn": "scikit-learn", "yaml": "pyyaml", "rerun": "rerun-sdk"}
@@ -52,6 +53,7 @@ def run(main: Callable[[Any], Any], args: Any, next_step: Callable[[Any, Any], s
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     gc.freeze()  # ManiSkill collects garbage at every reset; it need not search the modules
     atexit.register(gc.freeze)  # else the interpreter searches all objects of torch for garbage as it ends, for about 1 s
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: what is finished is kept, and workers are ended
     try:
         import_typed_tasks(args)
         answer = main(args)

@@ -59,7 +59,7 @@ def run_jobs(study: Study, jobs: list[Job], root: Path, address: str | None, sho
         MachineError: Ray does not start, cannot be reached, or has no machine that is large enough.
     """
     _start_ray(address)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C; Ray's own handler prints a stack trace
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # again, since Ray sets a handler that prints a stack trace
     restore_child_signals()
     try:
         worker: Any = ray.remote(max_calls=1, max_retries=RETRIES)(perform_in)  # a new process for each job

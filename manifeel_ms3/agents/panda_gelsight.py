@@ -348,8 +348,12 @@ class PandaGelSight(BaseAgent):
         return Kinematics(self.urdf_path, self.ee_link_name, self.robot, arm.active_joint_indices)
 
     def pad_wrench(self, side: str) -> torch.Tensor:
-        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; what TacFF adds up to."""
-        return self._gauges[side].read()
+        """Force and moment (N, 6), N and N m, of the world on the "left" or "right" pad, pad frame; what TacFF adds up to.
+
+        Raises:
+            InvalidArgumentError: There is no such pad.
+        """
+        return self._gauges[one_of("side", side, self._gauges)].read()
 
     def held_object_force(self, joint_forces: torch.Tensor) -> torch.Tensor:
         """Norm (...), in N, of the force of both pads together on the held object, which equals that of the world on it.

@@ -6,7 +6,6 @@ Cameras, touch, forces, actions and success are shown over one time axis. Needs 
 import logging
 import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -143,7 +142,6 @@ def without_statistics(folder: Path) -> dict[str, str]:
 
 def _show(command: list[str], environment: dict[str, str]) -> None:
     """Run the viewer until it is closed or this process is interrupted; then the viewer ends, too."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with subprocess.Popen(command, env=environment) as viewer:
         try:
             if viewer.wait() != 0:

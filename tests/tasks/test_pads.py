@@ -58,6 +58,12 @@ def test_force_field_equals_the_wrench_and_the_weight(make_env):
         assert total.tolist() == pytest.approx([0, 0, -weight], abs=0.02 * weight)
 
 
+def test_a_pad_that_is_not_there_is_named(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    with pytest.raises(InvalidArgumentError, match=r"side='middle' is unknown; choose from \['left', 'right'\]"):
+        env.unwrapped.agent.pad_wrench("middle")
+
+
 def test_sensor_configs_reach_pads_as_well(make_env):
     pad = dict(units="tacsl", optics=dict(noise=2.0))
     env = make_env(obs_mode="tacff", render_backend="none", sensor_configs=dict(tactile_right=pad, width=64)).unwrapped
