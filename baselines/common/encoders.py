@@ -11,10 +11,13 @@ import torch.nn as nn
 
 from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
+from manifeel_ms3.files import file_hash
 
 from .observation import POSE, ObservationSpec, is_tactile
 
 log = logging.getLogger(__name__)
+HASH_DIGITS = 16
+"""Number of hexadecimal digits of the hash by which a run's settings name the weights that it began with."""
 
 
 @dataclass
@@ -200,8 +203,11 @@ class PretrainedEncoder(nn.Module):
         raise NotImplementedError
 
 
-def load_pretrained(policy: nn.Module, weights: Path | None) -> None:
+def load_pretrained(policy: nn.Module, weights: Path | None) -> str | None:
     """Load weights into the pretrained part of every TacRGB encoder of a policy; warn if it has one, and no weights are given.
+
+    Returns:
+        The name of the file and the beginning of its SHA-256, which tell these weights from all others; None without weights.
 
     Raises:
         InvalidArgumentError: No encoder of the policy has a pretrained part.
@@ -211,7 +217,7 @@ def load_pretrained(policy: nn.Module, weights: Path | None) -> None:
     if weights is None:
         if encoders:
             log.warning("the TacRGB encoder begins with random weights; --tacrgb-weights gives it pretrained ones")
-        return
+        return None
     if not encoders:
         raise InvalidArgumentError(
             f"tacrgb_weights={weights}: no network of this policy takes them; choose one that does, such as "
@@ -219,6 +225,7 @@ def load_pretrained(policy: nn.Module, weights: Path | None) -> None:
         )
     for encoder in encoders:
         encoder.load(weights)
+    return f"{weights.name} {file_hash(weights)[:HASH_DIGITS]}"
 
 
 def _key_points(_size: int, features: int) -> nn.Module:

@@ -218,7 +218,7 @@ class Trainer:
         policy = policy_class(self.args.policy, self.dataset.spec, self.config["action_dim"]).to(self.device)
         lay_out_channels_last(policy)
         if not self.args.resume:
-            load_pretrained(policy, self.args.tacrgb_weights)
+            self.config["tacrgb_weights"] = load_pretrained(policy, self.args.tacrgb_weights)
         policy.fit_normalizers(self.dataset.observations, self.dataset.actions_to_fit)
         if self.args.compile:
             policy.encoder.compile()
@@ -233,6 +233,7 @@ class Trainer:
         last = newest_checkpoint(self.checkpoints)
         saved = with_implied(checkpoint_config(last))
         require_same_config(saved, self.config, FREE_ON_RESUME, last)
+        self.config["tacrgb_weights"] = saved.get("tacrgb_weights")  # those that it began with; their file may be gone
         state = read_tensors(last / TRAINING_STATE, BROKEN_STATE)
         self.order.load_state_dict(state)
         unpack(state, self.optimizer, self.policy, last, self.processes.rank)
@@ -395,6 +396,5 @@ def run_config(args: TrainArgs, policy_class: type[VisuotactilePolicy], dataset:
 def fast_forward(schedule: LambdaLR, steps: int) -> None:
     """Set a new schedule, and its optimiser's learning rates, to where they are after a number of steps."""
     schedule.last_epoch = steps
-    groups = zip(schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True)
-    for group, base_lr, factor in groups:
+    for group, base_lr, factor in zip(schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True):
         group["lr"] = base_lr * factor(steps)

@@ -110,7 +110,7 @@ def training_curve(log_file: Path) -> str:
     figure.update_layout(
         xaxis_title="gradient step",
         yaxis_title="loss",
-        yaxis_type="log",
+        yaxis=dict(type="log", dtick="D2"),  # labels at 1, 2 and 5 of each decade; more of them would overlap
         height=CURVE_HEIGHT,
         margin=CURVE_MARGINS,
     )

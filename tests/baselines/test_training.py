@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from baselines.common import background_evaluation, training
 from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.dataset import recorded_env_kwargs
-from baselines.common.encoders import EncoderConfig
+from baselines.common.encoders import FIELD_ENCODERS, EncoderConfig, PretrainedEncoder
 from baselines.common.train_args import TrainArgs
 from baselines.common.training import TrainingError
 from baselines.diffusion_policy import train as diffusion
@@ -155,6 +156,42 @@ def test_resumed_training_equals_uninterrupted(run, checkpoint, tmp_path, monkey
     whole, second = read_tensors(checkpoint / "model.safetensors"), read_tensors(resumed / "model.safetensors")
     assert all(torch.equal(whole[name], second[name]) for name in whole)
     assert log_of(tmp_path) == log_of(run.args.run_dir)
+
+
+class FromWeights(PretrainedEncoder):
+    """A network of TacFF that is initialised from a file."""
+
+    def __init__(self, network):
+        super().__init__()
+        self.network = network
+
+    def load(self, weights):
+        assert weights.is_file()
+
+    def fit(self, images):
+        """It needs no statistics."""
+
+    def forward(self, field):
+        return self.network(field)
+
+
+@pytest.mark.parametrize("run", ["diffusion"], indirect=True)
+def test_a_run_names_the_weights_that_it_began_with_by_their_content(run, tmp_path, monkeypatch):
+    small = FIELD_ENCODERS["small"]
+    monkeypatch.setitem(FIELD_ENCODERS, "small", lambda shape, features: FromWeights(small(shape, features)))
+    names = []
+    for content in ("one", "other"):
+        folder = tmp_path / content
+        folder.mkdir()
+        weights = folder / "weights.safetensors"
+        weights.write_text(content)
+        again = dict(run_dir=folder / "run", save_freq=2)
+        names.append(checkpoint_config(run.again(tacrgb_weights=weights, steps=2, **again))["tacrgb_weights"])
+        weights.unlink()
+        resumed = checkpoint_config(run.again(resume=True, steps=4, **again))
+        assert (resumed["step"], resumed["tacrgb_weights"]) == (4, names[-1])
+    assert names[0] != names[1]
+    assert all(re.fullmatch("weights.safetensors [0-9a-f]{16}", name) for name in names)
 
 
 @pytest.mark.parametrize("run", ["diffusion"], indirect=True)
