@@ -289,7 +289,12 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     size = network_size(config, spec, key)
     if not is_tactile(key):
         return by_name(IMAGE_ENCODERS, config.image)(size, config.image_features)
-    encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(size, config.tactile_features)
+    try:
+        encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(size, config.tactile_features)
+    except InvalidArgumentError as error:
+        if size < spec.size_of(key):
+            raise InvalidArgumentError(f"{error} --policy.encoder.tactile-crop 0") from None
+        raise
     if config.freeze_tacrgb or config.tacrgb_sensor:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(

@@ -61,7 +61,8 @@ class UprightInsertionExpert(InsertionExpert):
 
     It comes roughly over the hole, brings the plug to its axis while it lowers it, and presses. Where the plug stands on an
     edge, the force comes from the side on which it overlaps, and it slides away from there. In the hole it yields to the walls.
-    Each action depends only on what is seen and felt at that moment, so that a policy without memory can do the same.
+    Almost every action depends only on what is seen and felt at that moment, so that a policy without memory can do the same;
+    only where the plug has been stuck for several steps, that counts, too.
     """
 
     config = UprightConfig()

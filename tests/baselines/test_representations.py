@@ -207,6 +207,17 @@ def test_the_advice_on_a_size_that_does_not_fit_can_be_followed(make, size):
         assert encoder(torch.zeros(2, 3, advised, advised)).shape == (2, 512)
 
 
+def test_the_advice_on_a_crop_that_does_not_fit_can_be_followed():
+    cropped = EncoderConfig(tacrgb="unit", tactile_crop=230)
+    spec = replace(SPEC, tactile_image_size=256)
+    with torch.device("meta"):
+        with pytest.raises(
+            InvalidArgumentError, match=r"not 230; give --tactile-image-size 256 --policy.encoder.tactile-crop 0$"
+        ):
+            ObservationEncoder(cropped, spec, 1)
+        ObservationEncoder(replace(cropped, tactile_crop=0), spec, 1)
+
+
 def test_a_policy_takes_the_statistics_of_its_demonstrations_and_its_weights_keep_them(monkeypatch):
     monkeypatch.setattr("baselines.tactile_representations.encoder.T3", small_t3)
     config = DiffusionConfig(encoder=EncoderConfig(tacrgb="t3"), down_dims=(16, 32))
