@@ -114,7 +114,7 @@ OVER_SOCKET = "At the code's height the plug could start inside its socket."
 WHY_STARTS = {
     "USBInsertion": OVER_SOCKET,
     "PowerPlugInsertion": OVER_SOCKET,
-    "GearAssembly": OVER_SOCKET,
+    "GearAssembly": "At the code's height, the gear could start as little as 4 mm above the shafts.",
     "ObjectSearch": "Without this variation, the fifty evaluation episodes would have only two different initial states.",
 }
 """Why starts differ from the code's."""

@@ -13,7 +13,10 @@ from manifeel_ms3.arguments import require_at_least
 
 @dataclass
 class DiffusionConfig(PolicyConfig):
-    """Settings of the Diffusion Policy; the defaults are the paper's."""
+    """Settings of the Diffusion Policy.
+
+    The defaults are those of the paper, and where it is silent or differs, of its public code.
+    """
 
     diffusion_steps: int = 100
     """Number of diffusion steps in training."""

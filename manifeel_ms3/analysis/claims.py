@@ -10,10 +10,11 @@ Interval and verdict are those of a single comparison. Of many comparisons witho
 the p-values after Holm's correction for all comparisons with a verdict say which differences remain.
 """
 
+import json
 import logging
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Literal
@@ -30,7 +31,7 @@ from .encoder_ranking import ranking_tables
 from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
-from .paper import reported
+from .paper import TACFF, TACSL, TWIN_RATES, reported, twin_condition
 from .paper_claims import Comparison, comparisons
 from .presets import TrainingSettings
 from .protocol import collect, of_the_protocol
@@ -117,13 +118,10 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
         found: The results that enter comparisons.
         answered: What `results_of_claims` makes of them.
     """
-    tables: dict[str, dict[Condition, float]] = {}
-    for number, condition, rate in reported():
-        tables.setdefault(number, {})[condition] = rate.mean
-    rows = []
+    tables, rows = _papers_rates(), []
     for comparison, outcomes in answered.items():
         what = (comparison.claim, comparison.first.task, _compared(comparison))
-        papers = _papers_difference(comparison, tables.values())
+        papers = _papers_difference(comparison, tables)
         ran = [
             (one.difference.signed, papers, p_text(one.p_value), p_text(one.p_holm), one.verdict, one.settings)
             for one in outcomes
@@ -139,6 +137,18 @@ def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> 
     pairs = "1 pair" if len(tested) == 1 else f"{len(tested)} pairs"
     note = MANY_TESTS.format(seeds=FEWEST_SEEDS, pairs=pairs, count=len(tested), remaining=remaining, reach=reach)
     return f"{table}\n{note}\n{''.join(ranking_tables(found))}"
+
+
+def _papers_rates() -> list[dict[Condition, float]]:
+    """The rates of each of the paper's tables and of its simulated twin. The paper's TacFF has TacSL's units."""
+    tables: dict[str, dict[Condition, float]] = {}
+    for number, condition, rate in reported():
+        rates = tables.setdefault(number, {})
+        rates[condition] = rate.mean
+        if condition.obs_mode == TACFF:
+            rates[replace(condition, variant=json.dumps(TACSL, sort_keys=True))] = rate.mean
+    twin = {twin_condition(task, mode): rate for task, rates in TWIN_RATES.items() for mode, rate in rates.items()}
+    return [*tables.values(), twin]
 
 
 def _papers_difference(comparison: Comparison, tables: Iterable[dict[Condition, float]]) -> str | None:

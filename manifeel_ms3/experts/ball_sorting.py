@@ -64,6 +64,8 @@ class BallSortingExpertConfig:
 class BallSortingExpert:
     """Grasps one of the two balls, which look alike, and decides by the TacRGB image of its surface.
 
+    It reads the position of the balls' stand from the simulator, with an error of up to `SkillConfig.sight_error`.
+
     Args:
         env: Environment that has just been reset.
         seed: Seed of the episode.

@@ -55,7 +55,7 @@ SHAFT_X = {
 BASE_SHIFT = -0.010
 """Position of the medium shaft along x, seen from the base's middle, in m. Chosen by eye."""
 LOOKS = {"small": Look((0.62, 0.10, 0.05)), "medium": Look((0.85, 0.55, 0.05)), "large": Look((0.06, 0.35, 0.12))}
-"""Looks of the gears: red, yellow and green. Chosen by eye."""
+"""Looks of the gears: aluminium that is painted red, yellow and green. Chosen by eye."""
 
 
 @dataclass(frozen=True)

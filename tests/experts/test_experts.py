@@ -70,6 +70,34 @@ def test_every_expert_succeeds_gently(make_env, task):
         gentle_success(env, task, seed)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["ManiFeel-USBInsertion-v1", "ManiFeel-PowerPlugInsertion-v1", "ManiFeel-GearAssembly-v1"])
+def test_experts_of_close_fits_succeed_gently(make_env, task):
+    env = make_env(task, obs_mode="none", render_backend="none", fit="tight")
+    for seed in range(3):
+        gentle_success(env, task, seed)
+
+
+def test_demonstrations_of_insertion_hold_pushes_of_the_hand_while_the_plug_is_free(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    pushes = []
+    for seed in range(5):
+        env.reset(seed=seed)
+        expert = make_expert(PEG, env.unwrapped, seed)
+        disturb, felt = expert._disturb, []
+        expert._disturb = lambda disturb=disturb, felt=felt: felt.append(disturb()) or felt[-1]
+        actions = list(zip(range(40), expert.actions(), strict=False))
+        begun = [
+            now
+            for before, now in zip([np.zeros(6), *felt], felt, strict=False)
+            if now.any() and not np.array_equal(before, now)
+        ]
+        pushes.append(len(begun))
+        assert len(actions) == 40
+        assert all(push[2] >= 0 for push in begun)  # none rams the plug into the rim
+    assert 1 <= np.mean(pushes) <= 4
+
+
 @pytest.mark.parametrize(
     ("task", "variant", "action_dim"),
     [

@@ -6,7 +6,7 @@ import sapien
 import torch
 
 from manifeel_ms3.errors import InvalidArgumentError
-from tests.tasks_and_marks import needs_renderer
+from tests.tasks_and_marks import PEG, needs_renderer
 
 
 @needs_renderer
@@ -52,11 +52,22 @@ def test_dim_ball_sorting_is_dim_unless_it_is_asked_to_be_light(make_env):
 
 
 @needs_renderer
-def test_cameras_stand_where_the_paper_has_them_and_look_30_degrees_down(make_env):
+@pytest.mark.parametrize(
+    ("task", "front", "side"),
+    [
+        (PEG, (0.68, 0.0, 0.15), (0.5, -0.17, 0.17)),
+        ("ManiFeel-BulbInstallation-v1", (0.68, 0.0, 0.15), (0.5, -0.17, 0.17)),
+        *(
+            (f"ManiFeel-{name}-v1", (0.80, 0.0, 0.15), (0.5, -0.4, 0.17))
+            for name in ("PegReorientation", "ObjectSearch", "BallSorting")
+        ),
+    ],
+)
+def test_cameras_stand_where_the_paper_has_them_and_look_30_degrees_down(make_env, task, front, side):
     """Position and view in the base frame, or in the frame of the hand; x ahead and z up in SAPIEN's cameras."""
     slant = np.array([np.cos(np.pi / 6), -np.sin(np.pi / 6)])
-    views = {"front": ((0.68, 0.0, 0.15), (-slant[0], 0.0, slant[1])), "side": ((0.5, -0.17, 0.17), (0.0, *slant))}
-    env = make_env(obs_mode="rgb", cameras=("front", "side", "wrist"), sensor_configs=dict(width=32, height=32))
+    views = {"front": (front, (-slant[0], 0.0, slant[1])), "side": (side, (0.0, *slant))}
+    env = make_env(task, obs_mode="rgb", cameras=("front", "side", "wrist"), sensor_configs=dict(width=32, height=32))
     env.reset(seed=0)
     base = env.unwrapped
     views["wrist"] = ((0.045, 0.0, 0.04), (slant[1], 0.0, slant[0]))  # along the fingers, and inward
