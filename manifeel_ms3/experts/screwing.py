@@ -235,7 +235,7 @@ class BulbExpertConfig(ScrewingExpertConfig):
     """Share of the bulb's distance from the tool by which the hand follows it: a round part that slips between the pads would
     slip out of them."""
     aim_error: float = 0.015
-    """Largest distance from the axis, in m, of the point at `clear_height` to which the bulb comes first. Set once; not tuned."""
+    """Largest distance from the axis, in m, of the point at which the bulb begins to descend. Set once; not tuned."""
     centring: float = 0.2
     """Share of its distance from the axis by which the bulb is moved in one step of its descent. Set once; not tuned."""
     slope: float = 1.0
