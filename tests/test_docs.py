@@ -22,7 +22,9 @@ from baselines.diffusion_policy import train as diffusion
 from baselines.tactile_representations.t3 import T3
 from docs import make_readme_results
 from manifeel_ms3 import cli
+from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.demonstrations import render_observations
+from manifeel_ms3.leaderboard import __main__ as leaderboard
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.links import dead_links, missing_targets
 from tests.sample import states_sample
@@ -107,6 +109,19 @@ def test_a_page_links_files_that_exist(page):
 def test_readme_has_the_published_results():
     readme = make_readme_results.README.read_text()
     assert make_readme_results.block() in readme, "run `python -m docs.make_readme_results`"
+
+
+def test_the_page_of_results_has_every_claim():
+    page = (REPOSITORY / "docs/results.md").read_text()
+    missing = [one for one in comparisons() if f"| {one.claim} | {one.first.task} |" not in page]
+    assert not missing, "run `make results`"
+
+
+def test_the_leaderboard_shows_its_entries(tmp_path):
+    board = Path(shutil.copytree(REPOSITORY / "leaderboard", tmp_path / "leaderboard"))
+    shown = (board / "README.md").read_text()
+    leaderboard.main(leaderboard.Build(board))
+    assert (board / "README.md").read_text() == shown, "run `manifeel leaderboard build`"
 
 
 def test_the_site_builds_without_a_warning(tmp_path):

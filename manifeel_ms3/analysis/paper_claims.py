@@ -64,9 +64,12 @@ def _touch_claims() -> Iterator[Comparison]:
 def _tacrgb_claims() -> Iterator[Comparison]:
     """The claims about TacRGB in tasks that its images do not help."""
     for task in tasks_in_table("I", "insertion", "screwing"):
-        if task != "PegInsertion":  # there, the paper found a gain of seven points
+        with_picture, without = paper_condition(task, TACRGB), paper_condition(task, VISION)
+        if task == "PegInsertion":
+            yield Comparison("3. TacRGB is above vision on the peg (read off Table I)", with_picture, without)
+        else:
             claim = "3. TacRGB is no gain over vision in insertion and screwing, except for the peg (read off Table I)"
-            yield Comparison(claim, paper_condition(task, TACRGB), paper_condition(task, VISION), gain=False)
+            yield Comparison(claim, with_picture, without, gain=False)
     for policy in (DP, EQUIDP, FM):
         with_picture, without = (paper_condition("GearAssembly", mode, policy) for mode in (TACRGB, VISION))
         yield Comparison("3. TacRGB takes success away on gear, with every policy", without, with_picture)

@@ -74,9 +74,9 @@ which cover the variation over training only in tasks with several training seed
 come from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
 """
 AGAIN = """
-The success rate of each run links to its result file. If the file lies in a folder `leaderboard/NAME/seed0`, its checkpoint is
-beside it, and `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree. `manifeel study
-configs/tables_cpu.yaml` produces all results of the small networks.
+The success rate of each run links to its result file. Where a folder `checkpoints` lies beside that file in
+`leaderboard/NAME/seed0`, `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree.
+`manifeel study configs/tables_cpu.yaml` produces all results of the small networks.
 """
 CURVES = """
 ![Success over the samples seen in training]({figure})

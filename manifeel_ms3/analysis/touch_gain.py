@@ -14,7 +14,7 @@ from .episode_endings import Results, endings_of
 from .estimates import SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
 from .markdown import markdown_table, shown
 from .matching import Found, answering, of_table_one
-from .paper import MODES, TABLE_I, VISION, Rate, paper_condition, tasks_in_table
+from .paper import DP, MODES, TABLE_I, TABLE_II, VISION, Rate, paper_condition, tasks_in_table
 from .presets import TrainingSettings
 from .protocol import ConditionResults
 
@@ -23,7 +23,8 @@ TEXT = """
 
 Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. Where a condition has
 fewer than three training seeds, the interval covers the initial states only and says nothing about how much training varies.
-Each change is tested alone, without a correction for their number.
+Each change is tested alone, without a correction for their number, and contradicts the paper's where that lies outside of its
+interval.
 How an episode fails is determined by a rule of its task. The [audit](audit.md) shows how much the camera and touch can reveal
 at all.
 
@@ -54,7 +55,8 @@ def touch_gains(found: Found, results: list[dict[str, Any]]) -> Iterator[str]:
         results: Contents of result files.
     """
     of_condition = by_condition(results)
-    paragraphs = [text for task in TABLE_I for text in _of_a_task(task, found, of_condition)]
+    tasks = dict.fromkeys((*TABLE_I, *TABLE_II))  # Table II adds sorting in normal light
+    paragraphs = [text for task in tasks for text in _of_a_task(task, found, of_condition)]
     if paragraphs:
         yield TEXT
         yield "\n".join(paragraphs)
@@ -101,7 +103,8 @@ def _measured(results: ConditionResults, measure: str) -> ConditionResults | Non
 
 
 def _papers_rates(task: str) -> dict[str, Rate]:
-    return dict(zip(MODES, TABLE_I[task], strict=True))
+    """The paper's rates of Diffusion Policy by observation mode."""
+    return dict(zip(MODES, TABLE_I.get(task) or TABLE_II[task][DP], strict=True))
 
 
 def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> Iterator[str]:
@@ -115,7 +118,8 @@ def _of_a_task(task: str, found: Found, results: dict[Condition, Results]) -> It
 
 def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) -> str:
     rates = _papers_rates(task)
-    papers = f"the paper: {100 * (rates[mode].mean - rates[VISION].mean):+.0f}"
+    change = rates[mode].mean - rates[VISION].mean
+    papers = f"the paper: {100 * change:+.0f}"
     touched, seen = found[conditions[mode]], found[conditions[VISION]]
     try:
         gain, p_value = difference(touched, seen)
@@ -124,6 +128,8 @@ def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) 
     verdict = "not significant; " if p_value >= SIGNIFICANT else ""
     if not has_enough_seeds(touched, seen):
         verdict = "too few training seeds to tell; "
+    elif not gain.low <= change <= gain.high:
+        papers += ", which this contradicts"
     return f"{NAMES[mode]} changes success by {gain.signed} points ({verdict}{papers})"
 
 

@@ -32,6 +32,7 @@ from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.presets import training_settings_of
 from manifeel_ms3.errors import MachineError
+from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
 from tests.tiny_study import TINY
@@ -202,7 +203,30 @@ def test_the_papers_studies_answer_every_claim_and_every_cell_of_its_tables():
     assert missing == []
 
 
+def test_the_small_networks_study_makes_every_published_result():
+    """Each published condition and training seed is one of the study that the page of results names."""
+    folders = [REPOSITORY / folder for folder in ("leaderboard", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")]
+    published = {(without_settings(condition_of(result)), result["config"]["seed"]) for result in results_in(*folders).values()}
+    planned = set()
+    for job in jobs_of(read_study(REPOSITORY / "configs/tables_cpu.yaml")):
+        if job.kind == "train":
+            planned.add((without_settings(_condition_of_training(job)), training_args(job).seed))
+    assert len(published) > 100
+    assert sorted(map(str, published - planned)) == []
+
+
+def without_settings(condition: Condition) -> tuple[Condition, str]:
+    """A condition without its settings, and the preset that they come from."""
+    return replace(condition, settings=()), training_settings_of(condition).preset
+
+
 def _condition_planned(job: Job) -> Condition:
+    condition = _condition_of_training(job)
+    assert str(training_settings_of(condition)) in ("paper", "paper, precision bf16"), condition
+    return as_the_paper_says(condition)
+
+
+def _condition_of_training(job: Job) -> Condition:
     args, record = training_args(job), job.needs[0]
     sensing = dict(cameras=list(args.cameras), tactile_sensors=list(args.tactile_sensors))
     learning_rate = args.lr or args.public_code_lr()
@@ -212,9 +236,7 @@ def _condition_planned(job: Job) -> Condition:
     result = dict(
         env_id=args.env_id, env_kwargs=kwargs, obs_mode=args.obs_mode, policy=policy, config=config, revision=revision
     )
-    condition = condition_of(result)
-    assert str(training_settings_of(condition)) in ("paper", "paper, precision bf16"), condition
-    return as_the_paper_says(condition)
+    return condition_of(result)
 
 
 def test_an_encoder_is_pretrained_once_and_the_policies_start_from_it(tmp_path):
