@@ -31,8 +31,8 @@ both lights.
 """
 NOT_RUN = """
 Not run: {what}. `manifeel study configs/tables_cpu.yaml` runs Tables I and II with small networks on a CPU, and
-`manifeel study configs/paper.yaml` everything with the networks of the paper, on a GPU; with `--dry-run`, both estimate the hours
-on your machine.
+`manifeel study configs/paper.yaml` everything with the networks of the paper, on a GPU; with `--dry-run`, both estimate the
+hours on your machine.
 """
 Files = Mapping[Condition, Sequence[str]]
 """Links to result files of conditions: the last checkpoint's of each training seed, in the order of `ConditionResults`."""
