@@ -34,7 +34,7 @@ under changes of the [appearance](rendering.md#visual-randomization), which are 
 itself is not changed. All rows of a policy were evaluated on the same processor. Each difference, in percentage points, has a
 95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows
 of the policy (Holm 1979). One policy of each kind was tested: nothing here tells how other training seeds or tasks behave.
-The study `configs/perturbation.yaml` trains and evaluates policies of four tasks, with vision alone, TacRGB and TacFF. Of these,
+The study `configs/perturbation.yaml` trains and evaluates policies of four tasks, with vision alone, TacRGB and TacFF.
 GearAssembly and BallSorting, and PegInsertion with vision alone and TacRGB, have not been run.
 
 Touch does not make a policy robust that has only seen the usual appearance. In ObjectSearch, touch doubles success under the
@@ -47,7 +47,8 @@ and 24 with TacRGB. With vision alone, no difference but those of the light's di
 the correction.
 
 In PegInsertion with TacFF, 23 of 50 episodes succeed under the usual appearance, and fewer under each change: five to 10 with
-another direction or level of the light or a turned camera, which is significant after the correction, and 13 to 15 with the others.
+another direction or level of the light or a turned camera, which is significant after the correction, and 13 to 15 with the
+others.
 """
 
 
