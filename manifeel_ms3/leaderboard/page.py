@@ -124,7 +124,7 @@ def leaderboard_table(rows: list[Row]) -> str:
         'the success of policies that have learnt nothing, where it was measured. "Run again" is the number of episodes that '
         "the leaderboard ran again with the same outcome "
         "([what this proves](../docs/evaluation.md#what-running-episodes-again-proves)). Results whose checkpoints were not "
-        "kept are not here; with them, the rates of a row on the page of [results](../docs/results.md) can be of more seeds.\n\n"
+        "kept are not here; with them, rates on the page of [results](../docs/results.md) can be of more seeds.\n\n"
     )
     cells = []
     for row in rows:
