@@ -206,16 +206,18 @@ def test_the_papers_studies_answer_every_claim_and_every_cell_of_its_tables():
 def test_the_small_networks_study_makes_every_published_result():
     """Each published condition and training seed is one of the study that the page of results names."""
     folders = [REPOSITORY / folder for folder in ("leaderboard", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")]
-    published = {(without_settings(condition_of(result)), result["config"]["seed"]) for result in results_in(*folders).values()}
+    published = {
+        (_without_settings(condition_of(result)), result["config"]["seed"]) for result in results_in(*folders).values()
+    }
     planned = set()
     for job in jobs_of(read_study(REPOSITORY / "configs/tables_cpu.yaml")):
         if job.kind == "train":
-            planned.add((without_settings(_condition_of_training(job)), training_args(job).seed))
+            planned.add((_without_settings(_condition_of_training(job)), training_args(job).seed))
     assert len(published) > 100
     assert sorted(map(str, published - planned)) == []
 
 
-def without_settings(condition: Condition) -> tuple[Condition, str]:
+def _without_settings(condition: Condition) -> tuple[Condition, str]:
     """A condition without its settings, and the preset that they come from."""
     return replace(condition, settings=()), training_settings_of(condition).preset
 

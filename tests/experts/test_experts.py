@@ -86,14 +86,14 @@ def test_demonstrations_of_insertion_hold_pushes_of_the_hand_while_the_plug_is_f
         expert = make_expert(PEG, env.unwrapped, seed)
         disturb, felt = expert._disturb, []
         expert._disturb = lambda disturb=disturb, felt=felt: felt.append(disturb()) or felt[-1]
-        actions = list(zip(range(40), expert.actions(), strict=False))
+        for _, action in zip(range(40), expert.actions(), strict=False):
+            env.step(action)
         begun = [
             now
             for before, now in zip([np.zeros(6), *felt], felt, strict=False)
             if now.any() and not np.array_equal(before, now)
         ]
         pushes.append(len(begun))
-        assert len(actions) == 40
         assert all(push[2] >= 0 for push in begun)  # none rams the plug into the rim
     assert 1 <= np.mean(pushes) <= 4
 
