@@ -151,10 +151,13 @@ def _values(env: Any, name: str) -> str:
 def _measured(spec: TaskSpec) -> str:
     parts = []
     for page, title, columns in (("tasks.md", "The demonstrator", 4), ("audit.md", "What camera and touch reveal", 6)):
+        link = f"[{page.removesuffix('.md')}](../{page})"
         if found := rows_of(DOCS / page, spec.name, columns):
             names, rows = found
-            source = f"From [{page.removesuffix('.md')}](../{page}), which says how it was measured.\n"
+            source = f"From {link}, which says how it was measured.\n"
             parts.append(f"## {title}\n\n{source}\n{markdown_table(names[1:], (row[1:] for row in rows))}")
+        else:
+            parts.append(f"## {title}\n\nNot measured for this task; {link} has other tasks.\n")
     return "\n".join([*parts, _results(spec)])
 
 
