@@ -13,7 +13,7 @@ from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.files import file_hash
 
-from .observation import POSE, ObservationSpec, is_tactile
+from .observation import POSE, ImageSizeError, ObservationSpec, is_tactile
 
 log = logging.getLogger(__name__)
 HASH_DIGITS = 16
@@ -291,10 +291,9 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
         return by_name(IMAGE_ENCODERS, config.image)(size, config.image_features)
     try:
         encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(size, config.tactile_features)
-    except InvalidArgumentError as error:
-        if size < spec.size_of(key):
-            raise InvalidArgumentError(f"{error} --policy.encoder.tactile-crop 0") from None
-        raise
+    except ImageSizeError as error:
+        uncropped = " --policy.encoder.tactile-crop 0" if size < spec.size_of(key) else ""
+        raise ImageSizeError(f"{error}{uncropped}") from None
     if config.freeze_tacrgb or config.tacrgb_sensor:
         if not isinstance(encoder, PretrainedEncoder):
             raise InvalidArgumentError(

@@ -31,6 +31,10 @@ WORK_SQUARES = dict(wrist=(0.28, 0.14, 0.72), front=(0.0, 0.125, 0.75), side=(0.
 of it the wrist camera sees its own housing, and the others see bare table (judged by eye in demonstrations of all tasks)."""
 
 
+class ImageSizeError(InvalidArgumentError):
+    """A network does not take images of this size; the message ends with the options that set one which it takes."""
+
+
 @dataclass(frozen=True)
 class ObservationSpec:
     """Observations of a policy by their paths in ManiSkill's tree, such as "sensor_data/wrist/rgb"."""

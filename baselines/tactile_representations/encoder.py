@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from baselines.common.encoders import PretrainedEncoder, register_tacrgb_encoder
-from manifeel_ms3.errors import InvalidArgumentError
+from baselines.common.observation import ImageSizeError
 
 from .anytouch import AnyTouch
 from .representation import Representation
@@ -24,7 +24,7 @@ class RepresentationEncoder(PretrainedEncoder):
         features: Number of features.
 
     Raises:
-        InvalidArgumentError: The representation does not take images of this size.
+        ImageSizeError: The representation does not take images of this size.
     """
 
     def __init__(self, representation: Representation, size: int, features: int):
@@ -63,11 +63,11 @@ def require_size(representation: Representation, size: int, option: str = "--tac
         option: Option of the command line that sets the size, for the error's message.
 
     Raises:
-        InvalidArgumentError: The representation does not take images of this size.
+        ImageSizeError: The representation does not take images of this size.
     """
     patch = representation.patch
     if size < patch or size % patch:
-        raise InvalidArgumentError(
+        raise ImageSizeError(
             f"{type(representation).__name__} takes images whose sides are a multiple of {patch}, not {size}; give {option} "
             f"{representation.size}"
         )

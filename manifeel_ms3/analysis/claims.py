@@ -10,11 +10,10 @@ Interval and verdict are those of a single comparison. Of many comparisons witho
 the p-values after Holm's correction for all comparisons with a verdict say which differences remain.
 """
 
-import json
 import logging
 import sys
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Literal
@@ -31,7 +30,7 @@ from .encoder_ranking import ranking_tables
 from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
-from .paper import TACFF, TACSL, TWIN_RATES, reported, twin_condition
+from .paper import TACFF, TACSL, TWIN_RATES, paper_condition, reported, twin_condition
 from .paper_claims import Comparison, comparisons
 from .presets import TrainingSettings
 from .protocol import collect, of_the_protocol
@@ -146,7 +145,7 @@ def _papers_rates() -> list[dict[Condition, float]]:
         rates = tables.setdefault(number, {})
         rates[condition] = rate.mean
         if condition.obs_mode == TACFF:
-            rates[replace(condition, variant=json.dumps(TACSL, sort_keys=True))] = rate.mean
+            rates[paper_condition(condition.task, TACFF, condition.policy, variant=TACSL)] = rate.mean
     twin = {twin_condition(task, mode): rate for task, rates in TWIN_RATES.items() for mode, rate in rates.items()}
     return [*tables.values(), twin]
 

@@ -216,6 +216,8 @@ def test_the_advice_on_a_crop_that_does_not_fit_can_be_followed():
         ):
             ObservationEncoder(cropped, spec, 1)
         ObservationEncoder(replace(cropped, tactile_crop=0), spec, 1)
+        with pytest.raises(InvalidArgumentError, match=r"needs an even number$"):  # no advice about the crop, which fits
+            ObservationEncoder(replace(cropped, tacrgb="resnet18_keypoints", tactile_features=9), spec, 1)
 
 
 def test_a_policy_takes_the_statistics_of_its_demonstrations_and_its_weights_keep_them(monkeypatch):

@@ -25,6 +25,7 @@ from baselines.studies.planning import Job, jobs_of
 from baselines.studies.study import OF_THE_STUDY, Resources, StudyError, read_study
 from baselines.studies.work import AMOUNT_FLAGS
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
+from docs import make_readme_results
 from manifeel_ms3 import cli
 from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.matching import as_the_paper_says
@@ -205,10 +206,8 @@ def test_the_papers_studies_answer_every_claim_and_every_cell_of_its_tables():
 
 def test_the_small_networks_study_makes_every_published_result():
     """Each published condition and training seed is one of the study that the page of results names."""
-    folders = [REPOSITORY / folder for folder in ("leaderboard", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")]
-    published = {
-        (_without_settings(condition_of(result)), result["config"]["seed"]) for result in results_in(*folders).values()
-    }
+    results = results_in(*make_readme_results.RESULTS).values()
+    published = {(_without_settings(condition_of(result)), result["config"]["seed"]) for result in results}
     planned = set()
     for job in jobs_of(read_study(REPOSITORY / "configs/tables_cpu.yaml")):
         if job.kind == "train":
