@@ -109,7 +109,8 @@ class ScrewingExpert:
         self._closed = self.skills.grip_action(self.screw.grip_width, self.screw.grip_force)
         self._open = self.skills.finger_action(self.screw.grip_width / 2 + self.config.open_by)
         self.skills.gripper = self._closed
-        self.axis = perceived_position(env.fixed, np.random.default_rng([seed, STREAM]))
+        self._rng = np.random.default_rng([seed, STREAM])
+        self.axis = perceived_position(env.fixed, self._rng)
         self.yaw = WOUND_UP
 
     def _facing(self) -> Rotation:
@@ -132,11 +133,16 @@ class ScrewingExpert:
         yield skills.command(*skills.commanded)
         skills.tare()
         over = above(self.axis, self.screw.engaged + config.hover_height)
-        yield from skills.reach(above(over, config.clear_height), self._facing(), config.travel_tolerance)
-        yield from skills.reach(over, self._facing(), config.hover_tolerance)
+        yield from self._come_over(over)
         lowest = over[2] - config.lower_distance
         yield from skills.lower_until_contact(self._facing(), lowest, speed=config.lower_speed)
         yield from self._centre()
+
+    def _come_over(self, end: np.ndarray) -> Actions:
+        """Bring the tool to a point (3,), m, sideways first and then straight down."""
+        skills, config = self.skills, self.config
+        yield from skills.reach(above(end, config.clear_height), self._facing(), config.travel_tolerance)
+        yield from skills.reach(end, self._facing(), config.hover_tolerance)
 
     def _centre(self) -> Actions:
         """Press, and comply with the chamfer's push, until the part no longer sinks and does not stand on the rim."""
@@ -216,16 +222,54 @@ class ScrewingExpert:
         skills.tare()
 
 
+@dataclass(frozen=True)
+class BulbExpertConfig(ScrewingExpertConfig):
+    """Constants of the demonstrator of BulbInstallation. Those with another value than for the nut are tuned."""
+
+    tightening: float = float(np.deg2rad(120))
+    """Rotation of the bulb once it is at its final height, in rad."""
+    release_force: float = 4.0
+    """Upward force, in N, above which the hand may rise while it turns: when the bulb meets the contact, the holder's thread
+    must take the load, not the hand."""
+    follow: float = 0.2
+    """Share of the bulb's distance from the tool by which the hand follows it: a round part that slips between the pads would
+    slip out of them."""
+    aim_error: float = 0.015
+    """Largest distance from the axis, in m, of the point at which the bulb begins to descend. Set once; not tuned."""
+    centring: float = 0.2
+    """Share of its distance from the axis by which the bulb is moved in one step of its descent. Set once; not tuned."""
+    slope: float = 1.0
+    """Smallest ratio of the height over the end of the descent to the distance from the axis: the bulb comes down within a
+    cone. Set once; not tuned."""
+    descent: float = 0.0015
+    """Largest step downwards of the descent, in m. Set once; not tuned."""
+
+
 @register_demonstrator("ManiFeel-BulbInstallation-v1")
 class BulbExpert(ScrewingExpert):
-    """Screws in a bulb that it holds, or one that already sits in the holder's thread (`start="holder"`)."""
+    """Screws in a bulb that it holds, or one that already sits in the holder's thread (`start="holder"`).
 
-    config = ScrewingExpertConfig(
-        tightening=float(np.deg2rad(120)),  # tuned
-        release_force=4.0,  # tuned: when the bulb meets the contact, the holder's thread must take the load, not the hand
-        follow=0.2,  # tuned: a round part that slips between the pads would slip out of them
-    )
+    It comes roughly over the holder and moves to its axis while it descends, so that demonstrations show how a bulb beside the
+    axis is brought to it.
+    """
+
+    config = BulbExpertConfig()
     env: BulbInstallationEnv
+
+    def _come_over(self, end: np.ndarray) -> Actions:
+        skills, config = self.skills, self.config
+        angle, share = self._rng.uniform(0, 2 * np.pi), np.sqrt(self._rng.uniform())
+        aside = config.aim_error * share * np.array([np.cos(angle), np.sin(angle), 0.0])
+        yield from skills.reach(above(end, config.clear_height) + aside, self._facing(), config.travel_tolerance)
+        while True:
+            off = end - skills.tool[0]
+            distance, height = np.linalg.norm(off[:2]), -off[2]
+            if max(distance, height) < config.hover_tolerance:
+                return
+            near = distance <= max(config.hover_tolerance, height / config.slope)
+            down = np.clip(height, 0.0, config.descent) if near else 0.0
+            command, _ = skills.commanded
+            yield skills.command(command + np.array([*config.centring * off[:2], -down]), self._facing())
 
     def _begin(self) -> Actions:
         yield from self._grasp_in_holder() if self.env.start == "holder" else self._set_down()

@@ -161,6 +161,9 @@ THREAD_OVERLAP = 1e-4
 """Length by which the holder's thread reaches into its wall, in m, so that no gap is between them."""
 HOLDER_RADIUS, HOLDER_HEIGHT = 0.022, 0.035
 """Outer radius and height of the holder, in m. Chosen by eye."""
+BASE_RADIUS, BASE_HEIGHT = 0.05, 0.006
+"""Radius and height of the base on which the holder stands, in m. Over the holder, the bulb's glass hides it from the wrist
+camera; the base, which is wider than the glass, shows where it is. Chosen by eye."""
 CONTACT_HEIGHT = 0.012
 """Height of the holder's contact over the underside, in m. Chosen by eye."""
 BORE = (0.018, 0.0288)
@@ -230,7 +233,7 @@ def e27_bulb() -> Part:
 
 
 def e27_holder() -> Part:
-    """Lampholder with an inner thread below its rim, and a contact at the bottom."""
+    """Lampholder on a wide base, with an inner thread below its rim, and a contact at the bottom."""
     bore = E27.wider(E27_GAP)
     mouth = bore.major_radius + GUIDE
     thread = internal_mesh(bore, BORE[1] - BORE[0], mouth + THREAD_OVERLAP)
@@ -240,12 +243,13 @@ def e27_holder() -> Part:
     shell = trimesh.creation.annulus(mouth, HOLDER_RADIUS, HOLDER_HEIGHT, sections=HOLDER_SECTIONS)
     shell.apply_translation([0, 0, HOLDER_HEIGHT / 2])
     contact = Cylinder(mouth, CONTACT_HEIGHT, (0.0, 0.0, CONTACT_HEIGHT / 2))
+    base = Cylinder(BASE_RADIUS, BASE_HEIGHT, (0.0, 0.0, BASE_HEIGHT / 2))
     return Part(
         "holder",
-        (Solid(shell), Solid(thread), contact),
+        (Solid(shell), Solid(thread), contact, base),
         looks.DARK_PLASTIC,
         friction=DRY_FRICTION,
-        other_looks={1: looks.STEEL, 2: looks.BRASS},
+        other_looks={1: looks.STEEL, 2: looks.BRASS, 3: looks.BLUE_PLASTIC},
         springs={2: CONTACT_SPRING},
     )
 
