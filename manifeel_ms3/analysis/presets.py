@@ -15,7 +15,7 @@ from .markdown import shown
 
 PAPER = "paper"
 """Name of the preset that has the paper's settings, in every policy that the paper reports."""
-FULLEST = (PAPER, "cpu_targets", "cpu_long", "cpu")
+FULLEST = (PAPER, "cpu_targets", "cpu_noisy_pose", "cpu_long", "cpu")
 """Presets from the paper's own training to the shortest: an overview of Table I has the first in which a task was run."""
 PAPER_PRECISION = {"precision": json.dumps("fp32")}
 """Number format of the paper's training. The presets' own depends on the machine."""
