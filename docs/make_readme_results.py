@@ -24,8 +24,7 @@ from manifeel_ms3.tasks.registry import task_spec
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-FOLDERS = ("leaderboard/cpu", "leaderboard/cpu_targets", "docs/cpu", "docs/cpu_long", "docs/cpu_targets")
-RESULTS = [ROOT / folder for folder in FOLDERS]
+RESULTS = sorted(ROOT.glob("leaderboard/cpu*")) + sorted(ROOT.glob("docs/cpu*"))
 BLOCK = re.compile(r"(<!-- --8<-- \[start:results\] -->\n).*(?=<!-- --8<-- \[end:results\] -->)", re.DOTALL)
 """README's part between the marks with which the home page of the documentation includes it."""
 ROWS = {
@@ -48,9 +47,9 @@ above those of vision alone. Policies that have learnt nothing reach at most {fl
 DETAILS = """
 Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of
 demonstrations, and evaluated on {episodes} initial states that no demonstration has. A preset is a set of training settings:
-`cpu_long` trains longer than `cpu`, and in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves.
-Each row has one preset: the last of `cpu`, `cpu_long` and `cpu_targets` among those with which all three sensings were run with
-most training seeds. Rows without ± have one seed, so that their differences of less than about 35 points may be chance.
+`cpu_long` trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and in
+`cpu_noisy_pose` noise hides where the hand is. Each row has one preset: the last of `cpu`, `cpu_long`, `cpu_noisy_pose` and
+`cpu_targets` among those with which all three sensings were run with most training seeds. Rows without ± have one seed, so that their differences of less than about 35 points may be chance.
 "Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training

@@ -10,7 +10,6 @@ import dataclasses
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import cv2
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
-from manifeel_ms3.analysis.markdown import markdown_table
+from manifeel_ms3.analysis.markdown import markdown_table, markdown_tables
 from manifeel_ms3.analysis.paper import training_demos
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, description_of
@@ -176,18 +175,12 @@ def _results(spec: TaskSpec) -> str:
 def rows_of(page: Path, task: str, columns: int) -> tuple[list[str], list[list[str]]] | None:
     """The head and the rows of a task in the table of a page that has so many columns; None if it has none."""
     head: list[str] = []
-    for table in _tables(page.read_text(encoding="utf-8")):
+    for table in markdown_tables(page.read_text(encoding="utf-8")):
         head, *rows = table
         mine = [row for row in rows if task in re.split(r",\s*", row[0])]
         if len(head) == columns and mine:
             return head, mine
     return None
-
-
-def _tables(text: str) -> Iterator[list[list[str]]]:
-    for block in re.findall(r"(?:^\|.*\|\n)+", text, flags=re.MULTILINE):
-        head, _, *rows = ([cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines())
-        yield [head, *rows]
 
 
 def _use(spec: TaskSpec) -> str:

@@ -37,6 +37,8 @@ from .probes import EpisodeGroup, Probe
 log = logging.getLogger(__name__)
 MODALITIES = {"camera": "camera", "tacrgb": "TacRGB", "tacff": "TacFF"}
 """Names of the modalities, and their titles in the table and the figure."""
+COLUMNS_OF_TABLE = ("task", "question", "chance", *MODALITIES.values())
+"""Names of the columns of the table."""
 OBSERVED = "rgb+tacrgb+tacff"
 """Observations that a recording must have."""
 FOLDS = 5
@@ -268,7 +270,7 @@ def audit_table(results: list[ProbeResult]) -> str:
         chance = f"{first.chance:.1f}{_suffix(first)}" if first.unit else f"{first.chance:.0%}"
         cells = [f"{_cell(first)} ({first.sensor})", *(_cell(result) for result in group[1:])]
         rows.append((short_name(first.env_id), first.question, chance, *cells))
-    return markdown_table(("task", "question", "chance", *MODALITIES.values()), rows)
+    return markdown_table(COLUMNS_OF_TABLE, rows)
 
 
 def _cell(result: ProbeResult) -> str:

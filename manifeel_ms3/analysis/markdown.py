@@ -1,7 +1,7 @@
 """Markdown of pages that are made from results."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 from manifeel_ms3.text import markdown_text
@@ -20,6 +20,17 @@ def markdown_table(names: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     names = list(names)
     lines = [names, ["---"] * len(names), *(["" if cell is None else str(cell) for cell in row] for row in rows)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def markdown_tables(text: str) -> Iterator[list[list[str]]]:
+    """The tables of a Markdown page, each as its rows of cells; the first row holds the names of the columns.
+
+    Args:
+        text: Content of the page.
+    """
+    for block in re.findall(r"(?:^\|.*\|\n)+", text, flags=re.MULTILINE):
+        head, _, *rows = ([cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines())
+        yield [head, *rows]
 
 
 def shown(text: str) -> str:

@@ -39,7 +39,7 @@ from .presets import FULLEST, training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
 from .success_curves import DPI, PANEL, write_curves
-from .touch_gain import touch_gains
+from .touch_gain import audited, touch_gains
 
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
@@ -125,6 +125,8 @@ class Args:
     """Folders with result files, and with the logs of training if there are any."""
     out: Path = Path("docs/results.md")
     """Path of the Markdown page; its figures and their table go into the folder images beside it."""
+    audit: Path | None = None
+    """Page with the table that `manifeel audit` wrote, which then stands beside what touch adds to success."""
 
 
 @dataclass(frozen=True)
@@ -147,16 +149,17 @@ def main(args: Args) -> Path:
     A figure of the loss in training that was drawn before stays on the page where the logs of training are not at hand.
 
     Raises:
-        InvalidArgumentError: The path of the page is that of a folder.
+        InvalidArgumentError: The path of the page is that of a folder, or `audit` does not hold the table of an audit.
         ResultError: There is no result, or one is broken.
     """
     require_file("--out", args.out, "results.md")
+    audit = audited(args.audit) if args.audit else {}
     by_file = results_in(*args.results)
     results = list(by_file.values())
     collected = collect(by_file)
     figures = _draw(args, by_file, of_the_protocol(collected))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
-    write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities)))
+    write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities, audit)))
     return args.out
 
 
@@ -232,6 +235,7 @@ def page(
     files: Files,
     figures: Figures,
     similarities: Sequence[Path],
+    audit: Mapping[str, Sequence[str]],
 ) -> Iterator[str]:
     """The Markdown page, part by part.
 
@@ -241,13 +245,14 @@ def page(
         files: Links to the result files of conditions.
         figures: Paths of the figures.
         similarities: Files that `manifeel similarity` wrote.
+        audit: What the information audit found, by the names of tasks.
     """
     found = of_the_protocol(collected)
     yield HEAD.format(last=LAST)
     if figures.sensing:
         yield CHART.format(figure=_address(figures.sensing), presets=", ".join(f"`{name}`" for name in FULLEST))
     yield from tables_of_the_paper(found, files)
-    yield from touch_gains(found, results)
+    yield from touch_gains(found, results, audit)
     if figures.gentle:
         yield GENTLE.format(figure=_address(figures.gentle))
     yield "\n## What was run\n\n"

@@ -29,7 +29,7 @@ def text_of(results: Path) -> str:
     by_file = results_in(results)
     none = results_page.Figures(*[None] * len(fields(results_page.Figures)))
     links = results_page._links(by_file, results)
-    return "".join(results_page.page(list(by_file.values()), collect(by_file), links, none, ()))
+    return "".join(results_page.page(list(by_file.values()), collect(by_file), links, none, (), {}))
 
 
 def config_of(policy: str, preset: str, task: str, mode: str, seed: int, encoder: str = "", **changes: Any) -> dict[str, Any]:

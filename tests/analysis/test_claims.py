@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manifeel_ms3.analysis import claims
+from manifeel_ms3.analysis import claims, results_page
 from manifeel_ms3.analysis.condition import Condition
 from manifeel_ms3.analysis.encoder_ranking import rankings, verdict_on
 from manifeel_ms3.analysis.estimates import Estimate, difference, holm
+from manifeel_ms3.analysis.information_audit import ProbeResult, audit_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_II, TABLE_III, TACFF, TACRGB, VISION, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.tasks.registry import task_spec
 from tests.tasks_and_marks import PEG
@@ -115,6 +117,27 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
         write_run(tmp_path, TACFF, 0.5, seed)
     (paragraph,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
     assert re.search(change.format(""), paragraph)
+
+
+def test_what_the_audit_found_stands_beside_what_touch_adds(tmp_path):
+    of_camera = ProbeResult("peg touches or not", PEG, "camera", "", 0.67, (0.63, 0.72), 0.5, 50, 900, "wrist")
+    of_touch = [replace(of_camera, modality=name, score=score) for name, score in (("tacrgb", 0.75), ("tacff", 0.83))]
+    audit = tmp_path / "audit.md"
+    audit.write_text(audit_table([of_camera, *of_touch]))
+    for mode, rate in ((VISION, 0.2), (TACFF, 0.5)):
+        write_run(tmp_path, mode, rate)
+    page = results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md", audit)).read_text().replace("\\", "")
+    scores = "camera 67% [63, 72] (wrist), TacRGB 75% [63, 72], TacFF 83% [63, 72]; chance 50%"
+    assert f"\n**PegInsertion**, what one moment reveals: peg touches or not: {scores}.\n" in page
+
+
+def test_a_page_without_an_audit_is_refused_before_the_results_page_is_written(tmp_path):
+    write_run(tmp_path, VISION, 0.2)
+    for audit in (tmp_path / "audit.md", tmp_path / "other.md"):
+        (tmp_path / "other.md").write_text("| task |\n| --- |\n| PegInsertion |\n")
+        with pytest.raises(InvalidArgumentError, match=f"{audit.name}: no table of `manifeel audit` is there"):
+            results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md", audit))
+    assert not (tmp_path / "results.md").exists()
 
 
 def test_the_page_says_what_touch_adds_on_average_over_the_tasks_of_a_category(tmp_path):
