@@ -47,9 +47,10 @@ above those of vision alone. Policies that have learnt nothing reach at most {fl
 DETAILS = """
 Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of
 demonstrations, and evaluated on {episodes} initial states that no demonstration has. A preset is a set of training settings:
-`cpu_long` trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and in
-`cpu_noisy_pose` noise hides where the hand is. Each row has one preset: the last of `cpu`, `cpu_long`, `cpu_noisy_pose` and
-`cpu_targets` among those with which all three sensings were run with most training seeds. Rows without ± have one seed, so that their differences of less than about 35 points may be chance.
+`cpu_long` trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and
+in `cpu_noisy_pose` noise hides from it where the hand is. Each row has one preset: the last of `cpu`, `cpu_long`,
+`cpu_noisy_pose` and `cpu_targets` among those with which all three sensings were run with most training seeds. Rows without ±
+have one seed, so that their differences of less than about 35 points may be chance.
 "Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
