@@ -150,9 +150,9 @@ def _untrained(env_id: str, demos: Path, folder: Path) -> dict[str, Any]:
     return dict(policy="baselines.references:Untrained", policy_kwargs=kwargs, **observed)
 
 
-def next_step(_args: Args, made: Path) -> str:
+def next_step(_args: Args, made: list[Path]) -> str:
     """What the command made, and what one can do with it."""
-    return f"{made} has the floors; `manifeel results` shows them beside the results of trained policies"
+    return f"the floors are in {', '.join(map(str, made))}; `manifeel results` shows them beside what policies reach"
 
 
 if __name__ == "__main__":
