@@ -54,6 +54,8 @@ class Entry:
         """
         submitted = {episode["seed"]: episode for episode in self.result["episodes"]}
         compared = [outcome for outcome in outcomes if outcome.seed in submitted]
+        if not compared:
+            return f"no episode is compared with those of the entry {self.name}, which has other seeds"
         differing = {one.seed: found for one in compared if (found := differences(submitted[one.seed], one))}
         sentence = f"{len(compared) - len(differing)} of {len(compared)} episodes agree with those of the entry {self.name}"
         if not differing:

@@ -16,11 +16,13 @@ MAX_SEED = 2**32 - 1
 def read_seeds(path: Path) -> list[int]:
     """The seeds in a file with one number a line; empty lines, and what follows a "#", are left out.
 
+    The file may begin with a byte order mark, which some editors write.
+
     Raises:
         InvalidFileError: The file cannot be read, holds something else, no seed, a seed twice, or a seed of demonstrations.
     """
     try:
-        lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8").splitlines()]
+        lines = [line.partition("#")[0].strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
         seeds = [int(line) for line in lines if line]
     except (OSError, ValueError) as error:
         raise InvalidFileError(

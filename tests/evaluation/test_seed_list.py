@@ -11,8 +11,9 @@ from manifeel_ms3.evaluation.seed_list import read_seeds
 from tests.tasks_and_marks import PEG
 
 
-def test_a_list_is_read_with_comments(tmp_path):
-    (tmp_path / "seeds.txt").write_text("# ours\n734501\n\n100000  # the first public one\n")
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_list_is_read_with_comments(encoding, tmp_path):
+    (tmp_path / "seeds.txt").write_text("734501\n\n# ours\n100000  # the first public one\n", encoding)
     assert read_seeds(tmp_path / "seeds.txt") == [734501, 100000]
 
 

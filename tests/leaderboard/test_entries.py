@@ -64,6 +64,7 @@ def test_outcomes_that_differ_are_counted_and_the_first_is_named():
     counts = f"{int(other)} succeed here, {int(not other)} there"
     assert said.startswith(f"0 of 1 episodes agree with those of the entry {ENTRY}; {counts}. ")
     assert f"In the episode of seed {seed}, success_once says {not other}, run again it is {other}" in said
+    assert entry.agreement([made_up(seed - 1, other)]).startswith("no episode is compared with those of the entry")
 
 
 def test_an_entry_is_run_again_with_its_own_settings_unless_others_are_given(tmp_path, monkeypatch, caplog):
