@@ -31,7 +31,8 @@ class ManiFeelBenchmark(StepBenchmark):
     """Every episode of a task has one of its evaluation seeds, from 100000 on.
 
     A model gets `images` (cameras, and pads as `tactile_right`), `task_description`, `state` (the tool's pose) and `touch`, the
-    force fields in newtons by pad. It answers with `actions` in [-1, 1], as many as the task's controller takes.
+    force fields in newtons by pad. It answers with `actions` in [-1, 1], as many as the task's controller takes. Where other
+    tasks open and close the gripper, and this one does not, the last number is left out.
     """
 
     render_backends = frozenset({"gpu", "cpu"})
@@ -71,6 +72,8 @@ class ManiFeelBenchmark(StepBenchmark):
     def step(self, action: Action) -> StepResult:
         wanted = self.env.action_space.shape
         given = np.asarray(action["actions"], np.float32)
+        if self.has_gripper and given.shape == (wanted[0] + 1,):
+            given = given[:-1]  # this task's gripper is fixed, another one's is not
         if given.shape != wanted:
             raise ValueError(f"the model answered with actions of shape {given.shape}, the task takes {wanted}")
         obs, reward, terminated, truncated, info = self.env.step(np.clip(given, -1, 1))

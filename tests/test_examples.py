@@ -83,8 +83,12 @@ def test_a_pad_on_the_wrong_side_is_named(monkeypatch, caplog):
 
 
 @needs_renderer
-def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
-    """vla-eval's own loop, server and protocol; the model is a function that stands still and writes down what it is asked."""
+@pytest.mark.parametrize(("others", "actions"), [([], 6), (["ManiFeel-BallSorting-v1"], 7)])
+def test_vla_eval_scores_a_model_on_tasks(others, actions, monkeypatch):
+    """vla-eval's own loop, server and protocol; the model is a function that stands still and writes down what it is asked.
+
+    One model also answers tasks that take another number of actions.
+    """
     vla_eval = pytest.importorskip("vla_eval", reason="vla-eval is not installed")
     from vla_eval.model_servers.predict import PredictModelServer
     from vla_eval.specs import POSITION_DELTA
@@ -94,7 +98,7 @@ def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
     class StandStill(PredictModelServer):
         def predict(self, obs, ctx):
             asked.append(obs)
-            return {"actions": np.zeros(6, np.float32)}
+            return {"actions": np.zeros(actions, np.float32)}
 
         def get_action_spec(self):
             return {"position": POSITION_DELTA}
@@ -103,13 +107,13 @@ def test_vla_eval_scores_a_model_on_a_task(monkeypatch):
             return {}
 
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    params = dict(tasks=["ManiFeel-PegInsertion-v1"], obs_mode="rgb+tacrgb+tacff", env_kwargs=dict(max_episode_steps=3))
+    params = dict(tasks=[PEG, *others], obs_mode="rgb+tacrgb+tacff", env_kwargs=dict(max_episode_steps=3))
     benchmark = dict(benchmark="vla_eval_benchmark:ManiFeelBenchmark", episodes_per_task=2, params=params)
     (result,) = vla_eval.evaluate(StandStill(), dict(benchmarks=[benchmark]), no_save=True)
     assert result["mean_success"] == 0.0
-    (task,) = result["tasks"]
-    assert [episode["steps"] for episode in task["episodes"]] == [3, 3]
-    assert len(asked) == 6
+    for task in result["tasks"]:
+        assert [episode["steps"] for episode in task["episodes"]] == [3, 3]
+    assert len(asked) == 6 * len(result["tasks"]) == 6 + 6 * len(others)
     assert {name: image.shape for name, image in asked[0]["images"].items()} == dict(
         wrist=(256, 256, 3), tactile_right=(240, 320, 3)
     )

@@ -236,13 +236,15 @@ def _answer(ask: Callable[[], Any], step_timeout: float | None) -> Any:
 
 
 def _checked(action: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the policy's action as an array.
+    """Return the policy's action as an array of the task's shape.
+
+    It may have a leading dimension of 1, as a batch of one environment.
 
     Raises:
         PolicyFault: The task does not take the action.
     """
     try:
-        return checked_action(action, (shape,)).numpy()
+        return checked_action(action, (shape, (1, *shape))).numpy().reshape(shape)
     except InvalidArgumentError as error:
         raise PolicyFault(str(error)) from error
 

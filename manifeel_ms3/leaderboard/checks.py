@@ -3,6 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -63,15 +64,31 @@ def check(submission: Submission, to_take: bool = True) -> None:
 
 
 def submissions_on(board: Path) -> Iterator[Submission]:
-    """The submissions in a leaderboard's folder; a broken one is named in the log, and left out."""
+    """The submissions in a leaderboard's folder, without results of an earlier revision of their task.
+
+    Such results, and broken submissions, are named in the log.
+    """
     for folder in sorted(path for path in board.glob("*") if path.is_dir() and not path.name.startswith(".")):
         try:
-            submission = read_submission(folder)
+            submission = _without_outdated_results(read_submission(folder))
+            if not submission.results:
+                continue
             check(submission, to_take=False)
         except InvalidFileError as error:
             log.warning("left out: %s", " ".join(str(error).split()))
         else:
             yield submission
+
+
+def _without_outdated_results(submission: Submission) -> Submission:
+    """A submission without the results whose task has changed since; the log has how many these are."""
+    outdated: dict[Path, str] = {}
+    for path, result in submission.results.items():
+        if result["env_id"] in all_tasks() and (reason := other_revision(result["env_id"], result["revision"])):
+            outdated[path] = reason
+    for reason, count in Counter(outdated.values()).items():
+        log.warning("left out: %d results in %s: %s", count, quoted(submission.folder), reason.replace("it is", "they are", 1))
+    return replace(submission, results={path: one for path, one in submission.results.items() if path not in outdated})
 
 
 def check_is_new(submission: Submission, board: Path) -> None:

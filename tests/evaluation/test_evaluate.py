@@ -124,6 +124,11 @@ def test_a_wrong_number_of_actions_is_named(tmp_path):
     assert "shape (9,), the task takes (6,)" in result["episodes"][0]["error"]
 
 
+def test_a_policy_may_answer_as_a_batch_of_one_environment(tmp_path):
+    out = main(arguments_of("StandStill", tmp_path, policy_kwargs='{"size": [1, 6]}', episodes=1))
+    assert read_result(out)["episodes"][0]["error"] is None
+
+
 def test_the_command_says_how_many_episodes_the_policy_failed_by_an_error(tmp_path):
     out = tmp_path / "evaluation.json"
     failed("Raises", tmp_path)

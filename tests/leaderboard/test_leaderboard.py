@@ -238,6 +238,18 @@ def test_a_row_has_the_measures_of_the_episodes_of_its_success(tmp_path):
     assert row.floor == highest_floor(PEG, task_spec(PEG).revision)
 
 
+def test_results_of_an_earlier_revision_are_left_out_and_the_others_of_their_submission_stay(tmp_path, caplog):
+    folder = made_up(tmp_path / "ours", "Ours", "PegInsertion", "rgb", 10)
+    for path in (folder / "results/1").iterdir():
+        rewrite_json(path, lambda result: result.update(revision=1))
+    (row,) = rows_on(tmp_path)
+    assert row.results.success.shape == (1, 2, 50)
+    (message,) = caplog.messages
+    assert re.fullmatch(rf"left out: 2 results in .*ours: they are of revision 1 of {PEG}, but the task has .* here", message)
+    shutil.rmtree(folder / "results/0")
+    assert rows_on(tmp_path) == []
+
+
 def browsed(board: Path, address: str) -> str:
     """The html of the page after a browser has run its scripts."""
     command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=4000", "--dump-dom"]
