@@ -25,7 +25,7 @@ from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.errors import MachineError, WorkFailedError
 
 from . import cost
-from .checks import require_valid_environments, require_valid_flags
+from .checks import require_devices, require_valid_environments, require_valid_flags
 from .command_lines import shell_command
 from .jobs import FAILED, STARTED, Status, is_done, read_status, status_of
 from .planning import Job, jobs_of
@@ -96,6 +96,8 @@ def main(args: Args) -> None:
     if args.dry_run:
         console.print(plan(study, jobs, args.root))
         return
+    if args.address is None:
+        require_devices(jobs, args.root)
     errors = {}
     if not all(is_done(job, args.root) for job in jobs):
         try:

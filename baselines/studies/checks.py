@@ -6,6 +6,7 @@ from pathlib import Path
 
 from baselines.common.train_args import check_evaluation, check_run
 from manifeel_ms3.errors import InvalidArgumentError
+from manifeel_ms3.evaluation.policy import checked_device
 from manifeel_ms3.tasks.registry import make_env
 
 from .command_lines import training_args
@@ -39,6 +40,25 @@ def require_valid_flags(jobs: Iterable[Job]) -> None:
             ) from error
         except InvalidArgumentError as error:
             raise StudyError(f"{job.title}: {error}; correct `train` or `encoder_flags` in the study's file") from error
+
+
+def require_devices(jobs: Iterable[Job], root: Path) -> None:
+    """Check that this machine has the devices that the flags of trainings name, before the first job begins.
+
+    Args:
+        jobs: Every job of the study.
+        root: Folder of the output of all jobs.
+
+    Raises:
+        StudyError: A name is not that of a device.
+        MachineError: This machine does not have a device.
+    """
+    left = [job for job in jobs if job.kind == "train" and not is_done(job, root)]
+    for device in {str(job.settings["flags"]["device"]) for job in left if "device" in job.settings["flags"]}:
+        try:
+            checked_device(device)
+        except InvalidArgumentError as error:
+            raise StudyError(f"{error}, in `train` in the study's file") from error
 
 
 def require_valid_environments(jobs: Iterable[Job], root: Path) -> None:

@@ -11,6 +11,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.wrappers import CPUGymWrapper, FrameStack, RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.tasks.registry import make_env, task_spec
 
 Wrapper = Callable[[gym.Env], gym.Env]
@@ -45,10 +46,13 @@ def make_eval_envs(
         video_dir: Folder of videos of the first environment, or with "physx_cuda" of all of them beside each other; they need
             `render_mode="rgb_array"`. No videos if not given.
         wrappers: Wrappers that are applied first; they must be picklable on the CPU.
+
+    Raises:
+        InvalidArgumentError: Observations are to be stacked that are not flat.
     """
     env_id, kwargs = task_spec(env_id).env_id, env_kwargs or {}
     horizon = (other_kwargs or {}).get("obs_horizon")
-    wrappers = [*wrappers, *([partial(FrameStack, num_stack=horizon)] if horizon else [])]
+    wrappers = [*wrappers, *([partial(_stacked, num_stack=horizon)] if horizon else [])]
     if sim_backend == "physx_cpu":
         made = [
             partial(_make_on_cpu, env_id, kwargs, wrappers, str(video_dir) if video_dir and index == 0 else None)
@@ -61,6 +65,17 @@ def make_eval_envs(
     env = make_env(env_id, num_envs=num_envs, sim_backend=sim_backend, reconfiguration_freq=1, **kwargs)
     env = _wrapped(env, wrappers, video_dir and str(video_dir))
     return ManiSkillVectorEnv(env, ignore_terminations=True, record_metrics=True)
+
+
+def _stacked(env: gym.Env, num_stack: int) -> gym.Env:
+    space = env.observation_space
+    parts = space.spaces if isinstance(space, gym.spaces.Dict) else {}
+    if nested := [name for name, part in parts.items() if isinstance(part, gym.spaces.Dict)]:
+        raise InvalidArgumentError(
+            f"obs_horizon={num_stack}: ManiSkill's FrameStack takes flat observations, and {nested} are nested; give "
+            "wrappers=[FlattenVisuotactileObservationWrapper], from manifeel_ms3.wrappers"
+        )
+    return FrameStack(cast(Any, env), num_stack=num_stack)
 
 
 def _make_on_cpu(env_id: str, env_kwargs: dict[str, Any], wrappers: Sequence[Wrapper], video_dir: str | None) -> gym.Env:

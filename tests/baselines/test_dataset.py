@@ -1,6 +1,7 @@
 """The windows that policies learn from, and the files that they are read from."""
 
 import json
+import shutil
 import tracemalloc
 from pathlib import Path
 
@@ -53,6 +54,21 @@ def test_files_without_episodes_hide_no_others(demos, tmp_path):
     empty.with_suffix(".json").write_text(json.dumps(header | dict(episodes=[])))
     assert [len(read_episodes(files, PEG, SPEC, None)) for files in ([demos, empty, demos], [empty, demos])] == [4, 2]
     assert len(read_episodes([empty, demos, empty, demos], PEG, SPEC, 3)) == 3
+
+
+def test_episodes_that_do_not_succeed_are_counted_in_a_warning(tmp_path, caplog):
+    for file in (observed_sample(PEG), observed_sample(PEG).with_suffix(".json")):
+        shutil.copy(file, tmp_path)
+    path = tmp_path / observed_sample(PEG).name
+    read_episodes([path], PEG, SPEC, None)
+    assert not caplog.messages
+    header = json.loads(path.with_suffix(".json").read_text())
+    header["episodes"][1]["success"] = False
+    path.with_suffix(".json").write_text(json.dumps(header))
+    read_episodes([path], PEG, SPEC, 1)
+    assert not caplog.messages
+    read_episodes([path], PEG, SPEC, 2)
+    assert caplog.messages == [f"{path}: 1 of the first 2 episodes do not succeed"]
 
 
 def test_no_executed_action_is_padding():

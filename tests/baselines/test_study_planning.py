@@ -481,6 +481,17 @@ def test_what_a_machine_does_not_have_is_said(study, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("device", "error", "said"),
+    [("cuda:99", MachineError, "--device cuda:99 is not there"), ("gpu", StudyError, "--device 'gpu' is no device of torch")],
+)
+def test_a_device_that_is_not_there_is_said_before_the_first_job_begins(study, device, error, said, tmp_path):
+    study.write_text(TINY.replace("batch-size: 4", f"device: {device}"))
+    with pytest.raises(error, match=said):
+        study_command.main(study_command.Args(study, root=tmp_path / "root"))
+    assert not list(tmp_path.glob("root/*/*"))
+
+
+@pytest.mark.parametrize(
     ("address", "said"),
     [
         (None, "Ray, which runs the jobs, does not start (timed out during startup); give the same command again when"),

@@ -28,6 +28,7 @@ from manifeel_ms3.evaluation.policy import PolicyError, PolicyRequest, PolicySou
 from manifeel_ms3.evaluation.policy_process import PolicyProcess, SharedPolicy
 from manifeel_ms3.evaluation.rollout import PolicyFault, evaluate_episode
 from manifeel_ms3.evaluation.vector import make_eval_envs
+from manifeel_ms3.wrappers import FlattenVisuotactileObservationWrapper
 from tests.evaluation.batch_policies import (
     CRASHES,
     FINE,
@@ -412,6 +413,18 @@ def test_evaluation_environments_are_made_as_in_maniskills_baselines(num_envs):
     assert np.array_equal(obs[:, 0], obs[:, 1])
     assert not np.array_equal(after[:, 0], after[:, 1])
     assert info_after["elapsed_steps"].tolist() == [1] * num_envs
+
+
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_observations_of_touch_are_stacked_once_they_are_flat(num_envs):
+    kwargs = dict(obs_mode="tacff", render_backend="none", max_episode_steps=2)
+    stacked = dict(env_kwargs=kwargs, other_kwargs=dict(obs_horizon=2))
+    envs = make_eval_envs(PEG, num_envs, **stacked, wrappers=[FlattenVisuotactileObservationWrapper])
+    first, _ = envs.reset(seed=[1, 2][:num_envs])
+    envs.close()
+    assert {name: part.shape for name, part in first.items()} == dict(state=(num_envs, 2, 25), tacff=(num_envs, 2, 10, 14, 3))
+    with pytest.raises(InvalidArgumentError, match=r"obs_horizon=2: .* nested; give wrappers=\[FlattenVisuotactile"):
+        make_eval_envs(PEG, num_envs, **stacked)
 
 
 @needs_renderer

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import AsyncVectorEnv
 
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.evaluation.lerobot_env import GYM_ID, LeRobotEnv, make_env
@@ -72,6 +73,20 @@ def test_several_tasks_make_suites_of_vectorised_environments():
     assert envs.step(np.zeros(envs.action_space.shape))[4]["is_success"].tolist() == [False]
     for suite in suites.values():
         suite[0].close()
+
+
+def test_several_environments_of_a_task_have_processes_of_their_own_if_asked():
+    cfg = SimpleNamespace(task=PEG, obs_mode="tacff", env_kwargs=dict(render_backend="none", max_episode_steps=1))
+    envs = make_env(n_envs=2, use_async_envs=True, cfg=cfg)["insertion"][0]
+    assert isinstance(envs, AsyncVectorEnv)
+    assert len({process.pid for process in envs.processes}) == 2
+    obs, _ = envs.reset(seed=[100_000, 100_001])
+    assert not np.allclose(*obs["agent_pos"])
+    assert envs.call("task_description") == ("Insert the peg into the hole.",) * 2
+    *_, truncated, info = envs.step(np.zeros(envs.action_space.shape, np.float32))
+    assert truncated.tolist() == [True, True]
+    assert info["final_info"]["is_success"].tolist() == [False, False]
+    envs.close()
 
 
 def test_what_cannot_be_made_is_said():

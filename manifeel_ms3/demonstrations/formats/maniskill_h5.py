@@ -4,6 +4,7 @@ While a file is recorded, it is an index of links to the files of its episodes i
 like the finished file; `maniskill_h5_writing` has the two forms.
 """
 
+import logging
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from .demonstration_format import Demonstration, DemonstrationError, Demonstrati
 from .folder_checks import require_task
 from .h5_checks import check_trajectories
 
+log = logging.getLogger(__name__)
 COUNT = {"type": "integer", "minimum": 0, "maximum": 2**32 - 1}
 """Json schema of an episode's number, seed or length; numpy's and ManiSkill's seeds are 32 bits wide."""
 HEADER = {
@@ -248,6 +250,8 @@ def read_trajectories(
     header = read_header(path)
     require_task(path, about_task(header), env_id)
     entries = first_episodes(path, header, num)
+    if failures := sum(not entry["success"] for entry in entries):
+        log.warning("%s: %d of the first %d episodes do not succeed", path, failures, len(entries))
     with open_trajectories(path) as file:
         for entry in entries:
             group_of(file, entry)  # an episode that is missing is said before any is read
