@@ -27,6 +27,15 @@ def _form(spec: PolicySpec) -> Any:
 Args = reduce(or_, map(_form, all_policies().values()))
 
 
+ONLY_IN_MANISKILL = {
+    "--control-mode": "it is that of the demonstrations",
+    "--sim-backend": "it is that of the demonstrations",
+    "--demo-type": "nothing depends on it",
+    "--max-episode-steps": "it is the task's; --eval-env-kwargs '{\"max_episode_steps\": 300}' gives another to evaluations",
+}
+"""Flags of the scripts of ManiSkill's baselines that training does not take, and why."""
+
+
 def check_arguments(arguments: list[str]) -> None:
     """Check that the command begins with the names of a policy and a preset; tyro would list the flags of all presets instead.
 
@@ -34,7 +43,8 @@ def check_arguments(arguments: list[str]) -> None:
         arguments: The command line after `manifeel train`.
 
     Raises:
-        InvalidArgumentError: The name of the policy or of the preset is missing or misspelt.
+        InvalidArgumentError: The name of the policy or of the preset is missing or misspelt, or a flag is one that only
+            ManiSkill's scripts have.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
     if {"-h", "--help"} & set(arguments) or policy.startswith("__tyro"):
@@ -45,6 +55,12 @@ def check_arguments(arguments: list[str]) -> None:
             f"{meant(policy, all_policies())}"
         )
     if preset in spec.presets:
+        for argument in arguments:
+            name = argument.partition("=")[0].replace("_", "-")
+            if name in ONLY_IN_MANISKILL:
+                raise InvalidArgumentError(
+                    f"{name} is a flag of ManiSkill's baselines; leave it out: {ONLY_IN_MANISKILL[name]}"
+                )
         return
     choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
     wrong = f"has no preset {preset!r}" if preset.strip("_") == preset != "" else "needs the name of a preset before its flags"

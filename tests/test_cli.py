@@ -381,6 +381,13 @@ def test_a_shell_can_complete_commands_and_flags(shell, capsys):
         assert word in said, word
 
 
+@pytest.mark.parametrize("flag", ["--control-mode", "--sim_backend", "--max_episode_steps=300", "--demo_type"])
+def test_a_flag_that_only_maniskills_scripts_have_is_explained(flag, capsys):
+    assert cli.main(["train", "diffusion_policy", "cpu", "--demo-path", "x.h5", flag, "y"]) == 1
+    name = flag.partition("=")[0].replace("_", "-")
+    assert capsys.readouterr().err.startswith(f"error: {name} is a flag of ManiSkill's baselines; leave it out: ")
+
+
 def test_a_misspelt_task_or_preset_is_named_with_the_nearest(capsys):
     for typed in ("PegInsertoin", "peginsertion", "ManiFeel-PegInsertoin-v1"):
         assert cli.main(["tasks", typed]) == 1
