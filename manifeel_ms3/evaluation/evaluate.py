@@ -276,7 +276,7 @@ def evaluation_from_args(args: Args) -> Evaluation:
         raise InvalidArgumentError("a --policy of your own needs --env-id and --obs-mode")
     if unused := [name for name in ("device", "batch_size", INFERENCE_STEPS) if getattr(args, name) is not None]:
         raise InvalidArgumentError(
-            f"{_flags(unused)} are for a --checkpoint; give them to a --policy of your own by --policy-kwargs"
+            f"only a --checkpoint takes {_flags(unused)}; --policy-kwargs gives arguments to a --policy of your own"
         )
     env_id = task_spec(args.env_id).env_id
     check_obs_mode("--env-kwargs", given, args.obs_mode)

@@ -311,7 +311,7 @@ def test_a_device_that_is_not_there_is_named_before_anything_starts(checkpoint, 
         evaluation_from_args(Args(folder, device="toaster"))
     with pytest.raises(ValueError, match="--batch-size 0 is less than 1"):
         evaluation_from_args(Args(folder, batch_size=0))
-    with pytest.raises(ValueError, match="--device are for a --checkpoint"):
+    with pytest.raises(ValueError, match="only a --checkpoint takes --device"):
         evaluation_from_args(Args(policy="a:B", env_id=PEG, obs_mode="tacff", device="cpu"))
 
 

@@ -182,7 +182,7 @@ def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
         (dict(), "either --checkpoint, or --policy"),
         (dict(policy="a:B"), "--env-id"),
         (dict(policy="a:B", env_id=PEG, obs_mode="rgb", episodes=2, videos=(2,)), "the episodes are 0 to 1"),
-        (dict(policy="a:B", env_id=PEG, obs_mode="rgb", inference_steps=4), "--inference-steps are for a --checkpoint"),
+        (dict(policy="a:B", env_id=PEG, obs_mode="rgb", inference_steps=4), "only a --checkpoint takes --inference-steps"),
         (
             dict(checkpoint=Path("x"), policy_kwargs='{"inference_steps": 4, "device": "cpu"}'),
             "of a --checkpoint have flags of their own: --device and --inference-steps",
