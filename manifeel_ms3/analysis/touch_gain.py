@@ -68,7 +68,7 @@ def audited(page: Path) -> dict[str, list[str]]:
         if tuple(head) == COLUMNS_OF_TABLE:
             for task, question, chance, *scores in rows:
                 cells = (f"{name} {shown(score)}" for name, score in zip(head[3:], scores, strict=True))
-                found.setdefault(task, []).append(f"{shown(question)}: {', '.join(cells)}; chance {shown(chance)}")
+                found.setdefault(task, []).append(f'"{shown(question)}": {", ".join(cells)}, chance {shown(chance)}')
     if not found:
         raise InvalidArgumentError(f"--audit {page}: no table of `manifeel audit` is there; give the audit.md that it wrote")
     return found
@@ -142,7 +142,7 @@ def _of_a_task(task: str, found: Found, results: dict[Condition, Results], audit
     of_settings = of_table_one(task, found).items()
     compared = [(settings, of_mode) for settings, of_mode in of_settings if VISION in of_mode and len(of_mode) > 1]
     if compared and audit:
-        yield f"**{task}**, what one moment reveals: {'. '.join(audit)}.\n"
+        yield f"**{task}**, what one moment reveals: {'; '.join(audit)}.\n"
     for settings, conditions in compared:
         gains = "; ".join(_gain(task, mode, conditions, found) for mode in conditions if mode != VISION)
         ends = " ".join(_endings(mode, results[condition]) for mode, condition in conditions.items())

@@ -127,8 +127,8 @@ def test_what_the_audit_found_stands_beside_what_touch_adds(tmp_path):
     for mode, rate in ((VISION, 0.2), (TACFF, 0.5)):
         write_run(tmp_path, mode, rate)
     page = results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md", audit)).read_text().replace("\\", "")
-    scores = "camera 67% [63, 72] (wrist), TacRGB 75% [63, 72], TacFF 83% [63, 72]; chance 50%"
-    assert f"\n**PegInsertion**, what one moment reveals: peg touches or not: {scores}.\n" in page
+    scores = "camera 67% [63, 72] (wrist), TacRGB 75% [63, 72], TacFF 83% [63, 72], chance 50%"
+    assert f'\n**PegInsertion**, what one moment reveals: "peg touches or not": {scores}.\n' in page
 
 
 def test_a_page_without_an_audit_is_refused_before_the_results_page_is_written(tmp_path):
