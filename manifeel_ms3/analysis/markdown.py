@@ -28,7 +28,7 @@ def markdown_tables(text: str) -> Iterator[list[list[str]]]:
     Args:
         text: Content of the page.
     """
-    for block in re.findall(r"(?:^\|.*\|\n)+", text, flags=re.MULTILINE):
+    for block in re.findall(r"(?:^\|.*\|\n){2,}", text, flags=re.MULTILINE):
         head, _, *rows = ([cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines())
         yield [head, *rows]
 

@@ -62,11 +62,11 @@ def audited(page: Path) -> dict[str, list[str]]:
     Raises:
         InvalidArgumentError: There is no such page, or it does not hold that table.
     """
-    text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    text = page.read_text(encoding="utf-8", errors="replace") if page.is_file() else ""
     found: dict[str, list[str]] = {}
     for head, *rows in markdown_tables(text):
         if tuple(head) == COLUMNS_OF_TABLE:
-            for task, question, chance, *scores in rows:
+            for task, question, chance, *scores in (row for row in rows if len(row) == len(head)):
                 cells = (f"{name} {shown(score)}" for name, score in zip(head[3:], scores, strict=True))
                 found.setdefault(task, []).append(f'"{shown(question)}": {", ".join(cells)}, chance {shown(chance)}')
     if not found:

@@ -133,8 +133,11 @@ def test_what_the_audit_found_stands_beside_what_touch_adds(tmp_path):
 
 def test_a_page_without_an_audit_is_refused_before_the_results_page_is_written(tmp_path):
     write_run(tmp_path, VISION, 0.2)
-    for audit in (tmp_path / "audit.md", tmp_path / "other.md"):
-        (tmp_path / "other.md").write_text("| task |\n| --- |\n| PegInsertion |\n")
+    (tmp_path / "other.md").write_text("| task |\n| --- |\n| PegInsertion |\n")
+    (tmp_path / "line.md").write_text("| one line |\n")
+    (tmp_path / "cut.md").write_text(audit_table([]) + "| PegInsertion | peg touches or not |\n")
+    (tmp_path / "binary.md").write_bytes(b"\xff\xfe\n")
+    for audit in (tmp_path / f"{name}.md" for name in ("missing", "other", "line", "cut", "binary")):
         with pytest.raises(InvalidArgumentError, match=f"{audit.name}: no table of `manifeel audit` is there"):
             results_page.main(results_page.Args((tmp_path,), tmp_path / "results.md", audit))
     assert not (tmp_path / "results.md").exists()
