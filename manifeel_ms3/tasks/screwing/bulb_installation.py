@@ -51,7 +51,7 @@ class BulbRandomization(ScrewingRandomization):
     paper_demos=20,
     paper_tables=("I", "II"),
     demo_megabytes=120.0,
-    demo_steps=414,
+    demo_steps=418,
     revision=5,
     force_limit=35.0,
     start_control_modes={"holder": IN_HOLDER_CONTROL_MODE},
