@@ -17,6 +17,7 @@ from manifeel_ms3.errors import PluginError, UnknownNameError
 from . import tactile_representations as tactile_representations  # registers its encoders for every policy
 from .common.agent import PolicyAgent
 from .common.policy import VisuotactilePolicy
+from .common.presets import in_epochs, with_noisy_pose, with_targets
 from .common.train_args import TrainArgs
 
 
@@ -28,6 +29,26 @@ class Preset:
     """What the settings are for, in a few words."""
     args: TrainArgs
     """The settings."""
+
+
+def small_presets(cpu: TrainArgs) -> dict[str, Preset]:
+    """The presets of small networks, by name.
+
+    Args:
+        cpu: Settings of the preset `cpu`, from which the others follow.
+    """
+    longer = in_epochs(cpu)
+    return {
+        "cpu": Preset("A small network that learns on a CPU core in minutes.", cpu),
+        "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", longer),
+        "cpu_targets": Preset(
+            "The preset `cpu_long`, with the hand's pose predicted instead of motions.", with_targets(longer)
+        ),
+        "cpu_noisy_pose": Preset(
+            "The preset `cpu_targets`, with 8,000 gradient steps and ten times the noise on the pose.",
+            with_noisy_pose(with_targets(cpu)),
+        ),
+    }
 
 
 @dataclass(frozen=True)

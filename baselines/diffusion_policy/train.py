@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from baselines.common.encoders import IMAGE_ENCODERS
-from baselines.common.presets import for_cpu, in_epochs, with_noisy_pose, with_targets
+from baselines.common.presets import for_cpu
 from baselines.common.train_args import PUBLIC_CODE_LR, TrainArgs
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
-from baselines.registry import PolicySpec, Preset, next_step, preset_cli
+from baselines.registry import PolicySpec, Preset, next_step, preset_cli, small_presets
 from manifeel_ms3.command_line import run
 
 LR = 8e-5
@@ -39,15 +39,7 @@ CPU = for_cpu(Args(demos=()), inference_steps=8, prediction="sample")
 """Settings of the preset `cpu`, from which those of the other small presets follow."""
 PRESETS = {
     "paper": Preset("The settings of the paper's public code.", Args(demos=())),
-    "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
-    "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
-    "cpu_targets": Preset(
-        "The preset `cpu_long`, with the hand's pose predicted instead of motions.", with_targets(in_epochs(CPU))
-    ),
-    "cpu_noisy_pose": Preset(
-        "The preset `cpu_targets`, with 8,000 gradient steps and ten times the noise on the pose.",
-        with_noisy_pose(with_targets(CPU)),
-    ),
+    **small_presets(CPU),
 }
 
 SPEC = PolicySpec(DiffusionPolicy, Args, PRESETS)

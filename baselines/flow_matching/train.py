@@ -12,10 +12,10 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from baselines.common.presets import for_cpu, in_epochs, with_noisy_pose, with_targets
+from baselines.common.presets import for_cpu
 from baselines.common.train_args import TrainArgs
 from baselines.flow_matching.policy import FlowConfig, FlowMatchingPolicy
-from baselines.registry import PolicySpec, Preset, next_step, preset_cli
+from baselines.registry import PolicySpec, Preset, next_step, preset_cli, small_presets
 from manifeel_ms3.command_line import run
 
 
@@ -36,15 +36,7 @@ PRESETS = {
         "Consistency training, for generation in one step.",
         Args(demos=(), policy=FlowConfig(consistency=True), inference_steps=1),
     ),
-    "cpu": Preset("A small network that learns on a CPU core in minutes.", CPU),
-    "cpu_long": Preset("The preset `cpu`, for longer on long tasks, and with less noise on the pose.", in_epochs(CPU)),
-    "cpu_targets": Preset(
-        "The preset `cpu_long`, with the hand's pose predicted instead of motions.", with_targets(in_epochs(CPU))
-    ),
-    "cpu_noisy_pose": Preset(
-        "The preset `cpu_targets`, with 8,000 gradient steps and ten times the noise on the pose.",
-        with_noisy_pose(with_targets(CPU)),
-    ),
+    **small_presets(CPU),
 }
 
 SPEC = PolicySpec(FlowMatchingPolicy, Args, PRESETS)

@@ -25,13 +25,14 @@ import tyro
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.demonstrations.formats.maniskill_h5 import DemonstrationError, group_of, open_trajectories, read_header
 from manifeel_ms3.demonstrations.recording import observed_file
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.files import write_json, write_text
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import TaskSpec, all_tasks, short_name, task_spec
 
 from .estimates import TAILS
 from .figures import save_figure
-from .markdown import markdown_table
+from .markdown import markdown_table, markdown_tables, shown
 from .probes import EpisodeGroup, Probe
 
 log = logging.getLogger(__name__)
@@ -286,6 +287,27 @@ def _suffix(result: ProbeResult) -> str:
 
 def _by_question(results: list[ProbeResult]) -> Iterator[list[ProbeResult]]:
     return (results[k : k + len(MODALITIES)] for k in range(0, len(results), len(MODALITIES)))
+
+
+def audited(page: Path) -> dict[str, list[str]]:
+    """What the information audit found, by the names of tasks: for each question, the score of each kind of observation.
+
+    Args:
+        page: Markdown page that holds the table of `manifeel audit`.
+
+    Raises:
+        InvalidArgumentError: There is no such page, or it does not hold that table.
+    """
+    text = page.read_text(encoding="utf-8", errors="replace") if page.is_file() else ""
+    found: dict[str, list[str]] = {}
+    for head, *rows in markdown_tables(text):
+        if tuple(head) == COLUMNS_OF_TABLE:
+            for task, question, chance, *scores in (row for row in rows if len(row) == len(head)):
+                cells = (f"{name} {shown(score)}" for name, score in zip(head[3:], scores, strict=True))
+                found.setdefault(task, []).append(f'"{shown(question)}": {", ".join(cells)}, chance {shown(chance)}')
+    if not found:
+        raise InvalidArgumentError(f"--audit {page}: no table of `manifeel audit` is there; give the audit.md that it wrote")
+    return found
 
 
 def draw_figure(results: list[ProbeResult], path: Path) -> None:

@@ -31,6 +31,7 @@ from .episode_endings import census_table
 from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force, gentle_cell
+from .information_audit import audited
 from .markdown import markdown_table, shown
 from .matching import Found
 from .paper_comparison import gpu_of_training, runtime_table, similarity_table
@@ -39,7 +40,7 @@ from .presets import FULLEST, training_settings_of
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
 from .success_curves import DPI, PANEL, write_curves
-from .touch_gain import audited, touch_gains
+from .touch_gain import touch_gains
 
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""

@@ -2,20 +2,17 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.gentle import is_gentle
 from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition, by_condition
 from .episode_endings import Results, endings_of
 from .estimates import SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
-from .information_audit import COLUMNS_OF_TABLE
-from .markdown import markdown_table, markdown_tables, shown
+from .markdown import markdown_table, shown
 from .matching import Found, answering, of_table_one
 from .paper import DP, MODES, TABLE_I, TABLE_II, VISION, Rate, paper_condition, tasks_in_table
 from .presets import TrainingSettings
@@ -27,12 +24,12 @@ TEXT = """
 Changes are in percentage points against vision alone on the same initial states, with 95 % intervals. Where a condition has
 fewer than three training seeds, the interval covers the initial states only and says nothing about how much training varies.
 Each change is tested alone, without a correction for their number, and contradicts the paper's where that lies outside of its
-interval.
-How an episode fails is determined by a rule of its task.
+interval. How an episode fails is determined by a rule of its task.
 
 """
-AUDIT_TEXT = """Above the changes of a task stands what probes could tell from one moment of its demonstrations, by camera and
-touch ([audit](audit.md)): the share of right answers or the error, each with its 95 % interval, and the score by chance.
+AUDIT_TEXT = """Above the changes of a task stands what probes could tell from one moment of its demonstrations, by
+camera and touch ([audit](audit.md)): the share of right answers or the error, each with its 95 % interval, and the score by
+chance.
 
 """
 MEANS_TEXT = """
@@ -53,34 +50,13 @@ NAMES: dict[str, str] = dict(zip(MODES, ("vision alone", "TacRGB", "TacFF"), str
 """Names of the observation modes in the text."""
 
 
-def audited(page: Path) -> dict[str, list[str]]:
-    """What the information audit found, by the names of tasks: for each question, the score of each kind of observation.
-
-    Args:
-        page: Markdown page that holds the table of `manifeel audit`.
-
-    Raises:
-        InvalidArgumentError: There is no such page, or it does not hold that table.
-    """
-    text = page.read_text(encoding="utf-8", errors="replace") if page.is_file() else ""
-    found: dict[str, list[str]] = {}
-    for head, *rows in markdown_tables(text):
-        if tuple(head) == COLUMNS_OF_TABLE:
-            for task, question, chance, *scores in (row for row in rows if len(row) == len(head)):
-                cells = (f"{name} {shown(score)}" for name, score in zip(head[3:], scores, strict=True))
-                found.setdefault(task, []).append(f'"{shown(question)}": {", ".join(cells)}, chance {shown(chance)}')
-    if not found:
-        raise InvalidArgumentError(f"--audit {page}: no table of `manifeel audit` is there; give the audit.md that it wrote")
-    return found
-
-
 def touch_gains(found: Found, results: list[dict[str, Any]], audit: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Markdown, part by part; nothing if no task was run both with and without touch.
 
     Args:
         found: The results that enter comparisons.
         results: Contents of result files.
-        audit: What the information audit found, by the names of tasks; see `audited`.
+        audit: What the information audit found, by the names of tasks.
     """
     of_condition = by_condition(results)
     tasks = dict.fromkeys((*TABLE_I, *TABLE_II))  # Table II adds sorting in normal light

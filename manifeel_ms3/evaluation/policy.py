@@ -35,7 +35,7 @@ class Policy(Protocol):
         ...
 
     def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """Action (A,) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
+        """Action (A,) or (1, A) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
         ...
 
 
@@ -65,7 +65,7 @@ class EpisodePolicy(ABC):
 
     @abstractmethod
     def act(self, obs: dict[str, Any]) -> np.ndarray:
-        """Action (A,) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
+        """Action (A,) or (1, A) in the task's action space for its observation (`num_envs=1`, tensors with a leading 1)."""
 
 
 class PolicyOfPart(EpisodePolicy):

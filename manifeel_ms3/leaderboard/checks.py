@@ -84,10 +84,11 @@ def _without_outdated_results(submission: Submission) -> Submission:
     """A submission without the results whose task has changed since; the log has how many these are."""
     outdated: dict[Path, str] = {}
     for path, result in submission.results.items():
-        if result["env_id"] in all_tasks() and (reason := other_revision(result["env_id"], result["revision"])):
+        env_id = result["env_id"]
+        if env_id in all_tasks() and (reason := other_revision(env_id, result["revision"], "they are")):
             outdated[path] = reason
     for reason, count in Counter(outdated.values()).items():
-        log.warning("left out: %d results in %s: %s", count, quoted(submission.folder), reason.replace("it is", "they are", 1))
+        log.warning("left out: %d results in %s: %s", count, quoted(submission.folder), reason)
     return replace(submission, results={path: one for path, one in submission.results.items() if path not in outdated})
 
 

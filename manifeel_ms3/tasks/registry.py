@@ -160,12 +160,13 @@ def register_demonstrator(*env_ids: str) -> Callable[[Demonstrator], Demonstrato
     return attach
 
 
-def other_revision(env_id: str, revision: int | None) -> str:
+def other_revision(env_id: str, revision: int | None, subject: str = "it is") -> str:
     """The beginning of an error about what was made of another revision of a task than the present one; "" if it was not.
 
     Args:
         env_id: Id of the task.
         revision: Revision of the task at that time; None if that is not known, which passes.
+        subject: Subject and verb of the sentence.
 
     Raises:
         UnknownNameError: The task is not registered.
@@ -173,7 +174,7 @@ def other_revision(env_id: str, revision: int | None) -> str:
     here = task_spec(env_id).revision
     if revision in (None, here):
         return ""
-    return f"it is of revision {revision} of {env_id}, but the task has revision {here} here"
+    return f"{subject} of revision {revision} of {env_id}, but the task has revision {here} here"
 
 
 def task_spec(env_id: str) -> TaskSpec:
