@@ -66,7 +66,8 @@ docs: $(READY)
 	$(PYTHON) -m mkdocs build --quiet --strict --site-dir runs/site
 
 results: $(READY)
-	$(PYTHON) -m manifeel_ms3.analysis.results_page --results leaderboard/cpu* docs/cpu* --audit docs/audit.md --out docs/results.md
+	$(PYTHON) -m manifeel_ms3.analysis.results_page --results leaderboard/cpu* docs/cpu* --audit docs/audit.md \
+		--study configs/tables_cpu.yaml --out docs/results.md
 	$(PYTHON) -m docs.make_readme_results
 	$(PYTHON) -m docs.make_fidelity
 	$(PYTHON) -m docs.make_task_cards

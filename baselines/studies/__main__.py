@@ -28,7 +28,7 @@ from . import cost
 from .checks import require_devices, require_valid_environments, require_valid_flags
 from .command_lines import shell_command
 from .jobs import FAILED, STARTED, Status, is_done, read_status, status_of
-from .planning import Job, jobs_of
+from .planning import Job, jobs_of, only
 from .publish import publish
 from .running import run_jobs
 from .study import KINDS, Kind, Resources, Study, read_study
@@ -50,6 +50,9 @@ class Args:
     """Folder of the output of all jobs. Studies can share it: a job that two studies have in common is done once."""
     address: str | None = None
     """Address of a Ray cluster; this machine if not given."""
+    only: tuple[str, ...] = ()
+    """Names of rows of the plan, as `--dry-run` prints them, such as "PegInsertion, diffusion_policy, cpu, rgb, wrist, 50
+    demonstrations": only their jobs are done, and those that they need. All rows if not given."""
     dry_run: bool = False
     """Print the plan and the hours that it will take, without running it."""
     publish: Path | None = None
@@ -73,12 +76,14 @@ def main(args: Args) -> None:
 
     Raises:
         StudyError: The study's file cannot be used.
+        UnknownNameError: The study has no row of one of the names in `only`.
         InvalidArgumentError: Two settings of a training contradict each other.
         MachineError: The study asks for more than the machine has, or the folder of the jobs cannot be written.
         StudyFailed: Some jobs failed; the others are done.
     """
     study = read_study(args.study)
     jobs = jobs_of(study)
+    jobs = only(jobs, args.only) if args.only else jobs
     require_valid_flags(jobs)
     console = Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
     if args.print_commands:
@@ -191,7 +196,7 @@ def plan(study: Study, jobs: list[Job], root: Path) -> Table:
     table = Table("job", "what", "to do", "CPU hours", "GPU hours", "known from", title=study.name)
     groups: dict[tuple[Kind, str], list[Job]] = {}
     for job in sorted(jobs, key=lambda job: KINDS.index(job.kind)):
-        groups.setdefault((job.kind, job.title.partition(", seed")[0]), []).append(job)
+        groups.setdefault((job.kind, job.row), []).append(job)
     cpu = gpu = 0.0
     for (kind, title), group in track(groups.items(), "measuring", transient=True):
         needs = study.resources[kind]

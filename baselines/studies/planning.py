@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import version
@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from baselines.registry import policy_spec
+from manifeel_ms3.analysis.condition import listed, study_row
+from manifeel_ms3.arguments import meant
 from manifeel_ms3.command_line import PACKAGE
+from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import short_name, task_spec
 
@@ -19,6 +22,8 @@ from .study import Grid, Kind, Study
 
 OF_THE_MACHINE = ("device", "precision", "compile")
 """Settings of a preset that depend on the machine on which it is read."""
+SEED = ", seed "
+"""What stands before the training seed in the title of a job."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,11 @@ class Job:
         content = json.dumps([self.kind, self.settings, [job.key for job in self.needs]], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
+    @property
+    def row(self) -> str:
+        """Name of the job's row in the plan, which it shares with the jobs that differ from it in their seed."""
+        return self.title.partition(SEED)[0]
+
     def folder(self, root: Path) -> Path:
         """Folder of the job's output and of the files that hold its status."""
         return root / self.kind / self.key
@@ -56,6 +66,24 @@ def jobs_of(study: Study) -> list[Job]:
             for job in _with_needs(evaluate):
                 jobs.setdefault(job.key, job)
     return list(jobs.values())
+
+
+def only(jobs: list[Job], rows: Sequence[str]) -> list[Job]:
+    """The jobs of some rows of a plan, and those that they need.
+
+    Args:
+        jobs: All jobs of a study.
+        rows: Names of rows.
+
+    Raises:
+        UnknownNameError: The study has no row of one of these names.
+    """
+    known = {job.row for job in jobs}
+    for row in rows:
+        if row not in known:
+            raise UnknownNameError(f"no row of the study is named {row!r}{meant(row, known)}; --dry-run lists all rows")
+    needed = {job.key for chosen in jobs if chosen.row in rows for job in _with_needs(chosen)}
+    return [job for job in jobs if job.key in needed]
 
 
 def _with_needs(job: Job) -> Iterator[Job]:
@@ -78,13 +106,18 @@ def _evaluations(grid: Grid) -> Iterator[Job]:
         settings["half_precision"] = grid.half_precision
         for further in grid.evaluation_args:
             env_kwargs = json.dumps(grid.task_args | further, sort_keys=True)
-            title = ", ".join((train.title, json.dumps(further))) if further else train.title
+            title = listed(train.title, json.dumps(further) if further else "")
             yield Job("evaluate", title, settings | dict(env_kwargs=env_kwargs, version=version(PACKAGE)), (train,))
 
 
 def _recording(task: str, count: int, camera: str, env_kwargs: str) -> Job:
     settings = dict(env_id=task, num=count, camera=camera, env_kwargs=env_kwargs, revision=task_spec(task).revision)
-    return Job("record", f"{short_name(task)}, {count} demonstrations, {camera}", settings)
+    return Job("record", listed(short_name(task), _variant(env_kwargs), camera, f"{count} demonstrations"), settings)
+
+
+def _variant(env_kwargs: str) -> str:
+    """Arguments of a task as json, or "" if there are none."""
+    return "" if env_kwargs == "{}" else env_kwargs
 
 
 def _pretraining(encoder: str, task: str) -> Job:
@@ -102,12 +135,13 @@ def _training(grid: Grid, record: Job, policy: str, mode: str, encoder: str, num
         flags["num-demos"] = num_demos
     if encoder:
         flags |= {"policy.encoder.tacrgb": encoder} | grid.encoder_flags.get(encoder, {})
-    demonstrations = f"{num_demos} demonstrations" if some else ""
-    title = ", ".join(filter(None, (short_name(task), policy, mode, encoder, camera, demonstrations, f"seed {seed}")))
+    count = num_demos if some else record.settings["num"]
+    variant = _variant(record.settings["env_kwargs"])
+    row = study_row(short_name(task), variant, policy, grid.preset, mode, encoder, camera, count)
     recipe = _hash_of_preset(policy, grid.preset)
     settings = dict(policy=policy, preset=grid.preset, recipe=recipe, flags=flags, version=version(PACKAGE))
     pretrained = (_pretraining(encoder, grid.pretrain[encoder]),) if encoder in grid.pretrain else ()
-    return Job("train", title, settings, (record, *pretrained))
+    return Job("train", f"{row}{SEED}{seed}", settings, (record, *pretrained))
 
 
 @cache

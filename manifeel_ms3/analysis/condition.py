@@ -104,8 +104,30 @@ class Condition:
 
     def __str__(self) -> str:
         demos = f"{self.num_demos} demonstrations" if self.num_demos else ""
-        what = (self.task, self.variant, self.sensing, self.policy, self.encoder, demos)
-        return f"{', '.join(filter(None, what))} ({self.key})"
+        return f"{listed(self.task, self.variant, self.sensing, self.policy, self.encoder, demos)} ({self.key})"
+
+
+def listed(*parts: str) -> str:
+    """The parts that are not empty, separated by commas."""
+    return ", ".join(filter(None, parts))
+
+
+def study_row(
+    task: str, variant: str, policy: str, preset: str, obs_mode: str, encoder: str, camera: str, num_demos: int | None
+) -> str:
+    """Name of a row of a study: of the training runs, and their evaluations, that differ only in their seed.
+
+    Args:
+        task: Short name of the task.
+        variant: Arguments of the task other than its defaults, as json; "" if there are none.
+        policy: Registered name of the policy.
+        preset: Name of the policy's preset.
+        obs_mode: Observation mode.
+        encoder: Encoder of TacRGB; "" for the preset's own.
+        camera: The camera that the policy observes.
+        num_demos: Number of demonstrations.
+    """
+    return listed(task, variant, policy, preset, obs_mode, encoder, camera, f"{num_demos} demonstrations")
 
 
 def condition_of(result: dict[str, Any]) -> Condition:

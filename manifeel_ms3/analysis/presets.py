@@ -10,7 +10,7 @@ from manifeel_ms3 import plugins
 from manifeel_ms3.errors import UnknownNameError
 from manifeel_ms3.nested_settings import as_json
 
-from .condition import ENCODER, Condition, Settings, settings_of
+from .condition import ENCODER, Condition, Settings, settings_of, study_row
 from .markdown import shown
 
 PAPER = "paper"
@@ -71,6 +71,24 @@ def training_settings_of(condition: Condition) -> TrainingSettings:
         return TrainingSettings("", condition.settings)
     nearest = min(changes, key=lambda name: len(changes[name]))
     return TrainingSettings(nearest, changes[nearest])
+
+
+def row_in_a_study(condition: Condition) -> str | None:
+    """Name of the row of a study that makes results of a condition (`study_row`); None if its settings are not a preset's."""
+    training = training_settings_of(condition)
+    if not training.preset or training.changes:
+        return None
+    encoder = "" if has_presets_encoder(condition) else condition.encoder
+    return study_row(
+        condition.task,
+        condition.variant,
+        condition.policy,
+        training.preset,
+        condition.obs_mode,
+        encoder,
+        ", ".join(condition.cameras),
+        condition.num_demos,
+    )
 
 
 def has_presets_encoder(condition: Condition) -> bool:

@@ -13,38 +13,37 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import tyro
 
 from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import missing_extras_named, run
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, checkpoint_config
-from manifeel_ms3.evaluation.floors import POLICIES, floors_of, highest_floor
-from manifeel_ms3.evaluation.result import ResultError, results_in, successes_by_the_paper
+from manifeel_ms3.evaluation.floors import POLICIES, floors_of
+from manifeel_ms3.evaluation.result import ResultError, results_in
 from manifeel_ms3.files import read_json_lines, write_text
 from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
 from manifeel_ms3.tasks.registry import all_tasks
 
 from .claims import claims_page, results_of_claims
-from .condition import Condition, by_condition, condition_of
+from .condition import Condition, condition_of
 from .episode_endings import census_table
 from .estimates import difference, p_text
 from .figures import save_figure
-from .gentle_success import draw_success_under_force, gentle_cell
+from .gentle_success import draw_success_under_force
 from .information_audit import audited
 from .markdown import markdown_table, shown
 from .matching import Found
-from .paper_comparison import gpu_of_training, runtime_table, similarity_table
-from .paper_tables import Files, draw_sensing_by_task, success_with_links, tables_of_the_paper
-from .presets import FULLEST, training_settings_of
+from .paper_comparison import runtime_table, similarity_table
+from .paper_tables import Files, draw_sensing_by_task, tables_of_the_paper
+from .presets import FULLEST
 from .protocol import FEWEST_EPISODES, FEWEST_STEPS, LAST, ConditionResults, collect, in_order_of_seeds, of_the_protocol
 from .rank_agreement import rank_table
+from .run_table import in_order, table_of_runs, task_with_revision
 from .success_curves import DPI, PANEL, write_curves
 from .touch_gain import touch_gains
 
 REFERENCES = ("MeanAction", "Untrained")
 """Names of the policies of `baselines.references`, which have learnt nothing."""
-SECONDS_PER_HOUR = 3600
 IMAGES = "images"
 """Name of the folder beside the page that holds its figures."""
 LEGEND_SIZE = 7
@@ -73,11 +72,6 @@ Success in the tasks of the paper's Table I by what the policy senses; the prese
 of {presets} with which all sensings were run with as many training seeds as with any other. The thin lines are 95 % intervals,
 which cover the variation over training only in tasks with several training seeds. Black lines are the paper's rates, which
 come from a benchmark that differs in places ([fidelity](fidelity.md)); the tables below have the numbers.
-"""
-AGAIN = """
-The success rate of each run links to its result file. Where a folder `checkpoints` lies beside that file in
-`leaderboard/NAME/seed0`, `manifeel eval --entry NAME` runs its episodes again and reports in how many the outcomes agree.
-`manifeel study configs/tables_cpu.yaml` produces all results of the small networks.
 """
 CURVES = """
 ![Success over the samples seen in training]({figure})
@@ -128,6 +122,8 @@ class Args:
     """Path of the Markdown page; its figures and their table go into the folder images beside it."""
     audit: Path | None = None
     """Page with the table that `manifeel audit` wrote, which then stands beside what touch adds to success."""
+    study: Path | None = None
+    """File of the study that makes the results, which the page then names beside the row of each."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +156,8 @@ def main(args: Args) -> Path:
     collected = collect(by_file)
     figures = _draw(args, by_file, of_the_protocol(collected))
     similarities = sorted(path for folder in args.results for path in folder.rglob("similarity.json"))
-    write_text(args.out, "".join(page(results, collected, _links(by_file, args.out.parent), figures, similarities, audit)))
+    links = _links(by_file, args.out.parent)
+    write_text(args.out, "".join(page(results, collected, links, figures, similarities, audit, args.study)))
     return args.out
 
 
@@ -237,6 +234,7 @@ def page(
     figures: Figures,
     similarities: Sequence[Path],
     audit: Mapping[str, Sequence[str]],
+    study: Path | None = None,
 ) -> Iterator[str]:
     """The Markdown page, part by part.
 
@@ -247,6 +245,7 @@ def page(
         figures: Paths of the figures.
         similarities: Files that `manifeel similarity` wrote.
         audit: What the information audit found, by the names of tasks.
+        study: File of the study that makes the results; None if they are of no study.
     """
     found = of_the_protocol(collected)
     yield HEAD.format(last=LAST)
@@ -257,8 +256,7 @@ def page(
     if figures.gentle:
         yield GENTLE.format(figure=_address(figures.gentle))
     yield "\n## What was run\n\n"
-    yield _table_of_conditions(collected, results, files)
-    yield AGAIN
+    yield from table_of_runs(collected, results, files, study)
     if len(found) < len(collected):
         yield LEFT_OUT.format(episodes=FEWEST_EPISODES, steps=FEWEST_STEPS)
     if figures.success:
@@ -270,46 +268,12 @@ def page(
         yield "network before training, and the mean action of the demonstrations (`baselines/references.py`).\n\n"
         yield markdown_table(("task", "sensing", "policy", "over", "gain, points", "p"), rows)
     yield _table_of_floors()
-    yield census_table(results, [condition for condition, _ in _sorted(found)])
+    yield census_table(results, [condition for condition, _ in in_order(found)])
     yield rank_table(found)
     yield f"{CLAIMS}\n"
     yield _claims(found)
     yield runtime_table(results)
     yield similarity_table(similarities)
-
-
-def _table_of_conditions(found: dict[Condition, ConditionResults], results: list[dict[str, Any]], files: Files) -> str:
-    rows, of_condition = [], by_condition(results)
-    for condition, here in _sorted(found):
-        cost, machines = _cost(of_condition[condition])
-        note = f"left out: {here.why_left_out}" if here.why_left_out else None
-        success = success_with_links(here, files.get(condition, ())), _percent(here.success_at_end)
-        measured = (
-            *success,
-            _floor(condition),
-            gentle_cell(here),
-            _by_the_paper(here),
-            _percent(here.seed_deviation),
-            here.size,
-            note,
-        )
-        network = shown(condition.policy), shown(condition.encoder)
-        of = (*network, condition.num_demos, training_settings_of(condition), f"`{condition.key}`")
-        rows.append((_task(condition), shown(condition.sensing), *measured, *of, cost, machines))
-    measures = ("success", "at the end", "floor", "gentle success", "by the paper's threshold", "std", "of", "note")
-    settings = ("policy", "TacRGB encoder", "demonstrations", "settings", "id")
-    return markdown_table(("task", "sensing", *measures, *settings, "cost", "on"), rows)
-
-
-def _by_the_paper(results: ConditionResults) -> str | None:
-    """Share of the episodes that met the threshold of the paper's public code; None where some were not measured."""
-    successes = successes_by_the_paper(results.episodes)
-    return _percent(None if successes is None else float(np.mean(successes)))
-
-
-def _floor(condition: Condition) -> str | None:
-    floor = highest_floor(condition.env_id, condition.revision, condition.variant)
-    return floor and str(floor)
 
 
 def _table_of_floors() -> str:
@@ -324,23 +288,8 @@ def _table_of_floors() -> str:
     return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 
-def _percent(rate: float | None) -> str | None:
-    return None if rate is None else f"{rate:.0%}"
-
-
-def _sorted(found: dict[Condition, ConditionResults]) -> list[tuple[Condition, ConditionResults]]:
-    return sorted(found.items(), key=lambda item: tuple(map(str, vars(item[0]).values())))
-
-
-def _task(condition: Condition) -> str:
-    revision = f"revision {condition.revision}" if condition.revision > 1 else ""
-    variant = shown(condition.variant)
-    code = f"`{variant}`" if variant and variant == condition.variant else variant
-    return " ".join(filter(None, (shown(condition.task), code, revision)))
-
-
 def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator[tuple[str, ...]]:
-    for (condition, results), (other, learnt_nothing) in product(_sorted(found), repeat=2):
+    for (condition, results), (other, learnt_nothing) in product(in_order(found), repeat=2):
         same_task = (condition.env_id, condition.variant, condition.revision) == (other.env_id, other.variant, other.revision)
         comparable = same_task and other.obs_mode in ("none", condition.obs_mode)
         if comparable and other.policy in REFERENCES and condition.policy not in REFERENCES:
@@ -349,7 +298,7 @@ def _gains_over_references(found: dict[Condition, ConditionResults]) -> Iterator
                 cells = gain.signed, p_text(p_value) or ""
             except ResultError:
                 cells = "other initial states", ""
-            yield _task(condition), *map(shown, (condition.sensing, condition.policy, other.policy)), *cells
+            yield task_with_revision(condition), *map(shown, (condition.sensing, condition.policy, other.policy)), *cells
 
 
 def _claims(found: dict[Condition, ConditionResults]) -> str:
@@ -358,20 +307,6 @@ def _claims(found: dict[Condition, ConditionResults]) -> str:
         return claims_page(found, results_of_claims(found))
     except ResultError as error:
         return f"They are not tested: {error}.\n"
-
-
-def _cost(results: list[dict[str, Any]]) -> tuple[str | None, str | None]:
-    """Hours of training and the machines that trained, as text; None for a policy that was not trained."""
-    longest: dict[Any, float] = {}
-    machines = set()
-    for result in results:
-        config = result["config"]
-        seed = result["training_seed"]
-        longest[seed] = max(longest.get(seed, 0.0), config.get("training_seconds", 0.0))
-        if trained_on := config.get("trained_on"):
-            machines.add(shown(gpu_of_training(config) or f"{trained_on['cores']} cores of an {trained_on['cpu']}"))
-    hours = sum(longest.values()) / SECONDS_PER_HOUR
-    return f"{hours:.2f} h" if hours else None, ", ".join(sorted(machines)) or None
 
 
 def next_step(_args: Args, made: Path) -> str:

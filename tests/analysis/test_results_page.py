@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
@@ -129,3 +130,14 @@ def test_the_rate_of_a_training_seed_is_that_of_all_its_checkpoints():
     success[0, 1] = 1.0
     shown = paper_tables.success_with_links(ConditionResults(success, list(range(50))), ["first.json", "second.json"])
     assert shown.endswith("([50%](first.json), [0%](second.json))")
+
+
+def test_each_row_of_a_study_says_how_it_is_made_again(tmp_path):
+    write_run(tmp_path, VISION, 0.2, preset="cpu_targets")
+    write_run(tmp_path, TACFF, 0.2, preset="cpu", batch_size=3)  # of no study, since it has no preset's settings
+    page = results_page.main(results_page.Args((tmp_path,), tmp_path / "page.md", study=Path("configs/mine.yaml"))).read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| PegInsertion") and " h |" not in line]
+    named = [line.rpartition(" | ")[2] for line in rows if "diffusion_policy" in line and "`" in line.rpartition(" | ")[2]]
+    assert named == ["`PegInsertion, diffusion_policy, cpu_targets, rgb, wrist, 50 demonstrations` |"]
+    assert "`manifeel study configs/mine.yaml --only 'ROW'`" in page
+    assert "row in the study" not in page_of(tmp_path)

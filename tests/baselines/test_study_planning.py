@@ -21,7 +21,7 @@ from baselines.studies import __main__ as study_command
 from baselines.studies import cost, running
 from baselines.studies.checks import require_valid_flags
 from baselines.studies.command_lines import shell_command, training_args
-from baselines.studies.planning import Job, jobs_of
+from baselines.studies.planning import Job, jobs_of, only
 from baselines.studies.study import OF_THE_STUDY, Resources, StudyError, read_study
 from baselines.studies.work import AMOUNT_FLAGS
 from baselines.tactile_representations.pretrain import Args as PretrainArgs
@@ -31,8 +31,8 @@ from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.matching import as_the_paper_says
 from manifeel_ms3.analysis.paper import paper_condition, reported
 from manifeel_ms3.analysis.paper_claims import comparisons
-from manifeel_ms3.analysis.presets import training_settings_of
-from manifeel_ms3.errors import MachineError
+from manifeel_ms3.analysis.presets import row_in_a_study, training_settings_of
+from manifeel_ms3.errors import MachineError, UnknownNameError
 from manifeel_ms3.evaluation.result import results_in
 from manifeel_ms3.nested_settings import as_json
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
@@ -148,7 +148,7 @@ def test_numbers_that_no_training_can_meet_are_refused_before_any_job_begins(stu
 @pytest.mark.parametrize(
     ("argument", "said"),
     [
-        ("task_args: {randomization: {socket: 0.0}}", r"1 demonstrations, .*: randomization\['socket'\] is unknown"),
+        ("task_args: {randomization: {socket: 0.0}}", r"1 demonstrations: randomization\['socket'\] is unknown"),
         ("task_args: {sensor_configs: {wirst: {fov: 1.0}}}", r"sensor_configs\['wirst'\] is neither a sensor"),
         ("evaluation_args: [{}, {tactile: {units: grams}}]", "seed 0, .*: units='grams' is unknown; choose from .*newton"),
     ],
@@ -172,7 +172,7 @@ def test_every_shipped_study_is_planned_and_costed(path, tmp_path):
     measured = {trial.key: dict(seconds=0.5) for trial in trials}  # the trials themselves: the tests below
     (tmp_path / cost.TRIALS).write_text(json.dumps(measured))
     table = study_command.plan(study, jobs, tmp_path)
-    assert table.row_count == len({(job.kind, job.title.partition(", seed")[0]) for job in jobs}) + 1
+    assert table.row_count == len({(job.kind, job.row) for job in jobs}) + 1
     assert list(table.columns[1].cells)[-1] == "all jobs that are left whose cost is known"
     assert float(list(table.columns[3].cells)[-1]) > 0
     on_gpus = float(list(table.columns[4].cells)[-1]) > 0
@@ -208,12 +208,33 @@ def test_the_small_networks_study_makes_every_published_result():
     """Each published condition and training seed is one of the study that the page of results names."""
     results = results_in(*make_readme_results.RESULTS).values()
     published = {(_without_settings(condition_of(result)), result["config"]["seed"]) for result in results}
-    planned = set()
+    planned, rows = set(), set()
     for job in jobs_of(read_study(REPOSITORY / "configs/tables_cpu.yaml")):
         if job.kind == "train":
             planned.add((_without_settings(_condition_of_training(job)), training_args(job).seed))
+            rows.add(job.row)
+            assert row_in_a_study(_condition_of_training(job)) == job.row
     assert len(published) > 100
     assert sorted(map(str, published - planned)) == []
+    assert sorted({str(row_in_a_study(condition_of(result))) for result in results} - rows) == []
+
+
+def test_some_rows_of_a_study_bring_the_jobs_that_they_need(study, capsys, tmp_path):
+    study.write_text("""
+grids:
+  - &row {tasks: [ManiFeel-PegInsertion-v1], obs_modes: [rgb, rgb+tacff], seeds: [0, 1], preset: cpu}
+  - {<<: *row, preset: cpu_targets, task_args: {tactile: {units: tacsl}}}
+""")
+    row = 'PegInsertion, {"tactile": {"units": "tacsl"}}, diffusion_policy, cpu_targets, rgb+tacff, wrist, 50 demonstrations'
+    jobs = only(jobs_of(read_study(study)), [row])
+    assert [job.kind for job in jobs] == ["record", *["train", "evaluate"] * 2]
+    assert {job.title for job in jobs[1:]} == {f"{row}, seed 0", f"{row}, seed 1"}
+    study_command.main(study_command.Args(study, tmp_path, only=(row,), print_commands=True))
+    assert len(re.findall(r"manifeel train diffusion_policy cpu_targets .*--obs-mode rgb\+tacff", capsys.readouterr().out)) == 2
+    with pytest.raises(UnknownNameError, match=r"no row of the study is named 'PegInsertion, rgb'.*--dry-run lists all rows"):
+        study_command.main(study_command.Args(study, tmp_path, only=("PegInsertion, rgb",)))
+    with pytest.raises(UnknownNameError, match=r"did you mean 'PegInsertion, diffusion_policy, cpu, rgb, wrist, 50 demon"):
+        only(jobs_of(read_study(study)), ["PegInsertion, diffusion_policy, cpu, rgb, wrist"])
 
 
 def _without_settings(condition: Condition) -> tuple[Condition, str]:
