@@ -374,8 +374,12 @@ def network_images(images: torch.Tensor, crop: int, at_random: bool) -> torch.Te
         crop: Side of the crops, pixels; 0 for whole images.
         at_random: Whether crops are taken at random places; else the centre is taken.
     """
-    taken = cropped(images, crop, at_random).flatten(0, 1).movedim(-1, 1)
-    return taken.float() / 127.5 - 1.0 if images.dtype == torch.uint8 else taken
+    return in_unit_range(cropped(images, crop, at_random).flatten(0, 1).movedim(-1, 1))
+
+
+def in_unit_range(values: torch.Tensor) -> torch.Tensor:
+    """Images of uint8 as floats in [-1, 1]; floats, which are normalised already, as they are."""
+    return values.float() / 127.5 - 1.0 if values.dtype == torch.uint8 else values
 
 
 def cropped(images: torch.Tensor, size: int, at_random: bool) -> torch.Tensor:

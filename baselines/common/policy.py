@@ -11,7 +11,7 @@ from tyro.conf import arg
 from manifeel_ms3.arguments import require_amount, require_at_least, require_choices
 from manifeel_ms3.errors import InvalidArgumentError
 
-from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
+from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder, in_unit_range
 from .mlp import ConditionalMLP
 from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
@@ -68,6 +68,9 @@ class PolicyConfig:
     """Standard deviation of the noise that training adds to the normalised tool pose, except to its height. Without noise, a
     policy trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart,
     and says how far the work has come."""
+    touch_noise: float = 0.0
+    """Standard deviation of the noise that training adds to every value of TacRGB images and force fields, which range from -1 to
+    1. Without noise, touch can tell a policy which of a few demonstrations it is in, and how the hand moves there."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
@@ -110,6 +113,7 @@ class PolicyConfig:
                 "executed from the last of them on; give a larger pred_horizon, or a smaller action_horizon"
             )
         require_amount("pose_noise=", self.pose_noise)
+        require_amount("touch_noise=", self.touch_noise)
         require_at_least(1, noise_draws=self.noise_draws, mlp_width=self.mlp_width, mlp_blocks=self.mlp_blocks)
         if self.diffusion_step_embed_dim < LEAST_EMBED_DIM or self.diffusion_step_embed_dim % 2:
             raise InvalidArgumentError(
@@ -212,19 +216,28 @@ class VisuotactilePolicy(nn.Module):
         """The normaliser of an observation."""
         return cast(Normalizer, self.obs_normalizers[module_name(key)])
 
-    def condition(self, obs: dict[str, torch.Tensor], pose_noise: float = 0.0) -> torch.Tensor:
-        """Features (B, ...) of observations {key: (B, obs_horizon, ...)}."""
-        normalised = {key: self.obs_normalizer(key).normalize(obs[key]) for key in self.normalized}
-        if pose_noise > 0:
-            noise = pose_noise * torch.randn_like(normalised[POSE])
+    def condition(self, obs: dict[str, torch.Tensor], is_noisy: bool = False) -> torch.Tensor:
+        """Features (B, ...) of observations {key: (B, obs_horizon, ...)}, with the noise of training if asked for."""
+        seen = {**obs, **{key: self.obs_normalizer(key).normalize(obs[key]) for key in self.normalized}}
+        return self.encoder(self._with_noise(seen) if is_noisy else seen)
+
+    def _with_noise(self, obs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Observations whose pose, except for the height, and whose touch have noise; those without normaliser are uint8."""
+        noisy = dict(obs)
+        if self.config.pose_noise > 0:
+            noise = self.config.pose_noise * torch.randn_like(obs[POSE])
             noise[..., HEIGHT] = 0.0
-            normalised[POSE] = normalised[POSE] + noise
-        return self.encoder({**obs, **normalised})
+            noisy[POSE] = obs[POSE] + noise
+        if self.config.touch_noise > 0:
+            for key in filter(is_tactile, (*self.spec.images, *self.spec.force_fields)):
+                touch = in_unit_range(obs[key])
+                noisy[key] = touch + self.config.touch_noise * torch.randn_like(touch)
+        return noisy
 
     def forward(self, obs: dict[str, torch.Tensor], actions: torch.Tensor) -> torch.Tensor:
         """The loss of a batch of observations {key: (B, obs_horizon, ...)} and actions (B, pred_horizon, A)."""
         draws = self.config.noise_draws
-        condition = self.condition(obs, self.config.pose_noise).repeat_interleave(draws, dim=0)
+        condition = self.condition(obs, is_noisy=True).repeat_interleave(draws, dim=0)
         return self.generation_loss(self.action_normalizer.normalize(actions).repeat_interleave(draws, dim=0), condition)
 
     @torch.no_grad()

@@ -10,7 +10,7 @@ from manifeel_ms3.analysis.condition import Condition, condition_of
 from manifeel_ms3.analysis.paper import DP, training_demos
 from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import published_hash
-from manifeel_ms3.evaluation.entries import ABOUT
+from manifeel_ms3.evaluation.entries import ABOUT, VIDEO_SUFFIX, VIDEOS
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.files import atomic_folder, read_json, restore_folder, write_json
 from manifeel_ms3.ownership import owned
@@ -118,6 +118,9 @@ def _publish_results(results: dict[Path, dict[str, Any]], folder: Path) -> dict[
         shutil.copyfile(path, run / path.name)
         hashes[(run / path.name).relative_to(folder).as_posix()] = published_hash(checkpoint)
         if result["training_seed"] == 0:
+            (folder / VIDEOS / f"{entry_name(result)}{VIDEO_SUFFIX}").unlink(
+                missing_ok=True
+            )  # which is of the earlier checkpoint
             shutil.copytree(checkpoint, run / CHECKPOINTS / checkpoint.name)
     return hashes
 

@@ -44,6 +44,7 @@ OF_MODALITIES = {
     "policy.encoder.freeze_tacrgb": ("tacrgb",),
     "policy.encoder.force_field": ("tacff",),
     "policy.encoder.tactile_features": ("tacrgb", "tacff"),
+    "policy.touch_noise": ("tacrgb", "tacff"),
 }
 """Settings that only have an effect on a policy that observes one of the given modalities."""
 ENCODER, NETWORK = "policy.encoder.tacrgb", "policy.encoder.image"

@@ -20,6 +20,7 @@ IMPLIED = {
     "num_processes": 1,
     "policy.action_form": "delta",
     "policy.tacrgb_scale": "colour",
+    "policy.touch_noise": 0.0,
     "policy.encoder.tactile_crop": 0,
 }
 """Settings that configurations of older versions lack, with the values that they count as having. Dots join nested names."""

@@ -20,6 +20,9 @@ from .rollout import EpisodeOutcome
 
 ABOUT = "submission.json"
 """File that names the checkpoints' hashes."""
+VIDEOS, VIDEO_SUFFIX = "videos", ".mp4"
+"""Folder of a submission's videos, in which videos/PegInsertion/rgb.mp4 is that of PegInsertion/rgb, and the ending of their
+names."""
 SETTINGS = ("env_kwargs", "revision", "inference", "stop_at_success")
 """Parts of a result that say, beside the policy's configuration, what was evaluated, and how; only results that have the same
 can be compared by episode."""

@@ -5,7 +5,8 @@
     manifeel leaderboard build
 
 A submission is a folder with submission.json ({"name", "authors", "link"}), with the result files of a policy in any
-subfolders, one for each checkpoint and training seed, and optionally with `videos/*.mp4`. `hash` writes into submission.json
+subfolders, one for each checkpoint and training seed, and optionally with videos: videos/PegInsertion/rgb.mp4 is shown with the
+results in PegInsertion/rgb, and one that is named by no folder of results with all of them. `hash` writes into submission.json
 the hash of each result's checkpoint. `submit` checks a submission, runs episodes of all its results again, and copies it into
 the leaderboard's folder; `build` makes index.html and README.md from all submissions there.
 """

@@ -49,8 +49,8 @@ class Row:
     """Mean success with its interval."""
     results: ConditionResults
     """Success in every episode."""
-    files: list[dict[str, Any]]
-    """Contents of the result files of the condition."""
+    files: dict[Path, dict[str, Any]]
+    """Contents of the result files of the condition, by their paths in the submission."""
     inference_ms: float
     """Median over episodes of the mean time of an inference, in ms."""
     force: float
@@ -98,7 +98,7 @@ def rows_of(submission: Submission) -> list[Row]:
         gentle = None if limit is None else float(success_under_force(episodes, [limit])[0])
         floor = highest_floor(condition.env_id, condition.revision, condition.variant)
         measured = (latency, force, gentle, floor, rerun)
-        rows.append(Row(submission, condition, mean_success(results), results, [*files.values()], *measured))
+        rows.append(Row(submission, condition, mean_success(results), results, files, *measured))
     return rows
 
 
@@ -152,7 +152,7 @@ def write_page(rows: list[Row], board: Path) -> Path:
 
 
 def _for_page(row: Row) -> dict[str, Any]:
-    about, condition = row.submission.about, row.condition
+    about, condition, results = row.submission.about, row.condition, [*row.files.values()]
     texts = dict(
         task=condition.task,
         variant=condition.variant,
@@ -178,9 +178,9 @@ def _for_page(row: Row) -> dict[str, Any]:
         force=row.force,
         gentle=row.gentle,
         link=about.link,
-        config=json.dumps(dict(sorted(row.files[-1]["config"].items())), indent=1),
-        curves=json.dumps(_curves(row.files)),
-        videos=[base64.b64encode(video).decode() for video in row.submission.videos],
+        config=json.dumps(dict(sorted(results[-1]["config"].items())), indent=1),
+        curves=json.dumps(_curves(results)),
+        videos=[base64.b64encode(video).decode() for video in row.submission.videos_of(row.files)],
     )
 
 

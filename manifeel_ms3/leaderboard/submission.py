@@ -5,6 +5,7 @@ checks, the copy in the leaderboard and the page are made from the contents that
 """
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import jsonschema
 
 from manifeel_ms3.errors import InvalidFileError
 from manifeel_ms3.evaluation.entries import ABOUT as ABOUT_NAME
+from manifeel_ms3.evaluation.entries import VIDEO_SUFFIX, VIDEOS
 from manifeel_ms3.evaluation.result import check_result
 from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.paths import data_dir
@@ -92,10 +94,18 @@ class Submission:
     rerun: Rerun | None = None
     """Content of rerun.json, if there is one; it counts only in a folder of the leaderboard, which wrote it."""
 
-    @property
-    def videos(self) -> list[bytes]:
-        """The videos, in the order of their names."""
-        return [self.files[path] for path in sorted(self.files) if path.suffix == ".mp4"]
+    def videos_of(self, results: Iterable[Path]) -> list[bytes]:
+        """The videos of some results, in the order of their paths.
+
+        The video videos/PegInsertion/rgb.mp4 is of the results in the folder PegInsertion/rgb. One that is named by no folder
+        of results is of all of them.
+
+        Args:
+            results: Paths of result files in the submission.
+        """
+        own, all_of_them = ({folder for path in paths for folder in path.parents} for paths in (results, self.results))
+        shown = {path: path.relative_to(VIDEOS).with_suffix("") for path in sorted(self.files) if path.suffix == VIDEO_SUFFIX}
+        return [self.files[path] for path, named in shown.items() if named in own or named not in all_of_them]
 
 
 def read_submission(folder: Path) -> Submission:
@@ -133,7 +143,7 @@ def read_submission(folder: Path) -> Submission:
 
 
 def _is_video(path: Path) -> bool:
-    return path.parent == Path("videos") and path.suffix == ".mp4"
+    return Path(VIDEOS) in path.parents and path.suffix == VIDEO_SUFFIX
 
 
 def _about(content: Any) -> About:

@@ -92,6 +92,19 @@ def test_results_of_another_set_up_are_not_overwritten(tmp_path):
     assert published.read_bytes() == before
 
 
+def test_a_video_of_an_earlier_checkpoint_does_not_stay_with_new_results(tmp_path):
+    root, board = tmp_path / "study", tmp_path / "board"
+    publish([first := finished(root, "first"), finished(root, "other", task="ObjectSearch")], root, board, "tables", "us")
+    replaced, kept = (board / f"videos/{task}/rgb+tacrgb.mp4" for task in ("PegInsertion", "ObjectSearch"))
+    for video in (replaced, kept):
+        video.parent.mkdir(parents=True)
+        video.write_bytes(b"video")
+    publish([finished(root, "other seed", seed=1)], root, board)
+    assert replaced.is_file()
+    publish([first], root, board)
+    assert (replaced.is_file(), kept.is_file()) == (False, True)
+
+
 def test_a_submission_without_checkpoints_keeps_its_link(tmp_path):
     board = tmp_path / "board"
     board.mkdir()

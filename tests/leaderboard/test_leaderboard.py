@@ -1,5 +1,6 @@
 """Submissions are checked, run again, ranked, and shown on a page that is tried in a browser."""
 
+import base64
 import html
 import json
 import re
@@ -248,6 +249,22 @@ def test_results_of_an_earlier_revision_are_left_out_and_the_others_of_their_sub
     assert re.fullmatch(rf"left out: 2 results in .*ours: they are of revision 1 of {PEG}, but the task has .* here", message)
     shutil.rmtree(folder / "results/0")
     assert rows_on(tmp_path) == []
+
+
+def test_a_row_shows_the_video_of_its_own_results_and_those_of_the_whole_submission(tmp_path):
+    folder = made_up(tmp_path / "us", "Us", "PegInsertion", "rgb", 10)
+    (folder / "results").rename(folder / "of_peg")
+    shutil.copytree(made_up(tmp_path / "other", "Other", "ObjectSearch", "rgb", 20) / "results", folder / "of_search")
+    shutil.rmtree(tmp_path / "other")
+    (folder / "videos/notes").mkdir(parents=True)
+    for name in ("of_peg", "of_search", "notes/all"):
+        (folder / f"videos/{name}.mp4").write_bytes(name.encode())
+    (folder / "videos/not_a_video.txt").write_bytes(b"text")
+    main(Build(tmp_path))
+    page = (tmp_path / "index.html").read_text()
+    _, search, peg = page.split('<tr class="row"')  # in the order of the tasks
+    videos = [[base64.b64decode(one).decode() for one in re.findall('video/mp4;base64,([^"]+)', row)] for row in (search, peg)]
+    assert videos == [["notes/all", "of_search"], ["notes/all", "of_peg"]]
 
 
 def browsed(board: Path, address: str) -> str:
