@@ -11,7 +11,8 @@ from tyro.conf import arg
 from manifeel_ms3.arguments import require_amount, require_at_least, require_choices
 from manifeel_ms3.errors import InvalidArgumentError
 
-from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder, in_unit_range
+from .encoders import EncoderConfig, ObservationEncoder, PretrainedEncoder
+from .images import scaled
 from .mlp import ConditionalMLP
 from .normalizer import ActionNormalizer, Normalizer
 from .observation import POSE, ObservationSpec, is_tactile
@@ -69,8 +70,8 @@ class PolicyConfig:
     policy trained on a few demonstrations can recognise each of them by the pose alone; the height does not tell them apart,
     and says how far the work has come."""
     touch_noise: float = 0.0
-    """Standard deviation of the noise that training adds to every value of TacRGB images and force fields, which range from -1 to
-    1. Without noise, touch can tell a policy which of a few demonstrations it is in, and how the hand moves there."""
+    """Standard deviation of the noise that training adds to every value of TacRGB images and force fields, where they have the
+    range [-1, 1]. Without noise, touch can tell a policy in which of a few demonstrations it is and how the hand moves."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 
@@ -230,7 +231,7 @@ class VisuotactilePolicy(nn.Module):
             noisy[POSE] = obs[POSE] + noise
         if self.config.touch_noise > 0:
             for key in filter(is_tactile, (*self.spec.images, *self.spec.force_fields)):
-                touch = in_unit_range(obs[key])
+                touch = scaled(obs[key])
                 noisy[key] = touch + self.config.touch_noise * torch.randn_like(touch)
         return noisy
 

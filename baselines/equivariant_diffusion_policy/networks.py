@@ -3,7 +3,8 @@
 import torch
 import torch.nn as nn
 
-from baselines.common.encoders import EncoderConfig, by_name, field_encoder, image_encoder, network_images
+from baselines.common.encoders import EncoderConfig, by_name, field_encoder, image_encoder
+from baselines.common.images import network_images
 from baselines.common.observation import POSE, ObservationSpec, is_tactile
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
 from manifeel_ms3.errors import InvalidArgumentError

@@ -189,6 +189,27 @@ def test_noise_is_added_to_the_pose_in_training_alone_and_not_to_its_height():
     assert executed.std(0).max() == 0.0
 
 
+def test_noise_is_added_to_touch_in_training_alone_and_to_no_camera():
+    spec = observation_spec("rgb+tacrgb+tacff", ("wrist",), ("right",), 16, taxel_shape=(2, 3))
+    (camera, pad), (field,) = spec.images, spec.force_fields
+    policy, seen = Learns(PolicyConfig(touch_noise=0.5), spec, 1), []
+    policy.encoder.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    white = torch.full((1000, 2, 16, 16, 3), 255, dtype=torch.uint8)
+    obs = {POSE: torch.zeros(1000, 2, 7), camera: white, pad: white, field: torch.zeros(1000, 2, 2, 3, 3)}
+    torch.manual_seed(0)
+    policy(obs, torch.zeros(1000, 16, 1))
+    (trained,) = seen
+    for key, mean in ((pad, 1.0), (field, 0.0)):
+        spread = trained[key].std(0).flatten()
+        assert spread.tolist() == pytest.approx([0.5] * len(spread), rel=0.15)
+        assert trained[key].mean().item() == pytest.approx(mean, abs=0.02)
+    assert torch.equal(trained[camera], white)
+    assert not trained[POSE].any()
+    policy.sample(obs, 1, generators(1000))
+    assert torch.equal(seen[1][pad], white)
+    assert not seen[1][field].any()
+
+
 # ------------------------------------------------------------------ Diffusion Policy and Flow Matching
 
 
