@@ -132,14 +132,15 @@ def evaluated_checkpoint(path: Path, result: dict[str, Any]) -> Path:
         result: Its content.
 
     Raises:
-        CheckpointError: The last checkpoint is missing or broken, or the one of this step was deleted or is of another
-            training.
+        CheckpointError: There is no checkpoint of this step, or it is broken or of another training.
     """
-    last, step = path.parent / CHECKPOINTS / LAST_LINK, result["config"].get("step")
-    found = last if checkpoint_config(last).get("step") == step else last.with_name(str(step).zfill(8))
+    folder, step = path.parent / CHECKPOINTS, result["config"].get("step")
+    last, found = folder / LAST_LINK, folder / str(step).zfill(8)
+    if not found.is_dir() and checkpoint_config(last).get("step") == step:
+        found = last
     if not found.is_dir():
         raise CheckpointError(
-            f"{path} is of step {step}, whose checkpoint is not in {last.parent} any more; evaluate "
+            f"{path} is of step {step}, whose checkpoint is not in {folder} any more; evaluate "
             f"another one with `manifeel eval --checkpoint {last}`"
         )
     if not is_of_config(result, checkpoint_config(found), but=(INFERENCE_STEPS,)):

@@ -17,6 +17,12 @@ NO_RENDERER = (
     "driver and libvulkan1. What needs no image works without: obs_mode='state' or 'tacff', render_backend='none'."
 )
 """Message where no renderer was found; `wanted` is what needs one."""
+OTHER_DEVICE = (
+    "{wanted} needs images of a simulation on a GPU, which the same GPU has to draw, but the renderer is on the CPU. Install "
+    "the Vulkan part of the GPU's driver (in a container: NVIDIA_DRIVER_CAPABILITIES=all) and leave out render_backend. What "
+    "needs no image works without."
+)
+"""Message where the CPU would have to draw what a GPU simulates; `wanted` is what needs images."""
 FORKED = (
     "{wanted} needs a renderer, and this process was forked from one that has its own, which does not survive a fork. Start "
     "it anew: multiprocessing.get_context('spawn'), AsyncVectorEnv(..., context='spawn'). What needs no image works here: "
@@ -98,6 +104,11 @@ def _works(backend: str) -> bool:
         return True
     except RuntimeError:
         return False
+
+
+def is_gpu(backend: str) -> bool:
+    """Whether a GPU renders on the device that ManiSkill calls `backend`, such as "gpu" or "cuda:1"."""
+    return _device_of(backend).partition(":")[0] in ("cuda", "pci")
 
 
 def _device_of(backend: str) -> str:

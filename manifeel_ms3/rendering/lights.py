@@ -68,8 +68,15 @@ def add_lights(
     return lamps
 
 
+def change_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
+    """Let a lamp of a scene cast another shadow: SAPIEN looks at its settings only where a lamp is added to a scene."""
+    lamp.disable()
+    cast_shadow(lamp, shadow)
+    lamp.enable()
+
+
 def cast_shadow(lamp: Lamp, shadow: Shadow | None) -> None:
-    """Let a lamp cast a shadow, or none if it is None."""
+    """Let a lamp that is added to a scene later cast a shadow, or none if it is None."""
     lamp.shadow = shadow is not None
     if shadow is not None:
         lamp.shadow_map_size, lamp.shadow_half_size = shadow.size, shadow.half_extent

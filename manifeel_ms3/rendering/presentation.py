@@ -11,11 +11,13 @@ from torch.nn.functional import avg_pool2d
 from manifeel_ms3.arguments import by_name
 from manifeel_ms3.errors import InvalidArgumentError
 
-from .lights import PRESENTATION_SHADOW, Lamp, Shadow, cast_shadow
+from .lights import PRESENTATION_SHADOW, Lamp, Shadow, change_shadow
 from .shader_pack import camera_shader
 
 SIZE = 768
 """Width and height of the images, in pixels; chosen by eye."""
+SIZE_OF_MANY = 256
+"""The same where one process has many environments, whose images would fill a GPU's memory; not tried out."""
 SUPERSAMPLING = 2
 """Width and height, in drawn pixels, of the square that becomes one pixel; chosen by eye."""
 
@@ -63,9 +65,9 @@ def fine_shadow(lamps: list[Lamp], usual: Shadow | None) -> Iterator[None]:
         usual: Shadow that they cast otherwise; None if they cast none.
     """
     for lamp in lamps:
-        cast_shadow(lamp, PRESENTATION_SHADOW)
+        change_shadow(lamp, PRESENTATION_SHADOW)
     try:
         yield
     finally:
         for lamp in lamps:
-            cast_shadow(lamp, usual)
+            change_shadow(lamp, usual)

@@ -1,6 +1,7 @@
 """Checks of the arguments that a task's environment is made and reset with."""
 
 import inspect
+import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from decimal import ROUND_DOWN, Context
 from typing import Any
@@ -14,7 +15,11 @@ from mani_skill.sensors.camera import CameraConfig
 
 from manifeel_ms3.arguments import by_name, is_number, one_of
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
+from manifeel_ms3.rendering.backend import FORKED, NO_RENDERER, OTHER_DEVICE, is_gpu, renderer_lost
 
+from .obs_modes import has_images
+
+log = logging.getLogger(__name__)
 Limits = Mapping[str, tuple[float, str]]
 """By the name of a field of a randomization: its largest playable half range, in m or rad, and what happens beyond it."""
 
@@ -106,9 +111,46 @@ def check_base_arguments(task: type[BaseEnv], render_backend: Any, given: Mappin
     one_of("render_mode", given.get("render_mode"), (None, *task.metadata["render_modes"]))
     _check_backend("render_backend", render_backend, ("auto", "none", *render_backend_name_mapping), ("pci",))
     sim_backend = given.get("sim_backend", "auto")
-    name = _check_backend("sim_backend", sim_backend, ("auto", *sim_backend_name_mapping))
-    if sim_backend_name_mapping.get(name) == "physx_cuda" and not torch.cuda.is_available():
+    _check_backend("sim_backend", sim_backend, ("auto", *sim_backend_name_mapping))
+    if simulates_on_gpu(given) and not torch.cuda.is_available():
         raise MachineError(f"sim_backend={sim_backend!r} needs a CUDA GPU, and torch finds none; leave it out to use the CPU")
+    if simulates_on_gpu(given) and not getattr(task, "contacts", {}).get("enable_pcm", True):
+        log.warning("%s may not be playable on a GPU, where SAPIEN has other contacts than it needs", task.__name__)
+
+
+def simulates_on_gpu(given: Mapping[str, Any]) -> bool:
+    """Whether arguments of ManiSkill's `BaseEnv` ask for a simulation on a GPU."""
+    name = str(given.get("sim_backend", "auto")).partition(":")[0]
+    return given.get("num_envs", 1) > 1 if name == "auto" else sim_backend_name_mapping.get(name) == "physx_cuda"
+
+
+def check_renderer(backend: str, asked: str, own_mode: str, given: Mapping[str, Any]) -> None:
+    """Check that the images that are asked for can be drawn.
+
+    Args:
+        backend: Where this process renders; "none" if it does not.
+        asked: Argument `render_backend` of the environment.
+        own_mode: The part of the observation mode that ManiSkill knows.
+        given: The other arguments of `BaseEnv` that are given.
+
+    Raises:
+        InvalidArgumentError: Images are asked for, and no renderer.
+        MachineError: There is no renderer, or it is on another device than a simulation on a GPU, which it could not read.
+    """
+    if has_images(own_mode):
+        wanted = f"obs_mode={own_mode!r}"
+    elif render_mode := given.get("render_mode"):
+        wanted = f"render_mode={render_mode!r}"
+    else:
+        return
+    if asked == "none":
+        raise InvalidArgumentError(
+            f"render_backend='none' draws nothing, and {wanted} needs images; leave it out, or ask for no images"
+        )
+    if backend == "none":
+        raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
+    if simulates_on_gpu(given) and not is_gpu(backend):
+        raise MachineError(OTHER_DEVICE.format(wanted=wanted))
 
 
 def _check_backend(argument: str, given: Any, allowed: Sequence[str], with_device: Sequence[str] = ()) -> str:

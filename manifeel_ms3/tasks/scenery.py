@@ -16,7 +16,7 @@ from manifeel_ms3.geometry import Box, Part
 from manifeel_ms3.rendering.cameras import FARTHEST, FIELD_OF_VIEW, IMAGE_SIZE, NEAREST
 from manifeel_ms3.rendering.lights import SHADOWS, add_lights, cast_no_shadow
 from manifeel_ms3.rendering.looks import CONCRETE
-from manifeel_ms3.rendering.presentation import SIZE, SUPERSAMPLING, fine_shadow, presentation_shader
+from manifeel_ms3.rendering.presentation import SIZE, SIZE_OF_MANY, SUPERSAMPLING, fine_shadow, presentation_shader
 from manifeel_ms3.rendering.randomization import LARGEST, RandomLooks, VisualRandomization
 from manifeel_ms3.rendering.shader_pack import camera_shader, picture_formats
 from manifeel_ms3.rendering.table import table_mesh, wood
@@ -61,16 +61,16 @@ class SceneryEnv(SensingEnv):
     camera_names: tuple[str, ...]
     """Names of the cameras that are rendered."""
 
-    def _set_looks(self, lighting: str, quality: str, randomization: dict[str, float], num_envs: int) -> None:
+    def _set_looks(self, lighting: str, quality: str, randomization: dict[str, float], on_gpu: bool) -> None:
         self._lighting = one_of("lighting", lighting, LIGHTING)
         self._quality = one_of("quality", quality, QUALITIES)
         self.visual_randomization = checked_randomization(
             type(self).__name__, VisualRandomization, randomization, LARGEST, "visual_randomization", "light_level"
         )
-        if randomization and num_envs != 1:
+        if randomization and on_gpu:
             raise InvalidArgumentError(
-                f"visual_randomization={randomization!r} needs num_envs=1, not {num_envs}: all environments of one process "
-                "look alike; use several processes"
+                f"visual_randomization={randomization!r} needs a simulation on the CPU with num_envs=1: on a GPU, all "
+                "environments of a process look alike; use several processes"
             )
 
     @property
@@ -86,7 +86,7 @@ class SceneryEnv(SensingEnv):
     @property
     def _default_human_render_camera_configs(self):
         pose = looking_at(np.array(VIDEO_CAMERA_AT), np.array(VIDEO_CAMERA_LOOKS_AT))
-        drawn = SIZE * SUPERSAMPLING
+        drawn = (SIZE if self.num_envs == 1 else SIZE_OF_MANY) * SUPERSAMPLING
         return CameraConfig(
             "render_camera",
             pose,
@@ -99,7 +99,8 @@ class SceneryEnv(SensingEnv):
         )
 
     def render_rgb_array(self, camera_name: str | None = None):
-        with fine_shadow(self._lamps, SHADOWS[self._quality]):
+        lamps = [] if self.gpu_sim_enabled else self._lamps  # a scene that a GPU simulates cannot be changed any more
+        with fine_shadow(lamps, SHADOWS[self._quality]):
             image = super().render_rgb_array(camera_name)
         return None if image is None else image.to(self.device)  # a GPU may render for a simulation on the CPU
 

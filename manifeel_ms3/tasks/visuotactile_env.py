@@ -4,7 +4,7 @@
 # (ManiSkill annotates camera poses as its own, and takes SAPIEN's)
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, NoReturn
+from typing import Any, ClassVar
 
 import numpy as np
 import sapien
@@ -15,20 +15,25 @@ from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConf
 from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.agents.fingers import Finger
 from manifeel_ms3.arguments import by_name, checked_action, one_of
-from manifeel_ms3.errors import InvalidArgumentError, MachineError
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import (
-    FORKED,
-    NO_RENDERER,
     available_render_backend,
-    renderer_lost,
     restrict_torch_after_fork,
 )
 from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
 
-from .checks import check_argument_names, check_base_arguments, checked_randomization, checked_reset, split_sensor_configs
-from .obs_modes import PAD, cameras_to_observe, has_images, pads_to_observe, split_obs_mode
+from .checks import (
+    check_argument_names,
+    check_base_arguments,
+    check_renderer,
+    checked_randomization,
+    checked_reset,
+    simulates_on_gpu,
+    split_sensor_configs,
+)
+from .obs_modes import PAD, cameras_to_observe, pads_to_observe, split_obs_mode
 from .registry import gym_id, instruction_of
 from .scenery import SPACING, SceneryEnv
 from .states import RestorableEnv, take_given_state
@@ -43,9 +48,9 @@ HOLD_SECONDS = 0.5
 """Time for which a goal must hold until the episode is a success, in s. Our choice."""
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s. Set once; not tuned."""
-MAX_CONTACTS, MAX_PATCHES = 2**21, 2**19
-"""Numbers of contacts and contact patches for which the engine reserves memory on a GPU: enough for many environments with
-threads and teeth."""
+GPU_MEMORY = GPUMemoryConfig(max_rigid_contact_count=2**21, max_rigid_patch_count=2**19, collision_stack_size=2**26)
+"""Numbers of contacts and contact patches, and bytes for candidates of contact, for which the engine reserves memory on a GPU:
+more than ManiSkill's defaults, since many environments have threads and teeth. Not tried out; the bytes are PhysX's default."""
 CONTACTS: dict[str, Any] = dict(
     enable_tgs=False,  # with TGS, friction of a compliant contact chatters and creeps (0.2 mm/s at a third of the cone)
     contact_offset=5e-4,  # m: clearances are below a millimetre
@@ -160,7 +165,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         }
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
         self._finger = self._finger_of([configs[side] for side in self._sides or SIDES])
-        self._set_looks(lighting, quality, visual_randomization or {}, kwargs.get("num_envs", 1))
+        self._set_looks(lighting, quality, visual_randomization or {}, simulates_on_gpu(kwargs))
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -172,8 +177,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         check_base_arguments(type(self), render_backend, kwargs)
         restrict_torch_after_fork()
         backend = available_render_backend(render_backend)
-        if backend == "none" and (wanted := self._wanted_images(own_mode, kwargs.get("render_mode"))):
-            self._refuse_images(wanted, is_asked_for=render_backend == "none")
+        check_renderer(backend, render_backend, own_mode, kwargs)
         super().__init__(
             *args,
             obs_mode=own_mode,
@@ -194,21 +198,6 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
                 "for both pads, instead of in `sensor_configs` for one"
             )
         return finger
-
-    @staticmethod
-    def _refuse_images(wanted: str, is_asked_for: bool) -> NoReturn:
-        """Refuse images without a renderer, which the caller has asked for, or which this machine does not have."""
-        if is_asked_for:
-            raise InvalidArgumentError(
-                f"render_backend='none' draws nothing, and {wanted} needs images; leave it out, or ask for no images"
-            )
-        raise MachineError((FORKED if renderer_lost() else NO_RENDERER).format(wanted=wanted))
-
-    @staticmethod
-    def _wanted_images(own_mode: str, render_mode: str | None) -> str:
-        if has_images(own_mode):
-            return f"obs_mode={own_mode!r}"
-        return f"render_mode={render_mode!r}" if render_mode else ""
 
     @property
     def obs_mode(self) -> str:
@@ -272,7 +261,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             spacing=SPACING,
             sim_freq=self.physics_rate,
             control_freq=CONTROL_FREQ,
-            gpu_memory_config=GPUMemoryConfig(max_rigid_contact_count=MAX_CONTACTS, max_rigid_patch_count=MAX_PATCHES),
+            gpu_memory_config=GPU_MEMORY,
             scene_config=SceneConfig(**self.contacts),
         )
 

@@ -32,7 +32,7 @@ from manifeel_ms3.evaluation.policy import Policy, PolicySource
 from manifeel_ms3.evaluation.report import evaluated_checkpoint
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.evaluation.video import act_again, replayed
-from manifeel_ms3.paths import CHECKPOINTS, LAST_LINK
+from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
 from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
@@ -218,10 +218,10 @@ def _policy(path: Path, result: dict[str, Any], args: Args) -> Policy:
     """The policy of a result."""
     if args.policy is not None:
         return PolicySource(policy=args.policy, kwargs=args.policy_kwargs).make()
-    expected = args.checkpoint or path.parent / CHECKPOINTS / LAST_LINK
+    expected = args.checkpoint or path.parent / CHECKPOINTS
     if not expected.is_dir():
         raise InvalidArgumentError(
-            f"{path} holds no actions, and there is no policy in {expected} that could act again; give its "
+            f"{path} holds no actions, and there is no checkpoint in {expected} whose policy could act again; give its "
             "--checkpoint or --policy"
         )
     checkpoint = args.checkpoint or evaluated_checkpoint(path, result)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from docs.make_entry_videos import video_of
 from manifeel_ms3.evaluation import evaluate
 from manifeel_ms3.evaluation.checkpoint_config import published_hash
 from manifeel_ms3.evaluation.entries import Entry, find_entry
@@ -24,7 +25,7 @@ SIZE = 80 * 10**6
 """Largest size of all checkpoints in the repository, in bytes."""
 
 
-def test_every_entry_that_succeeds_has_the_checkpoint_that_its_submission_names():
+def test_every_entry_that_succeeds_has_a_video_and_the_checkpoint_that_its_submission_names():
     results = sorted(BOARD.glob("*/**/seed0/*.json"))
     assert results
     for path in results:
@@ -33,6 +34,7 @@ def test_every_entry_that_succeeds_has_the_checkpoint_that_its_submission_names(
             assert result["success_once"]["rate"] == 0, path
             continue
         assert find_entry(path.parents[1].relative_to(BOARD).as_posix()).result == result
+        assert video_of(path).is_file(), "run `python -m docs.make_entry_videos`"
     assert sum(path.stat().st_size for path in BOARD.rglob("*.safetensors")) < SIZE
 
 

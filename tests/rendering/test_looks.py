@@ -68,6 +68,21 @@ def test_an_image_for_people_is_large_and_changes_no_policys_image(make_env):
 
 
 @needs_renderer
+def test_an_image_for_people_has_a_fine_shadow_whatever_that_of_the_policys_images(make_env):
+    pictures, of_policy = {}, {}
+    for quality in ("normal", "fast"):
+        env = make_env(obs_mode="rgb", cameras=("front",), render_mode="rgb_array", quality=quality)
+        of_policy[quality] = images(env, "front")["rgb"].astype(int)
+        pictures[quality] = env.render()
+        after = env.unwrapped.get_obs()["sensor_data"]["front"]["rgb"][0].numpy()
+        assert np.array_equal(after, of_policy[quality])
+    assert np.abs(of_policy["normal"] - of_policy["fast"]).max() > 50  # a shadow, and none
+    assert torch.equal(pictures["normal"], pictures["fast"])
+    env.unwrapped._lamps = []
+    assert (env.render().int() - pictures["fast"].int()).abs().max() > 50
+
+
+@needs_renderer
 def test_cameras_with_other_shaders_leave_the_images_of_the_rest_as_they_are(make_env):
     small = dict(width=32, height=32)
     options = dict(obs_mode="rgb", cameras=("front", "wrist"), render_mode="rgb_array", human_render_camera_configs=small)

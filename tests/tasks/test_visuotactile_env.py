@@ -12,7 +12,10 @@ from manifeel_ms3.arguments import checked_action
 from manifeel_ms3.errors import InvalidArgumentError, MachineError
 from manifeel_ms3.rendering.backend import NO_RENDERER
 from manifeel_ms3.tasks import registry, visuotactile_env
+from manifeel_ms3.tasks.checks import check_base_arguments, check_renderer
+from manifeel_ms3.tasks.insertion.peg_insertion import PegInsertionEnv
 from manifeel_ms3.tasks.obs_modes import split_obs_mode
+from manifeel_ms3.tasks.screwing.bulb_installation import BulbInstallationEnv
 from tests.tasks_and_marks import needs_renderer
 
 
@@ -194,6 +197,24 @@ def test_images_without_a_renderer_say_what_to_install(make_env, monkeypatch):
 def test_images_from_a_renderer_that_was_declined_are_refused(make_env):
     with pytest.raises(InvalidArgumentError, match="render_backend='none' draws nothing, and obs_mode='rgb' needs images"):
         make_env(obs_mode="rgb", render_backend="none")
+
+
+@pytest.mark.parametrize("on_gpu", [dict(sim_backend="physx_cuda"), dict(sim_backend="gpu:1"), dict(num_envs=2)])
+def test_a_renderer_on_the_cpu_is_refused_for_images_of_what_a_gpu_simulates(on_gpu):
+    with pytest.raises(
+        MachineError, match=r"obs_mode='rgb' needs images of a simulation on a GPU.* the renderer is on the CPU"
+    ):
+        check_renderer("cpu", "auto", "rgb", on_gpu)
+    check_renderer("cpu", "auto", "state", on_gpu)  # no images
+    check_renderer("cuda:1", "auto", "rgb", on_gpu)
+    check_renderer("cpu", "auto", "rgb", dict(sim_backend="auto", num_envs=1))
+
+
+def test_a_task_whose_contacts_do_not_exist_on_a_gpu_warns_there(monkeypatch, caplog):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for task, warns in ((BulbInstallationEnv, True), (PegInsertionEnv, False)):
+        check_base_arguments(task, "auto", dict(num_envs=2))
+        assert (f"{task.__name__} may not be playable on a GPU" in caplog.text) == warns
 
 
 def test_machine_without_vulkan_runs_what_needs_no_picture():
