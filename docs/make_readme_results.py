@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from textwrap import fill
 
+import numpy as np
+
 from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds, holm
 from manifeel_ms3.analysis.markdown import markdown_table
@@ -18,7 +20,7 @@ from manifeel_ms3.analysis.paper_comparison import gpu_of_training
 from manifeel_ms3.analysis.paper_tables import HEADINGS, overview_of_table_one
 from manifeel_ms3.analysis.protocol import ConditionResults, collect, of_the_protocol
 from manifeel_ms3.evaluation.floors import highest_floor
-from manifeel_ms3.evaluation.result import results_in
+from manifeel_ms3.evaluation.result import results_in, successes_by_the_paper
 from manifeel_ms3.files import write_text
 from manifeel_ms3.tasks.registry import task_spec
 
@@ -40,21 +42,27 @@ ROWS = {
 }
 """First cells of the rows, in the order of the table."""
 LEAD = """
-**What touch adds, in numbers:** success rates of Diffusion Policy with small networks, with the standard deviation (±) over
-{seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks. Bold rates are significantly
-above those of vision alone. Policies that have learnt nothing reach at most {floor:.0f} % in each of these tasks.
+**What touch adds, in numbers:** success rates (at any step of an episode) of Diffusion Policy with small networks, with the
+standard deviation (±) over {seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks.
+Bold rates are significantly above those of vision alone. Policies that have learnt nothing reach at most {floor:.0f} % in
+each of these tasks; in ObjectSearch and BallSortingDim, choosing one of the two places or balls at random would give 50 %.
 """
 DETAILS = """
-Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core{on_gpu}, with the paper's number of
-demonstrations, and evaluated on {episodes} initial states that no demonstration has. A preset is a set of training settings:
-`cpu_long` trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and
-in `cpu_noisy_pose` noise hides from it where the hand is. Each row has one preset: the last of `cpu`, `cpu_long`,
-`cpu_noisy_pose` and `cpu_targets` among those with which all three sensings were run with most training seeds. Rows without ±
-have one seed, so that their differences of less than about 35 points may be chance.
-"Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds.
+Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core that other work often shared{on_gpu}, with
+the paper's number of demonstrations, and evaluated on {episodes} initial states that no demonstration has. The presets were
+chosen by trials on these same states, mostly with one training seed, so that rates on other states may be lower. Success is
+stricter than in the paper's public code: by its threshold, {by_the_paper}. A preset is a set of training settings: `cpu_long`
+trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and in
+`cpu_noisy_pose` noise hides from it where the hand is. Each row has one preset: the last of `cpu`, `cpu_long`,
+`cpu_noisy_pose` and `cpu_targets` among those with which all three sensings were run with most training seeds; with which
+ones a second and third seed were run was decided after the first. Rows without ± have one seed, so that their differences of
+less than about 35 points may be chance. "Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates
+with three seeds.
 """
 """35 points are about twice the standard deviation of the difference between two rates, each of which varies over training
 seeds by 12 points, as those of PegInsertion with touch do."""
+STRICTER = "PegReorientation"
+"""Task whose success here is far stricter than by the threshold of the paper's public code."""
 WIDTH = 140
 """Width of README's lines, in characters."""
 
@@ -83,6 +91,7 @@ def block() -> str:
         seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
         tests=len(gains),
+        by_the_paper=f"{STRICTER} has {_in_words(_rates_by_the_paper(here))} %",
         floor=100 * max(floor.rate for spec in map(task_spec, ROWS) if (floor := highest_floor(spec.env_id, spec.revision))),
     )
     raised = {place for place, p_holm in gains.items() if p_holm < SIGNIFICANT}
@@ -107,6 +116,17 @@ def _corrected_gains(results: Results) -> dict[tuple[str, str], float]:
     return {
         place: p_holm if gain.value > 0 else 1.0 for (place, (gain, _)), p_holm in zip(tested.items(), corrected, strict=True)
     }
+
+
+def _rates_by_the_paper(results: Results) -> list[str]:
+    """Success in `STRICTER` by the threshold of the paper's public code with each sensing, in percent."""
+    episodes = [successes_by_the_paper(results[STRICTER, mode].episodes) for mode in MODES]
+    return [f"{100 * np.mean(successes):.0f}" for successes in episodes if successes is not None]
+
+
+def _in_words(items: list[str]) -> str:
+    *others, last = items
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _cells(task: str, results: Results, raised: set[tuple[str, str]]) -> Iterator[str]:

@@ -26,9 +26,9 @@ from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, Visuotact
 
 DOCS = Path(__file__).parent
 CARDS, VIDEOS, PICTURES = DOCS / "tasks", DOCS / "videos", DOCS / "images" / "tasks"
-RESULT_COLUMNS = 17
+RESULT_COLUMNS = 18
 """Number of columns of the table of docs/results.md that says what was run."""
-NOT_ON_CARDS = ("std", "id", "on")
+NOT_ON_CARDS = ("std", "id", "on", "row in the study")
 """Columns of that table that a card leaves out."""
 MADE = "*Made by `python -m docs.make_task_cards` from the class of the task, the registry and what was measured.*\n"
 CAPTION = "The scene, the front, side and wrist cameras, and the left and right pads, after four fifths of a demonstration."

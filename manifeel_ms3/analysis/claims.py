@@ -27,7 +27,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition
 from .encoder_ranking import ranking_tables
-from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, p_text
+from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, hardly_succeed, has_enough_seeds, holm, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper import TACFF, TACSL, TWIN_RATES, paper_condition, reported, twin_condition
@@ -39,8 +39,6 @@ log = logging.getLogger(__name__)
 Verdict = Literal["holds", "does not hold", "undecided", "too few seeds"]
 MARGIN = 0.05
 """Largest gain in success that counts as none where a claim says that there is no gain: five points, our choice."""
-NEAR_NO_SUCCESS = 0.1
-"""Success below which two conditions decide nothing about a claim that there is no gain: both hardly learn the task."""
 MANY_TESTS = """Differences are in percentage points; "the paper" has its own. Interval, p and verdict are each of one
 comparison alone. A pair of which a condition has fewer than {seeds} training seeds has no verdict ("too few seeds"), since two
 runs that differ in their seed alone often differ as much; its interval is of these runs only. The table tests {pairs} of
@@ -93,19 +91,19 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
     outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
     for (comparison, settings), pair in pairs.items():
         (gap, _), test = differences[pair], frozenset(pair)
-        best = max(float(found[condition].success.mean()) for condition in pair)
-        verdict = _verdict(comparison, gap, best) if test in tests else "too few seeds"
+        is_learnt = not hardly_succeed(*(found[condition] for condition in pair))
+        verdict = _verdict(comparison, gap, is_learnt) if test in tests else "too few seeds"
         outcomes[comparison].append(ClaimResult(gap, tests.get(test), corrected.get(test), verdict, settings, test))
     return outcomes
 
 
-def _verdict(comparison: Comparison, gap: Estimate, best: float) -> Verdict:
-    """The verdict on a claim, given the difference and the higher success of the two conditions."""
+def _verdict(comparison: Comparison, gap: Estimate, is_learnt: bool) -> Verdict:
+    """The verdict on a claim, given the difference, and whether one of the two conditions has learnt its task."""
     if comparison.gain:
         return "holds" if gap.low > 0 else "does not hold" if gap.high < 0 else "undecided"
     if gap.low > 0:
         return "does not hold"
-    return "holds" if gap.high < MARGIN and best >= NEAR_NO_SUCCESS else "undecided"
+    return "holds" if gap.high < MARGIN and is_learnt else "undecided"
 
 
 def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> str:

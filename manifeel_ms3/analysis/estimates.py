@@ -29,6 +29,8 @@ FEWEST_SEEDS = 3
 """Number of training seeds of a condition from which a difference says something about training, as many as in the paper's
 protocol. Two runs that differ in their seed alone differ as much as two conditions often do: of the pairs of such runs in
 leaderboard/cpu, more than one in ten have a p-value below 0.05 on the same 50 initial states."""
+NEAR_NO_SUCCESS = 0.1
+"""Success below which two conditions decide nothing on what a difference is not: both hardly learn the task."""
 SMALLEST_SHOWN = 0.001
 """Smallest p-value that tables show as a number."""
 NO_SPREAD = 1e-12
@@ -66,7 +68,10 @@ def mean_success(*tasks: ConditionResults) -> Estimate:
         succeeded, episodes = int(tasks[0].success.sum()), len(tasks[0].episode_seeds)
         return Estimate(succeeded / episodes, *wilson_interval(succeeded, episodes))
     rng = np.random.default_rng(0)
-    drawn = [_resampled_means(_rates(task), _weights(rng, len(task.episode_seeds)), rng) for task in tasks]
+    drawn = [
+        _resampled_means(_rates(task), _weights(rng, len(task.episode_seeds)), _weights(rng, len(task.success)))
+        for task in tasks
+    ]
     value = float(np.mean([task.success.mean() for task in tasks]))
     return _estimate(value, np.mean(drawn, axis=0), tasks, lowest=0.0)
 
@@ -92,18 +97,24 @@ def difference(first: ConditionResults, second: ConditionResults) -> tuple[Estim
 def mean_difference(pairs: Sequence[Pair]) -> tuple[Estimate, float]:
     """Mean over pairs of how much more often the first condition succeeds, and the p-value of no difference on average.
 
-    Each pair weighs the same; seeds and initial states are drawn for each pair apart, as for different tasks.
+    Each pair weighs the same. Initial states are drawn for each pair apart, as for different tasks, but the training seeds of a
+    side for all pairs at once, because a seed gives the same initial weights and noise in every task.
 
     Raises:
         ResultError: The conditions of a pair were evaluated on different episodes.
     """
     rng = np.random.default_rng(0)
     values, resampled = [], []
+    seeds: dict[tuple[int, int], np.ndarray] = {}
     for pair in pairs:
         sides = _paired_rates(*pair)
         starts = _weights(rng, len(pair[0].episode_seeds))
+        for side in ((k, len(rates)) for k, rates in enumerate(sides)):
+            if side not in seeds:
+                seeds[side] = _weights(rng, side[1])
         values.append(float(sides[0].mean() - sides[1].mean()))
-        resampled.append(np.subtract(*(_resampled_means(rates, starts, rng) for rates in sides)))
+        means = (_resampled_means(rates, starts, seeds[k, len(rates)]) for k, rates in enumerate(sides))
+        resampled.append(np.subtract(*means))
     drawn = np.mean(resampled, axis=0)
     rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
     p_value = float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
@@ -120,6 +131,11 @@ def p_text(p_value: float | None) -> str | None:
 def has_enough_seeds(*conditions: ConditionResults) -> bool:
     """Whether each condition has so many training seeds that their difference says something about training."""
     return all(len(results.success) >= FEWEST_SEEDS for results in conditions)
+
+
+def hardly_succeed(*conditions: ConditionResults) -> bool:
+    """Whether all conditions succeed so rarely that a small difference between them says nothing (`NEAR_NO_SUCCESS`)."""
+    return max(float(results.success.mean()) for results in conditions) < NEAR_NO_SUCCESS
 
 
 def _mcnemar(first: np.ndarray, second: np.ndarray) -> float:
@@ -161,7 +177,7 @@ def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.
         same = (task, tuple(results.episode_seeds))
         if same not in starts:
             starts[same] = _weights(rng, len(results.episode_seeds))
-        drawn.append(_resampled_means(_rates(results), starts[same], rng))
+        drawn.append(_resampled_means(_rates(results), starts[same], _weights(rng, len(results.success))))
     return np.array(drawn)
 
 
@@ -194,9 +210,9 @@ def _weights(rng: np.random.Generator, count: int) -> np.ndarray:
     return 1 / count + (drawn - 1 / count) * np.sqrt(count / max(count - 1, 1))
 
 
-def _resampled_means(rates: np.ndarray, starts: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Means (RESAMPLES,) of rates (training seeds, episodes), given the weights of the episodes."""
-    return np.einsum("rs,se,re->r", _weights(rng, len(rates)), rates, starts, optimize=True)
+def _resampled_means(rates: np.ndarray, starts: np.ndarray, seeds: np.ndarray) -> np.ndarray:
+    """Means (RESAMPLES,) of rates (training seeds, episodes), given the weights of the episodes and of the seeds."""
+    return np.einsum("rs,se,re->r", seeds, rates, starts, optimize=True)
 
 
 def _estimate(value: float, drawn: np.ndarray, of: Sequence[ConditionResults], lowest: float) -> Estimate:

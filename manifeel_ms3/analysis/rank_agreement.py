@@ -9,6 +9,7 @@ compares: sensing, policies or encoders. Intervals are from a bootstrap over our
 rates are taken as they are.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,8 @@ from .protocol import ConditionResults
 
 FEWEST = 3
 """Smallest number of conditions whose order is compared."""
+NO_INTERVAL = (math.nan, math.nan)
+"""Ends of the interval of a measure that has none."""
 RESAMPLES = 1000
 """Number of resamples of an interval; fewer than for a rate, since each takes an order of all conditions."""
 TEXT = """
@@ -32,8 +35,8 @@ TEXT = """
 
 Whether our results rank the paper's conditions as the paper does, by Kendall's tau (1: the same order, -1: the reverse) and
 the mean maximum rank violation (MMRV; 0: the same order), with 95 % intervals from a bootstrap over our training seeds and
-initial states; conditions with one training seed add no variation over training to it. "Within
-tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
+initial states; conditions with one training seed add no variation over training to it, and there is no interval where all
+have one. "Within tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
 difficult the tasks are.
 
 """
@@ -54,10 +57,11 @@ class Ranked:
 
 
 class Agreement(Estimate):
-    """A measure of agreement with its interval of 95 %; it is not a share, and not written in percent."""
+    """A measure of agreement with its interval of 95 %, NaN if it has none; it is not a share, and not written in percent."""
 
     def __str__(self) -> str:
-        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        interval = "" if math.isnan(self.low) else f" [{self.low:.2f}, {self.high:.2f}]"
+        return f"{self.value:.2f}{interval}"
 
 
 def rank_table(found: Found) -> str:
@@ -85,6 +89,9 @@ def agreement_of(ranked: Sequence[Ranked], groups: Sequence[Sequence[int]]) -> t
     """
     paper = np.array([one.paper for one in ranked])
     ours = np.array([one.results.success.mean() for one in ranked])
+    if all(len(one.results.success) == 1 for one in ranked):  # nothing says how much they vary with the training seed
+        values = mean_tau(paper, ours, groups), rank_violation(paper, ours, groups)
+        return Agreement(values[0], *NO_INTERVAL), Agreement(values[1], *NO_INTERVAL)
     drawn = resampled_success([(one.condition.env_id, one.results) for one in ranked])[:, :RESAMPLES]
     tau = _with_interval(lambda rates: mean_tau(paper, rates, groups), ours, drawn)
     return tau, _with_interval(lambda rates: rank_violation(paper, rates, groups), ours, drawn)

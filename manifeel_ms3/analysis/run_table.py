@@ -64,7 +64,7 @@ def table_of_runs(
     )
     yield AGAIN
     if study is not None:
-        yield MADE_BY.format(study=shown(study.as_posix()))
+        yield MADE_BY.format(study=study.as_posix())
 
 
 def _code(text: str | None) -> str | None:
@@ -73,9 +73,13 @@ def _code(text: str | None) -> str | None:
 
 
 def _by_the_paper(results: ConditionResults) -> str | None:
-    """Share of the episodes that met the threshold of the paper's public code; None where some were not measured."""
-    successes = successes_by_the_paper(results.episodes)
-    return percent(None if successes is None else float(np.mean(successes)))
+    """Share of the episodes that met the threshold of the paper's public code, over the training seeds that measured it."""
+    count, size = len(results.success), len(results.episodes) // len(results.success)
+    of_seeds = [successes_by_the_paper(results.episodes[k * size : (k + 1) * size]) for k in range(count)]
+    measured = [successes for successes in of_seeds if successes is not None]
+    if not measured:
+        return None
+    return f"{np.mean(measured):.0%}" + (f", {len(measured)} of {count} seeds" if len(measured) < count else "")
 
 
 def _floor(condition: Condition) -> str | None:

@@ -79,9 +79,10 @@ def test_more_than_one_in_ten_pairs_of_published_runs_differ_by_their_seed_alone
 
 
 def test_p_values_are_corrected_for_all_comparisons_of_the_page(tmp_path):
-    for task, seed in product(("PegInsertion", "USBInsertion", "PowerPlugInsertion"), range(3)):
+    rates = dict(PegInsertion=0.28, USBInsertion=0.3, PowerPlugInsertion=0.36)
+    for (task, rate), seed in product(rates.items(), range(3)):
         write_run(tmp_path, VISION, 0.2, seed, task=task)
-        write_run(tmp_path, TACFF, 0.31, seed, task=task)
+        write_run(tmp_path, TACFF, rate, seed, task=task)
     write_run(tmp_path, VISION, 0.2, task="GearAssembly")
     write_run(tmp_path, TACFF, 0.9, task="GearAssembly")
     *found, single = [outcome for _, _, outcome in answered(tmp_path)]
@@ -117,6 +118,15 @@ def test_the_page_says_what_touch_adds_to_vision(tmp_path):
         write_run(tmp_path, TACFF, 0.5, seed)
     (paragraph,) = (line for line in text_of(tmp_path).splitlines() if line.startswith("**PegInsertion** (paper): "))
     assert re.search(change.format(""), paragraph)
+
+
+def test_a_change_between_rates_near_zero_contradicts_no_paper(tmp_path):
+    for folder, rates in (("low", (0.08, 0.02)), ("high", (0.4, 0.3))):
+        for (mode, rate), seed in product(zip((VISION, TACFF), rates, strict=True), range(3)):
+            write_run(tmp_path / folder, mode, rate, seed)
+    assert "TacFF changes success by -6" in text_of(tmp_path / "low")
+    assert "which this contradicts" not in text_of(tmp_path / "low")
+    assert "the paper: +26, which this contradicts" in text_of(tmp_path / "high")
 
 
 def test_what_the_audit_found_stands_beside_what_touch_adds(tmp_path):

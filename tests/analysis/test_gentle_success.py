@@ -53,6 +53,9 @@ def test_the_page_of_results_has_the_column_and_the_figure(runs, tmp_path):
     assert [row.split(" | ")[place] for row in rows[:2]] == [f"20% up to {LIMIT:g} N", f"37% up to {LIMIT:g} N"]
     place = header.split(" | ").index("by the paper's threshold")
     assert [row.split(" | ")[place] for row in rows[:2]] == ["60%", ""]
+    write_run(runs, VISION, 0.2, seed=1)  # has not measured it
+    rows = page_of(runs, tmp_path / "results.md").split("## What was run\n\n")[1].splitlines()[2:]
+    assert [row.split(" | ")[place] for row in rows[:2]] == ["60%, 1 of 2 seeds", ""]
     assert "(images/results_gentle.png)" in page
     assert cv2.imread(str(tmp_path / "images/results_gentle.png")).std() > 5
 

@@ -256,6 +256,14 @@ def test_a_mean_difference_weighs_tasks_the_same_and_varies_less_than_one_of_the
     assert mean_difference(pairs[:1]) == difference(*pairs[0])
 
 
+def test_a_mean_difference_varies_with_what_a_seed_does_in_every_task():
+    """Two of three seeds always succeed and one never does, in all tasks alike: many tasks are no better known than one."""
+    good_and_bad = np.repeat(np.array([1.0, 1.0, 0.0])[:, None, None], 50, axis=2)
+    alike = ConditionResults(good_and_bad, list(range(50))), ConditionResults(np.zeros((3, 1, 50)), list(range(50)))
+    one, many = (mean_difference([alike] * count)[0] for count in (1, 5))
+    assert (many.low, many.high) == pytest.approx((one.low, one.high), abs=0.01)
+
+
 def test_another_draw_of_resamples_hardly_changes_a_p_value(rng):
     first, second = runs(rng, 0.5), runs(rng, 0.45)
     (_, p), (_, reverse) = difference(first, second), difference(second, first)  # seeds are drawn for the first one first

@@ -56,6 +56,14 @@ def test_intervals_hold_the_value_and_shrink_with_what_is_certain():
     assert violation.high > 0.3
 
 
+def test_single_runs_have_no_interval_of_agreement():
+    single = [
+        Ranked(one.condition, one.paper, ConditionResults(one.results.success[:1], list(range(50))))
+        for one in ranked([0.1, 0.4, 0.7, 0.95])
+    ]
+    assert [str(measure) for measure in agreement_of(single, ALL)] == ["1.00", "0.00"]
+
+
 def test_the_page_ranks_three_conditions_or_more(tmp_path):
     for mode, rate in zip(MODES, (0.2, 0.3, 0.6), strict=True):
         if (tmp_path / "runs").exists():  # one or two conditions
