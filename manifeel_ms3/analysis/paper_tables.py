@@ -199,7 +199,7 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
         from matplotlib.figure import Figure
     drawn = {(task, mode): mean_success(found[one]) for task, (_, by_mode) in overview.items() for mode, one in by_mode.items()}
     tasks = list(TABLE_I)
-    names = [f"{task}\n({overview[task][0].preset})" if task in overview else task for task in tasks]
+    names = [_name_in_chart(task, overview, found) for task in tasks]
     fig = Figure(figsize=PANEL, layout="constrained")
     ax = fig.subplots()
     for k, mode in enumerate(MODES):
@@ -214,6 +214,15 @@ def draw_sensing_by_task(found: Found, out: Path) -> bool:
     ax.legend(ncols=1 + len(MODES), fontsize=LEGEND_SIZE, loc="upper left")
     save_figure(fig, out, DPI)
     return True
+
+
+def _name_in_chart(task: str, overview: Mapping[str, tuple[TrainingSettings, dict[str, Condition]]], found: Found) -> str:
+    """Name of a task, with the preset of its bars, and whether they are of one training seed."""
+    if task not in overview:
+        return task
+    settings, by_mode = overview[task]
+    seeds = ", one seed" if all(len(found[condition].success) == 1 for condition in by_mode.values()) else ""
+    return f"{task}\n({settings.preset}{seeds})"
 
 
 def _draw_bars(ax: Any, shift: float, estimates: list[Estimate | None], mode: str) -> None:
