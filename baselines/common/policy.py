@@ -71,7 +71,7 @@ class PolicyConfig:
     and says how far the work has come."""
     touch_noise: float = 0.0
     """Standard deviation of the noise that training adds to every value of TacRGB images and force fields, where they have the
-    range [-1, 1]. Without noise, touch can tell a policy in which of a few demonstrations it is and how the hand moves."""
+    range [-1, 1]; docs/trials.md has a trial."""
     noise_draws: int = 1
     """Number of noise samples for each observation in a loss; more cost little where the encoder takes most of the time."""
 

@@ -30,7 +30,7 @@ FEWEST_SEEDS = 3
 protocol. Two runs that differ in their seed alone differ as much as two conditions often do: of the pairs of such runs in
 leaderboard/cpu, more than one in ten have a p-value below 0.05 on the same 50 initial states."""
 NEAR_NO_SUCCESS = 0.1
-"""Success below which two conditions decide nothing on what a difference is not: both hardly learn the task."""
+"""Success below which two conditions decide nothing about a small difference: both hardly learn the task."""
 SMALLEST_SHOWN = 0.001
 """Smallest p-value that tables show as a number."""
 NO_SPREAD = 1e-12
@@ -109,12 +109,13 @@ def mean_difference(pairs: Sequence[Pair]) -> tuple[Estimate, float]:
     for pair in pairs:
         sides = _paired_rates(*pair)
         starts = _weights(rng, len(pair[0].episode_seeds))
-        for side in ((k, len(rates)) for k, rates in enumerate(sides)):
-            if side not in seeds:
-                seeds[side] = _weights(rng, side[1])
+        means = []
+        for k, rates in enumerate(sides):
+            if (k, len(rates)) not in seeds:
+                seeds[k, len(rates)] = _weights(rng, len(rates))
+            means.append(_resampled_means(rates, starts, seeds[k, len(rates)]))
         values.append(float(sides[0].mean() - sides[1].mean()))
-        means = (_resampled_means(rates, starts, seeds[k, len(rates)]) for k, rates in enumerate(sides))
-        resampled.append(np.subtract(*means))
+        resampled.append(means[0] - means[1])
     drawn = np.mean(resampled, axis=0)
     rarer = min((drawn <= 0).sum(), (drawn >= 0).sum())
     p_value = float(min(1.0, 2 * (1 + rarer) / (1 + RESAMPLES)))
@@ -134,7 +135,7 @@ def has_enough_seeds(*conditions: ConditionResults) -> bool:
 
 
 def hardly_succeed(*conditions: ConditionResults) -> bool:
-    """Whether all conditions succeed so rarely that a small difference between them says nothing (`NEAR_NO_SUCCESS`)."""
+    """Whether all conditions succeed so rarely that a small difference between them says nothing."""
     return max(float(results.success.mean()) for results in conditions) < NEAR_NO_SUCCESS
 
 
