@@ -180,6 +180,7 @@ def _for_page(row: Row) -> dict[str, Any]:
         link=about.link,
         config=json.dumps(dict(sorted(results[-1]["config"].items())), indent=1),
         curves=json.dumps(_curves(results)),
+        steps=row.results.success.shape[1],
         videos=[base64.b64encode(video).decode() for video in row.submission.videos_of(row.files)],
     )
 
