@@ -32,7 +32,7 @@ from tests.tasks_and_marks import PEG
 from tests.trajectories import changed_copy
 from tests.trust.running_evaluations import wait_for_episodes
 
-POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, {})}
+POLICIES = {"diffusion": (diffusion, {}), "equivariant": (equivariant, {}), "flow": (flow, dict(noise_draws=8))}
 POLICIES["consistency"] = (flow, dict(consistency=True))
 QUICK = ["diffusion", "flow", "consistency", pytest.param("equivariant", marks=pytest.mark.slow)]
 """All policies; the equivariant one, whose convolutions are slow on a CPU, only in the slow run."""
