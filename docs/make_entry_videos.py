@@ -6,7 +6,7 @@ entry's results anew deletes its video (`baselines.studies.publish`).
 
 from pathlib import Path
 
-from manifeel_ms3.evaluation.entries import VIDEO_SUFFIX, VIDEOS
+from manifeel_ms3.evaluation.entries import ABOUT, VIDEO_SUFFIX, VIDEOS
 from manifeel_ms3.evaluation.result import read_result
 from manifeel_ms3.paths import CHECKPOINTS, leaderboard_dir
 from manifeel_ms3.videos.__main__ import Args
@@ -32,9 +32,8 @@ def main() -> None:
 
 def video_of(result: Path) -> Path:
     """Path of the video of an entry, given by its result file, such as leaderboard/cpu/PegInsertion/rgb/seed0/00007000.json."""
-    entry = result.parents[1]
-    submission = leaderboard_dir() / entry.relative_to(leaderboard_dir()).parts[0]
-    name = entry.relative_to(submission)
+    submission = next(folder for folder in result.parents if (folder / ABOUT).is_file())
+    name = result.parents[1].relative_to(submission)
     return (submission / VIDEOS / name).with_name(f"{name.name}{VIDEO_SUFFIX}")
 
 

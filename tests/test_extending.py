@@ -107,7 +107,7 @@ def test_a_policy_is_trained_and_evaluated_and_its_result_is_taken(site, checkpo
 def test_a_study_plans_a_task_and_a_policy(site):
     (site / "study.yaml").write_text(STUDY)
     table = done(site, "study", "study.yaml", "--dry-run")
-    assert "LiftBlock, regression, rgb+tacff, wrist" in table
+    assert "LiftBlock, regression, cpu, rgb+tacff, wrist, 10 demonstrations" in table
     assert "all jobs that are left" in table
     assert f"manifeel record {TASK} --num 10" in done(site, "study", "study.yaml", "--print-commands")
 

@@ -27,7 +27,7 @@ from manifeel_ms3.files import write_text
 
 from .condition import Condition
 from .encoder_ranking import ranking_tables
-from .estimates import FEWEST_SEEDS, SIGNIFICANT, Estimate, difference, hardly_succeed, has_enough_seeds, holm, p_text
+from .estimates import FEWEST_SEEDS, NEAR_NO_SUCCESS, SIGNIFICANT, Estimate, difference, has_enough_seeds, holm, p_text
 from .markdown import markdown_table
 from .matching import Found, answering_all
 from .paper import TACFF, TACSL, TWIN_RATES, paper_condition, reported, twin_condition
@@ -91,19 +91,19 @@ def results_of_claims(found: Found) -> dict[Comparison, list[ClaimResult]]:
     outcomes: dict[Comparison, list[ClaimResult]] = {comparison: [] for comparison in comparisons()}
     for (comparison, settings), pair in pairs.items():
         (gap, _), test = differences[pair], frozenset(pair)
-        is_learnt = not hardly_succeed(*(found[condition] for condition in pair))
-        verdict = _verdict(comparison, gap, is_learnt) if test in tests else "too few seeds"
+        best = max(float(found[condition].success.mean()) for condition in pair)
+        verdict = _verdict(comparison, gap, best) if test in tests else "too few seeds"
         outcomes[comparison].append(ClaimResult(gap, tests.get(test), corrected.get(test), verdict, settings, test))
     return outcomes
 
 
-def _verdict(comparison: Comparison, gap: Estimate, is_learnt: bool) -> Verdict:
-    """The verdict on a claim, given the difference, and whether one of the two conditions has learnt its task."""
+def _verdict(comparison: Comparison, gap: Estimate, best: float) -> Verdict:
+    """The verdict on a claim, given the difference and the higher success of the two conditions."""
     if comparison.gain:
         return "holds" if gap.low > 0 else "does not hold" if gap.high < 0 else "undecided"
     if gap.low > 0:
         return "does not hold"
-    return "holds" if gap.high < MARGIN and is_learnt else "undecided"
+    return "holds" if gap.high < MARGIN and best >= NEAR_NO_SUCCESS else "undecided"
 
 
 def claims_page(found: Found, answered: dict[Comparison, list[ClaimResult]]) -> str:

@@ -134,11 +134,6 @@ def has_enough_seeds(*conditions: ConditionResults) -> bool:
     return all(len(results.success) >= FEWEST_SEEDS for results in conditions)
 
 
-def hardly_succeed(*conditions: ConditionResults) -> bool:
-    """Whether all conditions succeed so rarely that a small difference between them says nothing."""
-    return max(float(results.success.mean()) for results in conditions) < NEAR_NO_SUCCESS
-
-
 def _mcnemar(first: np.ndarray, second: np.ndarray) -> float:
     """P-value of McNemar's exact test of paired outcomes, 0 or 1 (episodes)."""
     from scipy.stats import binomtest  # takes a third of a second, needed only where two single runs are compared

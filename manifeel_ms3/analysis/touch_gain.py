@@ -11,7 +11,7 @@ from manifeel_ms3.evaluation.result import ResultError
 
 from .condition import Condition, by_condition
 from .episode_endings import Results, endings_of
-from .estimates import SIGNIFICANT, Pair, difference, hardly_succeed, has_enough_seeds, mean_difference
+from .estimates import NEAR_NO_SUCCESS, SIGNIFICANT, Pair, difference, has_enough_seeds, mean_difference
 from .markdown import markdown_table, shown
 from .matching import Found, answering, of_table_one
 from .paper import DP, MODES, TABLE_I, TABLE_II, VISION, Rate, paper_condition, tasks_in_table
@@ -138,7 +138,7 @@ def _gain(task: str, mode: str, conditions: dict[str, Condition], found: Found) 
     verdict = "not significant; " if p_value >= SIGNIFICANT else ""
     if not has_enough_seeds(touched, seen):
         verdict = "too few training seeds to tell; "
-    elif not gain.low <= change <= gain.high and not hardly_succeed(touched, seen):
+    elif not gain.low <= change <= gain.high and max(touched.success.mean(), seen.success.mean()) >= NEAR_NO_SUCCESS:
         papers += ", which this contradicts"
     return f"{NAMES[mode]} changes success by {gain.signed} points ({verdict}{papers})"
 

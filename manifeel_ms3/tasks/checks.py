@@ -121,7 +121,7 @@ def check_base_arguments(task: type[BaseEnv], render_backend: Any, given: Mappin
 def simulates_on_gpu(given: Mapping[str, Any]) -> bool:
     """Whether arguments of ManiSkill's `BaseEnv` ask for a simulation on a GPU."""
     name = str(given.get("sim_backend", "auto")).partition(":")[0]
-    return given.get("num_envs", 1) > 1 if name == "auto" else sim_backend_name_mapping.get(name) == "physx_cuda"
+    return given.get("num_envs", 1) != 1 if name == "auto" else sim_backend_name_mapping.get(name) == "physx_cuda"
 
 
 def check_renderer(backend: str, asked: str, own_mode: str, given: Mapping[str, Any]) -> None:

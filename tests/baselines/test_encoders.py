@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18, cropped, network_images
+from baselines.common.encoders import EncoderConfig, ObservationEncoder, ResNet18
+from baselines.common.images import cropped, network_images
 from baselines.common.observation import POSE, observation_spec
 from manifeel_ms3.errors import InvalidArgumentError
 
