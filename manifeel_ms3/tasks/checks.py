@@ -153,12 +153,11 @@ def check_renderer(backend: str, asked: str, own_mode: str, given: Mapping[str, 
         raise MachineError(OTHER_DEVICE.format(wanted=wanted))
 
 
-def _check_backend(argument: str, given: Any, allowed: Sequence[str], with_device: Sequence[str] = ()) -> str:
-    """The name of a backend without the device that may follow it, as in "cuda:1"; others must have a device."""
+def _check_backend(argument: str, given: Any, allowed: Sequence[str], with_device: Sequence[str] = ()) -> None:
+    """Check the name of a backend, which a device may follow, as in "cuda:1"; those in `with_device` must have one."""
     name, *device = str(given).split(":")
     if name not in (*allowed, *(with_device if device else ())):
         raise InvalidArgumentError(f"{argument}={given!r} is unknown; choose from {list(allowed)}")
-    return name
 
 
 def _check_num_envs(num_envs: Any) -> None:

@@ -16,10 +16,7 @@ from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.agents.fingers import Finger
 from manifeel_ms3.arguments import by_name, checked_action, one_of
 from manifeel_ms3.errors import InvalidArgumentError
-from manifeel_ms3.rendering.backend import (
-    available_render_backend,
-    restrict_torch_after_fork,
-)
+from manifeel_ms3.rendering.backend import available_render_backend, restrict_torch_after_fork
 from manifeel_ms3.rendering.presentation import drawn_sizes
 from manifeel_ms3.sensors import TactileSensorConfig
 from manifeel_ms3.sensors.registry import DEFAULT_SENSOR, task_sensor
