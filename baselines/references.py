@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3.agents.panda_gelsight import ACTION_AXES
+from manifeel_ms3.arguments import one_of
 from manifeel_ms3.demonstrations import read_demonstrations
 from manifeel_ms3.evaluation.checkpoint_config import checkpoint_config
 from manifeel_ms3.evaluation.policy import EpisodePolicy
@@ -31,10 +32,14 @@ class RandomActions(EpisodePolicy):
     Args:
         env_id: Id of the task.
         control_mode: Controller that takes the actions; the task's own if not given.
+
+    Raises:
+        InvalidArgumentError: Actions of the control mode are no steps of the tool.
     """
 
     def __init__(self, env_id: str, control_mode: str | None = None):
-        self._size = len(ACTION_AXES[control_mode or task_spec(env_id).env_class.default_control_mode])
+        mode = control_mode or task_spec(env_id).env_class.default_control_mode
+        self._size = len(ACTION_AXES[one_of("control_mode", mode, ACTION_AXES)])
         self._rng = np.random.default_rng(0)
 
     def reset(self) -> None:

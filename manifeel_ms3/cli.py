@@ -77,34 +77,39 @@ def all_commands() -> dict[str, Command]:
     Raises:
         PluginError: A plug-in does not import, is not a `Command`, or has the name of one of the package's own commands.
     """
-    commands = dict(COMMANDS)
-    for name in plugins.registered(plugins.COMMANDS):
-        command = plugins.load(plugins.COMMANDS, name)
-        if not isinstance(command, Command):
-            raise PluginError(f"the plug-in command {name!r} is {command!r}; it must be a manifeel_ms3.plugins.Command")
-        if name in COMMANDS:
-            raise PluginError(
-                f"the plug-in command {name!r} ({command.module}) has the name of one of manifeel's own; rename it"
-            )
-        commands[name] = command
-    return commands
+    return COMMANDS | {name: _of_plugin(name) for name in plugins.registered(plugins.COMMANDS)}
+
+
+def _of_plugin(name: str) -> Command:
+    command = plugins.load(plugins.COMMANDS, name)
+    if not isinstance(command, Command):
+        raise PluginError(f"the plug-in command {name!r} is {command!r}; it must be a manifeel_ms3.plugins.Command")
+    if name in COMMANDS:
+        raise PluginError(f"the plug-in command {name!r} ({command.module}) has the name of one of manifeel's own; rename it")
+    return command
+
+
+def _command(name: str) -> Command | None:
+    """The command of a name, without the import of other plug-ins, which may be broken; None if there is none."""
+    if name in COMMANDS:
+        return COMMANDS[name]
+    return _of_plugin(name) if name in plugins.registered(plugins.COMMANDS) else None
 
 
 def _run(arguments: list[str]) -> Any:
-    commands = all_commands()
     if arguments == ["--version"]:
         sys.stdout.write(f"manifeel-ms3 {version('manifeel-ms3')}\n")
         return None
-    if arguments and arguments[0] in commands:
-        name = arguments[0]
-        module = command_module(name)
+    if arguments and (command := _command(name := arguments[0])):
+        module = _module_of(command)
         getattr(module, "check_arguments", lambda _: None)(arguments[1:])
-        args = tyro.cli(module.Args, prog=f"manifeel {name}", description=commands[name].about, args=arguments[1:])
+        args = tyro.cli(module.Args, prog=f"manifeel {name}", description=command.about, args=arguments[1:])
         import_typed_tasks(args)
         answer = module.main(args)
         if hasattr(module, "next_step"):
             log.info("%s", module.next_step(args, answer))
         return answer
+    commands = all_commands()
     if arguments and not arguments[0].startswith("-"):
         raise UnknownNameError(
             f"{arguments[0]!r} is not a command; choose from {list(commands)}{meant(arguments[0], commands)}"
@@ -112,7 +117,7 @@ def _run(arguments: list[str]) -> Any:
     completion = any("-completion" in argument for argument in arguments)
     forms: list[Any] = [
         Annotated[
-            command_module(name).Args if completion else _NotImported, tyro.conf.subcommand(name, description=command.about)
+            _module_of(command).Args if completion else _NotImported, tyro.conf.subcommand(name, description=command.about)
         ]
         for name, command in commands.items()
     ]
@@ -122,13 +127,18 @@ def _run(arguments: list[str]) -> Any:
 
 
 def command_module(name: str) -> Any:
-    """The module of a command, with its `Args` and `main`.
+    """The module of the command of a name, with its `Args` and `main`.
 
     Raises:
+        PluginError: A plug-in does not import, is not a `Command`, or has the name of one of the package's own commands.
         MissingExtraError: The module needs an optional dependency that is not installed.
     """
+    return _module_of(all_commands()[name])
+
+
+def _module_of(command: Command) -> Any:
     with missing_extras_named():
-        return import_module(all_commands()[name].module)
+        return import_module(command.module)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,8 @@ from filelock import FileLock, Timeout
 from .errors import InUseError, MachineError
 from .processes import process_exists
 
+PATIENCE = 0.5
+"""Time, in s, for which a process tries to hold a path: another may hold it for a moment, in `is_owned`."""
 MAX_COMMAND = 80
 """Largest number of characters of a command in a message; those of Ray's workers have 900."""
 
@@ -34,15 +36,11 @@ def owned(path: Path) -> Iterator[None]:
         MachineError: The parent folder cannot be created or written.
     """
     path = Path(path).absolute()
-    lock, holder = (path.with_name(f".{path.name}.{kind}") for kind in ("lock", "holder.json"))
+    holder = _beside(path, "holder.json")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        held = FileLock(lock, timeout=0, mode=0o666)  # another user of the machine may be the next to hold it
-        held.acquire()
+        held = _lock(path, PATIENCE)
     except Timeout:
         raise InUseError(f"{path} is in use by {_described(holder)}; wait until it ends, or give another path") from None
-    except OSError as error:
-        raise MachineError(f"{path.parent} cannot be written ({error.strerror}); give another path") from error
     try:
         with suppress(OSError):  # the lock works without the name: the disk may be full, or the file another user's
             _write_holder(holder)
@@ -54,12 +52,33 @@ def owned(path: Path) -> Iterator[None]:
 
 
 def is_owned(path: Path) -> bool:
-    """Whether another process, or another part of this one, holds a file or folder in whose parent folder one can write."""
+    """Whether another process, or another part of this one, holds a file or folder in whose parent folder one can write.
+
+    Raises:
+        MachineError: The parent folder cannot be created or written.
+    """
     try:
-        with owned(path):
-            return False
-    except InUseError:
+        _lock(Path(path).absolute(), patience=0.0).release()
+    except Timeout:
         return True
+    return False
+
+
+def _lock(path: Path, patience: float) -> FileLock:
+    """Take the lock of a path, or raise `Timeout` if others hold it for longer than `patience`, in s."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(_beside(path, "lock"), patience, mode=0o666)  # another user of the machine may be the next to hold it
+        lock.acquire()
+    except Timeout:
+        raise
+    except OSError as error:
+        raise MachineError(f"{path.parent} cannot be written ({error.strerror}); give another path") from error
+    return lock
+
+
+def _beside(path: Path, kind: str) -> Path:
+    return path.with_name(f".{path.name}.{kind}")
 
 
 def _write_holder(path: Path) -> None:

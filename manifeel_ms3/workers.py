@@ -240,6 +240,17 @@ class _Worker:
         return self.make_state()
 
 
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Let torch use a number of CPU threads for as long as the context lasts."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
 _this_worker: _Worker | None = None
 """The worker of this process; None in a process that is no worker. It is global, since a process keeps its state nowhere
 else."""

@@ -5,6 +5,7 @@ import re
 import subprocess
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch
 
@@ -162,9 +163,12 @@ def test_a_policy_or_a_command_that_does_not_import_is_one_line(tmp_path):
     assert "the plug-in 'broken' of broken:SPEC (my_package) cannot be loaded (KeyError: 'what')" in said
     assert "Registered in manifeel.policies are ['broken', 'diffusion_policy'" in said
     install(tmp_path / "command", files=broken, entry_points="[manifeel.commands]\nbroken = broken:COMMAND\n")
-    said = refusal(tmp_path / "command", "tasks")
+    said = refusal(tmp_path / "command", "broken")
     assert "the plug-in 'broken' of broken:COMMAND (my_package) cannot be loaded" in said
     assert "Registered in manifeel.commands are ['broken', 'study', 'train']" in said
+    assert refusal(tmp_path / "command", "--help") == said  # the list of all commands
+    for working in (["tasks"], ["train", "--help"], ["--version"]):
+        assert manifeel(tmp_path / "command", *working).returncode == 0
 
 
 def test_a_task_that_is_registered_twice_is_refused(tmp_path):
@@ -184,7 +188,7 @@ def test_two_packages_with_one_name_are_refused(tmp_path):
     for name in ("first", "second"):
         code = {f"{name}.py": "from manifeel_ms3.plugins import Command\nCOMMAND = Command('json', 'About')"}
         install(tmp_path, name=name, files=code, entry_points=f"[manifeel.commands]\nsing = {name}:COMMAND\n")
-    said = refusal(tmp_path, "tasks")
+    said = refusal(tmp_path, "sing")
     assert "manifeel.commands: 'sing' is registered twice" in said
     assert "first:COMMAND (first)" in said
     assert "second:COMMAND (second)" in said
@@ -200,7 +204,8 @@ def test_two_packages_with_one_name_are_refused(tmp_path):
 def test_a_command_with_a_name_that_is_taken_or_of_another_kind_is_refused(tmp_path, command, said):
     code = {"mine.py": f"from manifeel_ms3.plugins import Command\nCOMMAND = {command}"}
     install(tmp_path, files=code, entry_points="[manifeel.commands]\nrecord = mine:COMMAND\n")
-    assert said in refusal(tmp_path, "tasks")
+    assert said in refusal(tmp_path, "--help")
+    assert manifeel(tmp_path, "record", "--help").stdout.startswith("usage: manifeel record")
 
 
 def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
@@ -224,3 +229,9 @@ def test_a_checkpoint_of_a_policy_that_is_not_registered_is_refused(tmp_path):
 def test_a_task_with_fields_that_cannot_be_is_refused(env_id, about, said):
     with pytest.raises(PluginError, match=said):
         register_task(env_id, **dict(category="insertion", paper_demos=10, max_episode_steps=40) | about)
+
+
+def test_a_task_without_a_field_that_it_needs_is_refused_before_it_is_known():
+    with pytest.raises(PluginError, match=r"is registered without \['paper_demos'\]"):
+        register_task("MyLab-Press-v1", category="insertion", max_episode_steps=40)(object)
+    assert "MyLab-Press-v1" not in gym.registry

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
@@ -47,6 +48,25 @@ def test_whether_a_file_is_held(holder, tmp_path):
     holder.kill()
     holder.wait(PATIENCE)
     assert not is_owned(tmp_path / "file.h5")
+
+
+def test_to_ask_whether_a_file_is_held_disturbs_nobody(tmp_path):
+    """To ask takes the lock for a moment, in which one who comes to hold the file must not be refused."""
+    ended = threading.Event()
+
+    def ask():
+        while not ended.is_set():
+            is_owned(tmp_path / "file.h5")
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    try:
+        for _ in range(100):
+            with owned(tmp_path / "file.h5"):
+                assert (tmp_path / ".file.h5.holder.json").is_file()
+    finally:
+        ended.set()
+        asking.join()
 
 
 def test_a_killed_process_leaves_nothing_that_blocks(holder, tmp_path):

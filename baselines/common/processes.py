@@ -1,12 +1,14 @@
 """Training on several devices at once, with one process for each, started by `torchrun`."""
 
 import os
+from collections.abc import Callable
 from typing import Any
 
 import torch
 import torch.distributed as dist
 import torch.nn as nn
 
+from manifeel_ms3.errors import ManifeelError
 from manifeel_ms3.evaluation.policy import checked_device
 
 
@@ -41,8 +43,19 @@ class Processes:
         """The model, wrapped so that its gradients are the mean over all processes."""
         return nn.parallel.DistributedDataParallel(model) if self.count > 1 else model
 
-    def of_first(self, value: str) -> str:
-        """The text that the first process has."""
+    def first_does(self, work: Callable[[], Any]) -> None:
+        """Let the first process do something while the others wait; an error that it raises is raised in all of them."""
+        raised = None
+        if self.first:
+            try:
+                work()
+            except ManifeelError as error:
+                raised = error
+        if (raised := self.of_first(raised)) is not None:
+            raise raised
+
+    def of_first(self, value: Any) -> Any:
+        """What the first process has."""
         values = [value]
         if self.count > 1:
             dist.broadcast_object_list(values, src=0, device=self.device)

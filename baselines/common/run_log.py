@@ -137,12 +137,15 @@ class RunLog:
             if name != "step":
                 self._board.add_scalar(name, value, int(entry["step"]))
 
-    def close(self) -> None:
-        """Finish the log."""
+    def __enter__(self) -> "RunLog":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:
+        """Finish the log; Weights & Biases shows a run that an exception has ended as failed."""
         self._lines.close()
         self._board.close()
         if self._wandb:
-            self._wandb.finish()
+            self._wandb.finish(exit_code=int(kind is not None))
 
 
 def entries_until(log: Path, step: int) -> list[dict[str, float]]:

@@ -4,8 +4,7 @@ import logging
 import math
 import random
 import time
-from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from diffusers.optimization import get_cosine_schedule_with_warmup
 from diffusers.training_utils import EMAModel
 from torch.optim.lr_scheduler import LambdaLR
 
-from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError, WorkFailedError
+from manifeel_ms3.errors import FileExistsAlreadyError, InvalidArgumentError
 from manifeel_ms3.evaluation.checkpoint_config import TRAINING_LOSS, TRAINING_STATE, WEIGHTS, checkpoint_config, with_implied
 from manifeel_ms3.files import remove_folder, remove_leftovers
 from manifeel_ms3.nested_settings import as_json
@@ -47,6 +46,7 @@ from .observation import ObservationSpec
 from .policy import VisuotactilePolicy
 from .pose_targets import CONTROL_MODES
 from .processes import Processes
+from .recent_losses import RecentLosses, TrainingError
 from .run_log import RunLog, wandb_run_of
 from .train_args import FREE_ON_RESUME, TrainArgs, check_evaluation, check_run, default_exp_name, planned_steps
 
@@ -55,10 +55,6 @@ EVALUATIONS = "evaluations"
 """Folder of the checkpoints' evaluations in the folder of a run."""
 RANK_SEED_STRIDE = 1_000_003
 """Difference between the noise seeds of two processes; a prime number that is larger than usual seeds."""
-
-
-class TrainingError(WorkFailedError):
-    """Training cannot continue."""
 
 
 def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
@@ -84,16 +80,26 @@ def train(args: TrainArgs, policy_class: type[VisuotactilePolicy]) -> Path:
     check_evaluation(args)
     exp_name = processes.of_first(args.exp_name or default_exp_name(args, policy_class.name))
     run_dir = args.run_dir or Path("runs") / exp_name
-    with owned(run_dir) if processes.first else nullcontext():
-        if saved_checkpoints(run_dir / CHECKPOINTS) and not (args.resume or args.overwrite):
-            raise FileExistsAlreadyError(
-                f"{run_dir} has the checkpoints of an earlier run; continue it with --resume, replace it with --overwrite, or "
-                "give another --run-dir"
-            )
+    with ExitStack() as stack:
+        processes.first_does(lambda: stack.enter_context(owned(run_dir)))
+        processes.first_does(lambda: _require_free(run_dir, args))
         trainer = Trainer(replace(args, exp_name=exp_name, run_dir=run_dir), policy_class, processes)
         if processes.first:
             log.info("the run is in %s", run_dir)
         return trainer.run()
+
+
+def _require_free(run_dir: Path, args: TrainArgs) -> None:
+    """Check that the folder of the run has no checkpoints, unless they are to be continued or replaced.
+
+    Raises:
+        FileExistsAlreadyError: It has.
+    """
+    if saved_checkpoints(run_dir / CHECKPOINTS) and not (args.resume or args.overwrite):
+        raise FileExistsAlreadyError(
+            f"{run_dir} has the checkpoints of an earlier run; continue it with --resume, replace it with --overwrite, or "
+            "give another --run-dir"
+        )
 
 
 class Trainer:
@@ -162,11 +168,12 @@ class Trainer:
         Raises:
             TrainingError: The loss is not a finite number.
         """
-        try:
-            self._train()
-            return self._finish()
-        finally:
-            self.evaluation.stop()
+        with self.log or nullcontext():
+            try:
+                self._train()
+                return self._finish()
+            finally:
+                self.evaluation.stop()
 
     def _train(self) -> None:
         """Train to the last step, with checkpoints and logs on the way."""
@@ -266,8 +273,19 @@ class Trainer:
         return self.args.num_eval_episodes > 0 and due
 
     def _log_loss(self) -> float:
-        """Log the mean loss since the last entry, and return it."""
-        mean = self.losses.take_mean(self.step, self.dataset.names)
+        """Log the mean loss since the last entry, and return it.
+
+        Raises:
+            TrainingError: A loss of this process, or of another one, is not a finite number.
+        """
+        mean, wrong = 0.0, None
+        try:
+            mean = self.losses.take_mean(self.step, self.dataset.names)
+        except TrainingError as error:
+            wrong = error
+        for raised in self.processes.of_all(wrong):  # the others would wait for ever for the one that gives up
+            if raised:
+                raise raised
         if self.log:
             epoch = self.step / math.ceil(len(self.dataset) / self.batch_size)
             seconds = time.time() - self.begin
@@ -299,51 +317,7 @@ class Trainer:
         if self.log:
             self._log_evaluations(wait=True)
             prune(self.checkpoints, self.args.keep, set())
-            self.log.close()
         return self.checkpoints / LAST_LINK
-
-
-class RecentLosses:
-    """The losses since the last entry of the log, kept on the device so that steps need not wait for it.
-
-    Args:
-        size: Largest number of losses.
-        device: Device that computes them.
-    """
-
-    def __init__(self, size: int, device: torch.device):
-        self._losses, self._batches = torch.zeros(size, device=device), []
-
-    @property
-    def full(self) -> bool:
-        """Whether there is no room for another loss."""
-        return len(self._batches) == len(self._losses)
-
-    def add(self, loss: torch.Tensor, batch: torch.Tensor) -> None:
-        """Keep the loss of a batch of samples, given by their indices."""
-        self._losses[len(self._batches)] = loss.detach()
-        self._batches.append(batch)
-
-    def take_mean(self, step: int, names: Callable[[torch.Tensor], str]) -> float:
-        """The mean of the losses, which are then forgotten.
-
-        Args:
-            step: Gradient step of the last loss.
-            names: Function from a batch to the names of its samples, for the error's message.
-
-        Raises:
-            TrainingError: A loss is not a finite number; the message names the step and the samples of the first such loss.
-        """
-        losses, batches = self._losses[: len(self._batches)], self._batches
-        wrong = (~torch.isfinite(losses)).nonzero()
-        if len(wrong):
-            first = int(wrong[0])
-            raise TrainingError(
-                f"the loss of step {step - len(batches) + 1 + first} is {float(losses[first])}, on {names(batches[first])}; "
-                "look at these demonstrations, lower --lr, or train with --precision fp32. Saved checkpoints are older"
-            )
-        self._batches = []
-        return float(losses.mean())
 
 
 def seed_everything(seed: int) -> None:

@@ -3,8 +3,7 @@
 import hashlib
 import json
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,8 +19,10 @@ from baselines.common.train_args import planned_steps
 from baselines.registry import policy_spec, preset_cli
 from manifeel_ms3.evaluation.policy import BATCH_SIZES
 from manifeel_ms3.files import write_json
+from manifeel_ms3.ownership import owned
 from manifeel_ms3.provenance import machine
 from manifeel_ms3.tasks.registry import all_tasks, make_env, task_spec
+from manifeel_ms3.workers import torch_threads
 
 from .command_lines import device_arguments, train_flags, training_args
 from .jobs import DONE, read_status
@@ -77,24 +78,15 @@ class Trial:
 
     def seconds(self, root: Path) -> float:
         """The outcome; it is measured at the first time and then kept in a file under `root`."""
-        known = read_status(root / TRIALS)
+        known: dict[str, Any] = read_status(root / TRIALS)
         if self.key not in known:
             what = f"{self.measure.__name__}: {', '.join(self.arguments)}"
-            with _torch_threads(self.threads):
+            with torch_threads(self.threads):
                 seconds = self.measure(*self.arguments)
-            known[self.key] = dict(seconds=seconds, what=what)
-            write_json(root / TRIALS, known)
+            with owned(root / TRIALS):  # another study on the same root may have added its own meanwhile
+                known = read_status(root / TRIALS) | {self.key: dict(seconds=seconds, what=what)}
+                write_json(root / TRIALS, known)
         return known[self.key]["seconds"]
-
-
-@contextmanager
-def _torch_threads(count: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def estimate(job: Job, root: Path, workers: int, gpus: float = 0.0) -> CostEstimate | None:

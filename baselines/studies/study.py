@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import yaml
 
 from baselines.common.encoders import TACRGB_ENCODERS
+from baselines.common.policy import PolicyConfig
 from baselines.common.train_args import TrainArgs
 from baselines.registry import policy_spec
 from baselines.tactile_representations.pretrain import Representation
@@ -278,10 +279,11 @@ def _train_flags(given: dict[str, Any], place: str) -> dict[str, Any]:
 def _short_names() -> dict[str, str]:
     """Second names of the flags of `manifeel train` that have two, by the first."""
     names = {}
-    for name, hint in get_type_hints(TrainArgs, include_extras=True).items():
-        for flag in getattr(hint, "__metadata__", ()):
-            if flag.aliases:
-                names[(flag.name or name).replace("_", "-")] = flag.aliases[0].removeprefix("--")
+    for prefix, kind in (("", TrainArgs), ("policy.", PolicyConfig)):
+        for name, hint in get_type_hints(kind, include_extras=True).items():
+            for flag in getattr(hint, "__metadata__", ()):
+                if flag.aliases:
+                    names[prefix + (flag.name or name).replace("_", "-")] = flag.aliases[0].removeprefix("--")
     return names
 
 

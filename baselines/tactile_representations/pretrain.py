@@ -24,6 +24,7 @@ from tyro.conf import arg
 from baselines.common.checkpoint import write_tensors
 from baselines.common.memory import keep_freed_memory
 from baselines.common.observation import is_tactile, prepare_images
+from baselines.common.recent_losses import TrainingError
 from manifeel_ms3.arguments import require_amount, require_file, require_positive
 from manifeel_ms3.command_line import as_typed, run
 from manifeel_ms3.demonstrations import DemonstrationError
@@ -100,6 +101,7 @@ def main(args: Args) -> list[float]:
         DemonstrationError: The files hold no TacRGB images, or are of another task than asked for or of another revision of it.
         FileExistsAlreadyError: The file of the weights exists, and is not to be overwritten.
         FileWriteError: The weights cannot be written.
+        TrainingError: The loss is not a finite number.
         InUseError: Another process trains into the same file.
     """
     require_positive(image_size=args.image_size, batch_size=args.batch_size, total_iters=args.steps, log_freq=args.log_freq)
@@ -137,6 +139,11 @@ def _pretrain(args: Args, out: Path) -> list[float]:
             loss = training.step(batch.movedim(-1, 1).float() / 127.5 - 1, step)
             if step % args.log_freq == 0:
                 losses.append(float(loss))
+                if not math.isfinite(losses[-1]):
+                    raise TrainingError(
+                        f"the loss of step {step} is {losses[-1]}; lower --lr, or train with more images in a --batch-size. No "
+                        "weights are written"
+                    )
                 bar.update(task, description=f"training, loss {losses[-1]:.4f}")
             bar.advance(task)
     with atomic_write(out) as partial:

@@ -158,13 +158,14 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected.tolist()
 
 
-def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.ndarray:
-    """Mean success of several conditions in each resample, (conditions, RESAMPLES).
+def resampled_success(conditions: Sequence[tuple[str, ConditionResults]], resamples: int = RESAMPLES) -> np.ndarray:
+    """Mean success of several conditions in each resample, (conditions, resamples).
 
     Training seeds are drawn for each condition apart; initial states alike for all conditions of a task that share them.
 
     Args:
         conditions: The id of the task, and the results, of each condition.
+        resamples: Number of resamples.
     """
     rng = np.random.default_rng(0)
     starts: dict[Any, np.ndarray] = {}
@@ -172,8 +173,8 @@ def resampled_success(conditions: Sequence[tuple[str, ConditionResults]]) -> np.
     for task, results in conditions:
         same = (task, tuple(results.episode_seeds))
         if same not in starts:
-            starts[same] = _weights(rng, len(results.episode_seeds))
-        drawn.append(_resampled_means(_rates(results), starts[same], _weights(rng, len(results.success))))
+            starts[same] = _weights(rng, len(results.episode_seeds), resamples)
+        drawn.append(_resampled_means(_rates(results), starts[same], _weights(rng, len(results.success), resamples)))
     return np.array(drawn)
 
 
@@ -195,14 +196,14 @@ def _paired_rates(first: ConditionResults, second: ConditionResults) -> list[np.
     return [_rates(side, checkpoints) for side in (first, second)]
 
 
-def _weights(rng: np.random.Generator, count: int) -> np.ndarray:
-    """How much each of `count` samples weighs in each resample (RESAMPLES, count).
+def _weights(rng: np.random.Generator, count: int, resamples: int = RESAMPLES) -> np.ndarray:
+    """How much each of `count` samples weighs in each resample (resamples, count).
 
     The spread of resampled means is too small by sqrt((count - 1) / count), which matters for three training seeds; the
     weights make up for it, and the sum of them stays one.
     """
-    chosen = rng.integers(count, size=(RESAMPLES, count)) + count * np.arange(RESAMPLES)[:, None]
-    drawn = np.bincount(chosen.ravel(), minlength=RESAMPLES * count).reshape(RESAMPLES, count) / count
+    chosen = rng.integers(count, size=(resamples, count)) + count * np.arange(resamples)[:, None]
+    drawn = np.bincount(chosen.ravel(), minlength=resamples * count).reshape(resamples, count) / count
     return 1 / count + (drawn - 1 / count) * np.sqrt(count / max(count - 1, 1))
 
 

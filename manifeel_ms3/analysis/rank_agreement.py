@@ -92,7 +92,7 @@ def agreement_of(ranked: Sequence[Ranked], groups: Sequence[Sequence[int]]) -> t
     if all(len(one.results.success) == 1 for one in ranked):  # nothing says how much they vary with the training seed
         values = mean_tau(paper, ours, groups), rank_violation(paper, ours, groups)
         return Agreement(values[0], *NO_INTERVAL), Agreement(values[1], *NO_INTERVAL)
-    drawn = resampled_success([(one.condition.env_id, one.results) for one in ranked])[:, :RESAMPLES]
+    drawn = resampled_success([(one.condition.env_id, one.results) for one in ranked], RESAMPLES)
     tau = _with_interval(lambda rates: mean_tau(paper, rates, groups), ours, drawn)
     return tau, _with_interval(lambda rates: rank_violation(paper, rates, groups), ours, drawn)
 

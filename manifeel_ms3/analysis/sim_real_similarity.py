@@ -256,6 +256,8 @@ def _image(path: Path) -> np.ndarray:
             field = next(iter(read_npz(path, "a force field").values()), np.zeros(0))
         else:
             field = np.load(path)
+            if not isinstance(field, np.ndarray):
+                raise ValueError("it is an archive of arrays; name it .npz")
     except (*NOT_NPZ, InvalidFileError) as error:
         raise SimilarityError(f"{path} cannot be read as a force field ({error}); repair or remove it") from error
     is_finite = field.dtype.kind in "fiu" and bool(np.isfinite(field).all())

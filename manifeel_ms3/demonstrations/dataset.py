@@ -94,6 +94,7 @@ def _record_all(args: Args) -> Path:
     }
     if observed:
         _check_room(args, {task: max(0, counts[task] - _num_finished(trajectory)) for task, (_, trajectory) in files.items()})
+    described: dict[Path, dict[str, Any]] = {}
     with progress_bar() as bar:
         total = sum(counts.values()) * (2 if observed else 1)
         wanted = [path for paths in files.values() for path in paths[: 1 + observed]]
@@ -106,7 +107,9 @@ def _record_all(args: Args) -> Path:
             if observed:
                 bar.update(progress, description=f"rendering {task}")
                 render_observations.main(_render_args(args, counts[task], states, trajectory), count)
-            write_manifest(args.out)
+            for changed in (states, trajectory):
+                described.pop(changed, None)
+            write_manifest(args.out, described)
     return args.out / MANIFEST_FILE
 
 
@@ -147,9 +150,17 @@ def _check_room(args: Args, counts: dict[str, int]) -> None:
         )
 
 
-def write_manifest(folder: Path) -> None:
-    """Write `manifest.json` for the trajectory files under a folder."""
-    files = {path.relative_to(folder).as_posix(): describe(path) for path in sorted(folder.glob("*/*.h5"))}
+def write_manifest(folder: Path, described: dict[Path, dict[str, Any]] | None = None) -> None:
+    """Write `manifest.json` for the trajectory files under a folder.
+
+    Args:
+        folder: The folder.
+        described: Entries of files that are known already, so that large files are not read again. The others are added to it.
+    """
+    described = {} if described is None else described
+    paths = sorted(folder.glob("*/*.h5"))
+    described |= {path: describe(path) for path in paths if path not in described}
+    files = {path.relative_to(folder).as_posix(): described[path] for path in paths}
     write_json(folder / MANIFEST_FILE, dict(schema=DEMONSTRATIONS_SCHEMA, version=version("manifeel-ms3"), files=files))
 
 

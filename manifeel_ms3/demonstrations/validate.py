@@ -24,6 +24,8 @@ from .formats.maniskill_h5 import group_of, open_trajectories, read_header
 from .replay import replay
 
 log = logging.getLogger(__name__)
+CHECKED = ("sha256", "json_sha256")
+"""Keys that a manifest's entry must have, without which nothing tells whether the file is the one that it describes."""
 
 
 @dataclass
@@ -48,7 +50,7 @@ def validate(path: Path, num_replays: int = 0) -> list[str]:
     """
     path = Path(path)
     if path.is_file() or (path.suffix == ".h5" and not path.is_dir()):  # a file that is missing is named as a file
-        return _problems_of_file(path, {}, num_replays)
+        return _problems_of_file(path, None, num_replays)
     problems = []
     files = read_manifest(path)["files"]
     with progress_bar() as bar:
@@ -65,11 +67,11 @@ def _problems(folder: Path, name: str, entry: dict[str, Any], num_replays: int) 
     return _problems_of_file(path, entry, num_replays)
 
 
-def _problems_of_file(path: Path, entry: dict[str, Any], num_replays: int) -> list[str]:
-    """Faults of one trajectory file, given what a manifest says of it."""
+def _problems_of_file(path: Path, entry: dict[str, Any] | None, num_replays: int) -> list[str]:
+    """Faults of one trajectory file, given what a manifest says of it; None if there is no manifest."""
     try:
         episodes = read_header(path)["episodes"]
-        problems = _manifest_problems(describe(path), entry) if entry else []
+        problems = [] if entry is None else _manifest_problems(describe(path), entry)
         with open_trajectories(path) as file:
             named = {f"traj_{episode['episode_id']}" for episode in episodes}
             if more := sorted(name for name in file if name.startswith("traj_") and name not in named):
@@ -106,7 +108,8 @@ def _manifest_problems(found: dict[str, Any], entry: dict[str, Any]) -> list[str
     """Where a manifest's entry says something else of a file than what was found in it."""
     unknown = [f"the manifest has the unknown key {key!r}; a key is one of {list(found)}" for key in entry.keys() - found]
     differing = [key for key in found if key in entry and found[key] != entry[key]]
-    return unknown + [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in differing]
+    lacking = [f"the manifest does not say its {key}; get the manifest again" for key in CHECKED if key not in entry]
+    return unknown + lacking + [f"{key} is {found[key]!r}, the manifest says {entry[key]!r}" for key in differing]
 
 
 def _episode_problems(file: Any, episode: dict[str, Any]) -> list[str]:

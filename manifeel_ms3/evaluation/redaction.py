@@ -63,7 +63,8 @@ def without_secrets(text: str, secrets: list[str]) -> str:
 
 
 def _is_secret(name: Any, value: Any) -> bool:
-    return value not in (None, "", True, False) and bool(_NAME.search(_CAMEL_CASE.sub("_", str(name))))
+    is_empty = value is None or value == "" or isinstance(value, bool)
+    return not is_empty and bool(_NAME.search(_CAMEL_CASE.sub("_", str(name))))
 
 
 def _leaves(value: Any) -> Iterator[str]:

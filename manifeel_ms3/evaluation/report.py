@@ -135,7 +135,7 @@ def evaluated_checkpoint(path: Path, result: dict[str, Any]) -> Path:
         CheckpointError: There is no checkpoint of this step, or it is broken or of another training.
     """
     folder, step = path.parent / CHECKPOINTS, result["config"].get("step")
-    last, found = folder / LAST_LINK, folder / str(step).zfill(8)
+    last, found = folder / LAST_LINK, folder / Path(str(step)).name.zfill(8)
     if not found.is_dir() and checkpoint_config(last).get("step") == step:
         found = last
     if not found.is_dir():

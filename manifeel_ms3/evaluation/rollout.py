@@ -264,7 +264,9 @@ def _time_limit(seconds: float | None) -> Iterator[None]:
     faulthandler.dump_traceback_later(seconds + HANGS_FOR_GOOD, exit=True)
     try:
         yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-        faulthandler.cancel_dump_traceback_later()
+    finally:  # each step in a finally of its own, since the alarm may still come before the first has been done
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+        finally:
+            signal.signal(signal.SIGALRM, before)
+            faulthandler.cancel_dump_traceback_later()

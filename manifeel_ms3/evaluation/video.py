@@ -10,13 +10,13 @@ import cv2
 import gymnasium as gym
 import imageio.v2 as imageio
 import numpy as np
-import torch
 
 from manifeel_ms3.arguments import names_in
 from manifeel_ms3.files import atomic_write
 from manifeel_ms3.sensors.visualisation import observation_images
 from manifeel_ms3.tasks.registry import make_env, task_spec
 from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ
+from manifeel_ms3.workers import torch_threads
 
 from .engine import Evaluation
 from .policy import STEP_TIMEOUT, Policy
@@ -51,9 +51,9 @@ def act_again(
         seed: Seed of the episode.
         step_timeout: Longest time that the policy may take for one action, in s, after which the episode ends.
     """
-    torch.set_num_threads(1)  # as in the evaluation: the rounding of sums, and so the episode, depends on it
     actions: list[np.ndarray] = []
-    with closing(make_env(env_id, **env_kwargs)) as env:
+    # one thread as in the evaluation: the rounding of sums, and so the episode, depends on their number
+    with torch_threads(1), closing(make_env(env_id, **env_kwargs)) as env:
         return evaluate_episode(env, policy, seed, actions.append, step_timeout), actions
 
 

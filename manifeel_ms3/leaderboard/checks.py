@@ -29,6 +29,8 @@ SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 NOT_OF_A_SUBMISSION = {"sim_config", "num_envs", "render_mode", "human_render_camera_configs"}
 """Arguments of an environment with which running an episode again could take any time or memory."""
+SENSOR_SETTINGS = ("sensor_configs", "tactile")
+"""Arguments of an environment that hold settings of cameras and pads."""
 MOST_PIXELS = 2048
 """Largest number in the settings of cameras and pads, whose images could otherwise fill the memory."""
 MOST_FORCE = 500.0
@@ -177,8 +179,9 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
         faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
     if given := sorted(NOT_OF_A_SUBMISSION & result["env_kwargs"].keys()):
         faults.append(f"its env_kwargs have {given}, which change the simulator or what is rendered; evaluate without them")
-    if _largest_number(result["env_kwargs"].get("sensor_configs")) > MOST_PIXELS:
-        faults.append(f"its sensor_configs hold a number above {MOST_PIXELS}; evaluate with smaller images")
+    for name in SENSOR_SETTINGS:
+        if _largest_number(result["env_kwargs"].get(name)) > MOST_PIXELS:
+            faults.append(f"its {name} hold a number above {MOST_PIXELS}; evaluate with smaller images")
     if fault := other_revision(env_id, result["revision"]):
         faults.append(f"{fault}; evaluate again with manifeel-ms3 {version('manifeel-ms3')}")
     return faults

@@ -54,7 +54,7 @@ def observation_images(obs: dict[str, Any], full_scales: Mapping[str, float]) ->
     for sensor, data in obs["sensor_data"].items():
         title = sensor.replace("_", " ")
         if "rgb" in data:
-            images[f"{title}: TacRGB" if sensor.startswith("tactile") else title] = common.to_numpy(data["rgb"])[0]
+            images[f"{title}: TacRGB" if sensor.startswith("tactile") else title] = common.to_numpy(data["rgb"][0])
         if "force_field" in data:
-            images[f"{title}: TacFF"] = common.to_numpy(force_field_images(data["force_field"], full_scales[sensor]))[0]
+            images[f"{title}: TacFF"] = force_field_images(data["force_field"][:1], full_scales[sensor])[0].numpy()
     return images

@@ -44,6 +44,8 @@ def split_obs_mode(obs_mode: str) -> tuple[str, tuple[str, ...]]:
     for token in tokens:
         if token not in known:
             raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {token!r} is unknown; join any of {list(known)} by '+'")
+    if "rgbd" in tokens and (twice := {"rgb", "depth"} & set(tokens)):
+        raise InvalidArgumentError(f"obs_mode={obs_mode!r}: 'rgbd' is 'rgb+depth', so that {sorted(twice)} is given twice")
     if repeated := {token for token in tokens if tokens.count(token) > 1}:
         raise InvalidArgumentError(f"obs_mode={obs_mode!r}: token {sorted(repeated)} is given more than once")
     if set(STATE_TOKENS) <= set(tokens):

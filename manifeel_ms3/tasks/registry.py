@@ -100,6 +100,8 @@ class TaskSpec:
 
 
 _SPECS: dict[str, TaskSpec] = {}
+REQUIRED = ("category", "paper_demos")
+"""Fields that every task gives, beside its id and its time limit."""
 COUNTS = ("max_episode_steps", "paper_demos", "revision")
 """Fields of a task that are whole numbers."""
 
@@ -113,13 +115,15 @@ def register_task(env_id: str, *, max_episode_steps: int, **about: Any) -> Calla
         about: The other fields of `TaskSpec`.
 
     Raises:
-        PluginError: Another class has registered the id, or the id or a field is not allowed.
+        PluginError: Another class has registered the id, a field is missing, or the id or a field is not allowed.
     """
     if not re.fullmatch(r"[\w.-]+-v\d+", env_id):
         raise PluginError(f"the id {env_id!r} of a task must end in a version; give one such as 'MyLab-Press-v1'")
     known_fields = [known.name for known in fields(TaskSpec)[1:]]
     if unknown := sorted(about.keys() - known_fields):
         raise PluginError(f"the task {env_id!r} is registered with {unknown}; the fields of a task are {known_fields}")
+    if missing := [name for name in REQUIRED if name not in about]:
+        raise PluginError(f"the task {env_id!r} is registered without {missing}; give `register_task` these, too")
     for name, number in (dict(max_episode_steps=max_episode_steps) | about).items():
         if name in COUNTS and not (isinstance(number, int) and number >= 1):
             raise PluginError(f"the task {env_id!r} has {name}={number!r}; give a whole number of at least 1")

@@ -85,9 +85,11 @@ class RestorableEnv(SensingEnv):
             return
         running = others.nonzero()[:, 0]
         state, were_stale = rows(self.get_state_dict(), running), self._touch_is_stale[running].clone()
-        yield
-        self._set_all_of_state(state, running)
-        self._touch_is_stale[running] = were_stale
+        try:
+            yield
+        finally:
+            self._set_all_of_state(state, running)
+            self._touch_is_stale[running] = were_stale
 
 
 def take_given_state(options: dict[str, Any], env: RestorableEnv) -> Any:

@@ -76,7 +76,6 @@ def main(args: Args) -> Path:
         kwargs["cameras"] = list(args.cameras)
     kwargs |= json_object("--env-kwargs", args.env_kwargs)
     env = make_env(args.env_id, **kwargs)
-    _require_images(env, kwargs["obs_mode"])
     base: Any = env.unwrapped
     operator = Operator(steerable_axes(base.control_mode))
     if args.device:
@@ -84,6 +83,7 @@ def main(args: Args) -> Path:
     out = args.out or Path("data/demos") / args.env_id / "human.h5"
     with ExitStack() as stack:
         stack.callback(env.close)
+        _require_images(env, kwargs["obs_mode"])
         page = Page(operator, args.env_id, args.host, args.port, base.touch_full_scales)
         stack.callback(page.stop)
         session = Session(env, args.env_id, kwargs, out, args.seed, operator)  # takes the file apart until it is finished

@@ -188,6 +188,13 @@ def test_a_field_that_is_no_force_field_is_refused(field, folders):
         sim_real_similarity.main(Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", out=folders / "out"))
 
 
+def test_an_archive_under_the_name_of_an_array_is_refused(folders):
+    with (folders / "real_fields/3.npy").open("wb") as file:
+        np.savez(file, field=np.zeros((10, 14, 3)))
+    with pytest.raises(SimilarityError, match=r"3\.npy cannot be read as a force field \(it is an archive"):
+        sim_real_similarity.main(Args(folders / "sim_fields", folders / "real_fields", OWN, "tacff", out=folders / "out"))
+
+
 @pytest.mark.parametrize("wrong", ["unflattened", "of_one_image", "not_finite"])
 def test_features_of_another_form_are_refused(folders, wrong):
     features = OWN.replace("brightness", wrong)

@@ -35,6 +35,8 @@ def test_random_actions_are_drawn_by_the_seed_of_the_episode():
     assert np.abs(first).max() <= 1
     assert len(first[0]) == 6
     assert len(RandomActions(PEG, "pd_ee_delta_yaw").act({})) == 5
+    with pytest.raises(InvalidArgumentError, match=r"control_mode.*pd_joint_pos.*pd_ee_delta_pose"):
+        RandomActions(PEG, "pd_joint_pos")
 
 
 def test_a_floor_is_measured_and_those_of_other_policies_are_kept(tmp_path):

@@ -13,6 +13,7 @@ import torch
 from baselines.common.encoders import TACRGB_ENCODERS, EncoderConfig, ObservationEncoder, load_pretrained
 from baselines.common.memory import lay_out_channels_last
 from baselines.common.observation import POSE, observation_spec
+from baselines.common.recent_losses import TrainingError
 from baselines.diffusion_policy.policy import DiffusionConfig, DiffusionPolicy
 from baselines.tactile_representations import pretrain
 from baselines.tactile_representations.anytouch import AnyTouch
@@ -109,6 +110,15 @@ def test_images_that_do_not_fit_are_named(pictures, tmp_path, monkeypatch):
         trained("t3", pictures, out, image_size=250)
     with pytest.raises(InvalidArgumentError, match="--total-iters 0 must be at least 1"):
         trained("t3", pictures, out, steps=0)
+    assert not out.exists()
+
+
+def test_a_training_that_diverges_writes_no_weights(pictures, tmp_path, monkeypatch):
+    make, size = SMALL["t3"]
+    monkeypatch.setitem(pretrain.REPRESENTATIONS, "t3", make)
+    out = tmp_path / "weights.safetensors"
+    with pytest.raises(TrainingError, match=r"the loss of step \d+ is (nan|inf); lower --lr"):
+        trained("t3", pictures, out, image_size=size, batch_size=4, steps=20, lr=1e30, log_freq=1)
     assert not out.exists()
 
 

@@ -41,16 +41,20 @@ def run_dir(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")
         patch.setenv("WANDB_SILENT", "true")
-        log = RunLog(folder, dict(seed=7, obs_mode="rgb+tacff"), 0, wandb_run_of(args, "diffusion_policy"))
-        log.write(TRAINED)
-        log.write(EVALUATED, video)
-        log.close()
+        with RunLog(folder, dict(seed=7, obs_mode="rgb+tacff"), 0, wandb_run_of(args, "diffusion_policy")) as log:
+            log.write(TRAINED)
+            log.write(EVALUATED, video)
     return folder
 
 
 @pytest.fixture(scope="module")
 def records(run_dir):
     """What Weights & Biases has written to disk and would send."""
+    return _finished(run_dir)
+
+
+def _finished(run_dir):
+    """What Weights & Biases has written in the folder of a run, once that has ended."""
     (path,) = run_dir.glob("wandb/offline-run-*/run-*.wandb")
     deadline = time.monotonic() + PATIENCE
     found = parsed(path)
@@ -125,10 +129,19 @@ def test_a_run_that_is_resumed_goes_on_under_its_id_and_a_new_one_has_another(tm
     monkeypatch.setenv("WANDB_SILENT", "true")
     ids = []
     for step in (0, 200, 0):
-        RunLog(tmp_path, {}, step, wandb_run_of(ARGS, "diffusion_policy")).close()
+        with RunLog(tmp_path, {}, step, wandb_run_of(ARGS, "diffusion_policy")):
+            pass
         newest = max(tmp_path.glob("wandb/offline-run-*/run-*.wandb"), key=lambda path: path.stat().st_mtime_ns)
         ids.append(newest.stem)
     assert ids[0] == ids[1] != ids[2]
+
+
+def test_a_run_that_an_error_ends_is_shown_as_failed(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    with pytest.raises(ZeroDivisionError), RunLog(tmp_path, {}, 0, wandb_run_of(ARGS, "diffusion_policy")):
+        raise ZeroDivisionError
+    assert [record.exit.exit_code for record in _finished(tmp_path) if record.HasField("exit")] == [1]
 
 
 def test_a_resumed_run_does_not_go_on_in_that_of_an_earlier_training(tmp_path, monkeypatch):
@@ -136,7 +149,8 @@ def test_a_resumed_run_does_not_go_on_in_that_of_an_earlier_training(tmp_path, m
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.setenv("WANDB_SILENT", "true")
     for step, track in ((0, True), (0, False), (200, True)):
-        RunLog(tmp_path, {}, step, wandb_run_of(replace(ARGS, track=track), "diffusion_policy")).close()
+        with RunLog(tmp_path, {}, step, wandb_run_of(replace(ARGS, track=track), "diffusion_policy")):
+            pass
     assert len({path.stem for path in tmp_path.glob("wandb/offline-run-*/run-*.wandb")}) == 2
 
 

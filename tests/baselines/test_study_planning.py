@@ -454,6 +454,10 @@ def test_flags_that_a_study_treats_apart_are_flags_of_training(capsys):
             "encoder_flags/t3: 'obs-mode' is set by the study itself",
         ),
         (
+            "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {act-horizon: 4, policy.action-horizon: 8}}]",
+            "'policy.action-horizon' is given twice, since 'act-horizon' is the same flag",
+        ),
+        (
             "grids: [{tasks: [ManiFeel-PegInsertion-v1], train: {steps: 6, total-iters: 6}}]",
             "'total-iters' is given twice, since 'steps' is the same flag",
         ),

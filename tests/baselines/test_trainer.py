@@ -17,8 +17,9 @@ from baselines.common.dataset import SampleOrder, read_episodes
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
 from baselines.common.processes import Processes
+from baselines.common.recent_losses import RecentLosses, TrainingError
 from baselines.common.train_args import FREE_ON_RESUME, PAPER_EPOCHS, TrainArgs, check_evaluation, check_run, planned_steps
-from baselines.common.training import RecentLosses, Trainer, TrainingError, fast_forward, with_taxel_shape
+from baselines.common.training import Trainer, fast_forward, with_taxel_shape
 from baselines.diffusion_policy import train as diffusion
 from baselines.diffusion_policy.policy import DiffusionConfig
 from baselines.flow_matching.policy import FlowConfig

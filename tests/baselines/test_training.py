@@ -17,8 +17,8 @@ from baselines.common.background_evaluation import BackgroundEvaluation
 from baselines.common.checkpoint import read_tensors
 from baselines.common.dataset import recorded_env_kwargs
 from baselines.common.encoders import FIELD_ENCODERS, EncoderConfig, PretrainedEncoder
+from baselines.common.recent_losses import TrainingError
 from baselines.common.train_args import TrainArgs
-from baselines.common.training import TrainingError
 from baselines.diffusion_policy import train as diffusion
 from baselines.equivariant_diffusion_policy import train as equivariant
 from baselines.flow_matching import train as flow

@@ -318,6 +318,17 @@ def test_an_unknown_key_of_a_manifest_is_named_and_hides_no_other_fault(folder, 
     assert differing == f"{PEG}/{STATES}: success is 2, the manifest says 1"
 
 
+@pytest.mark.parametrize("kept", [{}, dict(success=2)])
+def test_a_manifest_without_hashes_checks_nothing_and_is_a_fault(kept, folder, tmp_path):
+    copy = damaged(folder, tmp_path)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["files"] = {f"{PEG}/{STATES}": kept}
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    assert [problem.split("; ")[0] for problem in validate.validate(copy)] == [
+        f"{PEG}/{STATES}: the manifest does not say its {key}" for key in ("sha256", "json_sha256")
+    ]
+
+
 def test_a_set_may_hold_files_that_do_not_say_versions_and_forces(folder, tmp_path):
     copy = damaged(folder, tmp_path)
     header = json.loads((copy / PEG / STATES).with_suffix(".json").read_text())

@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+import torch
 
 from manifeel_ms3 import cli
-from manifeel_ms3.evaluation import evaluate
+from manifeel_ms3.evaluation import evaluate, video
 from manifeel_ms3.evaluation.rollout import evaluate_episode
 from manifeel_ms3.evaluation.video import act_again, record_episode
+from manifeel_ms3.workers import torch_threads
 from tests.evaluation import policies
 from tests.tasks_and_marks import PEG, needs_renderer
 
@@ -34,6 +36,13 @@ def test_a_policy_that_hangs_is_not_waited_for():
     outcome, actions = act_again(PEG, given, policies.Sleeps(), 3, step_timeout=1.0)
     assert "no answer within 1 s" in outcome.error
     assert not actions
+
+
+def test_what_is_run_again_leaves_the_threads_of_torch_as_they_were(monkeypatch):
+    monkeypatch.setattr(video, "evaluate_episode", lambda *_: torch.get_num_threads())
+    with torch_threads(3):
+        threads, _ = act_again(PEG, dict(obs_mode="state", render_backend="none", sim_backend="physx_cpu"), None, 3)
+        assert (threads, torch.get_num_threads()) == (1, 3)
 
 
 @needs_renderer

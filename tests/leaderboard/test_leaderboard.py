@@ -97,6 +97,10 @@ def change(folder: Path, edit) -> None:
             r"its env_kwargs have \['num_envs', 'sim_config'\], which change the simulator",
         ),
         (
+            lambda r: r["env_kwargs"].update(tactile={"image_shape": [20000, 20000], "pixel_size": 1e-6}),
+            "its tactile hold a number above 2048",
+        ),
+        (
             lambda r: r["env_kwargs"].update(sensor_configs=dict(wrist=dict(width=128, pose=[10**5]))),
             "its sensor_configs hold a number above 2048",
         ),

@@ -41,6 +41,7 @@ HEADER = {
                 "required": ["episode_id", "episode_seed", "elapsed_steps", "success"],
                 "properties": {
                     **dict.fromkeys(("episode_id", "episode_seed", "elapsed_steps"), COUNT),
+                    "success": {"type": "boolean"},
                     "control_mode": {"type": "string"},
                     "peak_contact_force": {"type": "number"},
                     "versions": {"type": "object"},

@@ -286,6 +286,8 @@ class RaycastDepth:
             )
         meshes = [_by_env(s.env_idx, s.meshes, scene.num_envs) for s in self.surfaces]
         self._rays = MeshRays(meshes, size, self.device, sag)
+        self._mass_centres = [_mass_centres(s.body, self.device) for s in self.surfaces]
+        self._pad_mass_centre = _mass_centres(pad, self.device)
         self._world = torch.zeros(scene.num_envs, len(self.surfaces), 7, device=scene.device)
         self._world[..., 3] = 1.0
 
@@ -306,11 +308,11 @@ class RaycastDepth:
     def sliding(self, grid: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Heights (N, C), m, and velocity (N, C, 2), m/s, pad frame, of the pad along the surface that it faces."""
         origin = self._pad_world[:, :3]
-        pad_linear, pad_spin = _motion(self.pad, origin)
+        pad_linear, pad_spin = _motion(self.pad, self._pad_mass_centre, origin)
         twist = torch.zeros(*self._world.shape[:2], 6, device=self.device)
         for b, surface in enumerate(self.surfaces):
             env = surface.env_idx
-            linear, spin = _motion(surface.body, origin[env])
+            linear, spin = _motion(surface.body, self._mass_centres[b], origin[env])
             twist[env, b] = torch.cat([pad_linear[env] - linear, pad_spin[env] - spin], dim=-1)
         return self._rays.sliding(grid, in_pad_frames(twist, self._pad_world))
 
@@ -332,13 +334,22 @@ def _is_static(body: Actor | Link) -> bool:
     return isinstance(body, Actor) and body.px_body_type == "static"
 
 
-def _motion(body: Actor | Link, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Velocity, m/s, of the body's point that is at `at` (n, 3), and its spin, rad/s; (n, 3) each, world frame."""
+def _mass_centres(body: Actor | Link, device: torch.device) -> torch.Tensor:
+    """Centres of mass (n, 3), m, of a body in the environments that have it, in its own frame; zeros for a static one."""
+    if _is_static(body):
+        return torch.zeros(len(body._bodies), 3, device=device)
+    return torch.stack([torch.as_tensor(one.cmass_local_pose.p) for one in body._bodies]).to(device)
+
+
+def _motion(body: Actor | Link, mass_centre: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Velocity, m/s, of the body's point that is at `at` (n, 3), and its spin, rad/s; (n, 3) each, world frame.
+
+    The engine's velocity is that of the centre of mass, which `mass_centre` (n, 3), m, gives in the body's frame.
+    """
     if _is_static(body):
         return torch.zeros_like(at), torch.zeros_like(at)
     spin, pose = body.angular_velocity, body.pose.raw_pose
-    centre = torch.tensor(body._bodies[0].cmass_local_pose.p, device=at.device)  # the engine's velocity is the mass centre's
-    centre = pose[:, :3] + (quaternion_to_matrix(pose[:, 3:]) @ centre)
+    centre = pose[:, :3] + (quaternion_to_matrix(pose[:, 3:]) @ mass_centre[..., None])[..., 0]
     return body.linear_velocity + torch.linalg.cross(spin, at - centre), spin
 
 

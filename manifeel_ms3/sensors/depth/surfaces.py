@@ -70,7 +70,12 @@ def scene_surfaces(scene: ManiSkillScene, excluded: set[str], robot: Articulatio
         relief = getattr(body, RELIEF, None)
         found = [_felt_mesh(entity) if relief is None else relief for entity in entities]
         meshes = [mesh for mesh in found if mesh is not None]
-        if len(meshes) == len(entities):
+        if meshes and len(meshes) < len(entities):
+            raise InvalidArgumentError(
+                f"body {body.name!r} collides in {len(meshes)} of its {len(entities)} environments, so that a pad cannot feel "
+                "it in all; give it collision shapes in all of them, or in none"
+            )
+        if meshes:
             surfaces.append(Surface(body, body._scene_idxs, meshes))
     return surfaces
 

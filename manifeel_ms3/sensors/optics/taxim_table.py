@@ -63,7 +63,7 @@ def fit_table(table: np.ndarray, image_shape: tuple[int, int]) -> Shader:
     slope = np.arange(bins) * (np.pi / 2 / (bins - 1))
     phi = np.arange(bins) * (2 * np.pi / (bins - 1)) - np.pi + np.pi / (bins - 1)  # middle of the bin
     kept = (slope > 0) & (slope <= MAX_SLOPE)
-    flat = table[:, 0, bins // 2]  # |grad| = 0 falls into the bin of phi = 0
+    flat = table[:, 0, (bins - 1) // 2]  # |grad| = 0 falls into the bin of phi = 0
     change = table[:, kept] - flat[:, None, None]  # (3, S, P, 6), portrait terms
     # a quadratic in (u, v) is one in (r, c): change the terms exactly, on a 3 x 3 grid that determines both
     r, c = (g.flatten() for g in np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0], indexing="ij"))
