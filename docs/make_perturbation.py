@@ -37,14 +37,14 @@ of the policy (Holm 1979). One policy of each kind was tested: nothing here tell
 The study `configs/perturbation.yaml` trains and evaluates policies of four tasks, with vision alone, TacRGB and TacFF.
 GearAssembly and BallSorting, and PegInsertion with vision alone and TacRGB, have not been run.
 
-Touch does not make a policy robust that has only seen the usual appearance. In ObjectSearch, touch doubles success under the
-usual appearance: 23 of 50 episodes succeed with vision alone, 46 with TacFF and 48 with TacRGB. Under all changes together, one
-episode succeeds with each of the three. Light from another direction is enough for that: two or three episodes succeed with
-each. A camera that is turned by up to 2 degrees leaves 9 or 10, with touch as without. Brighter or darker light, other colours
-of the parts or of the table, and a table with another texture do not harm the policy with TacFF (45 or 46 episodes); that with
-TacRGB falls to 28 where the parts have other colours, and to 37 in brighter or darker light. A camera that
-is up to 3 mm from its place leaves 37 episodes with TacFF and 24 with TacRGB. With vision alone, no difference but those of the
-light's direction and of all changes is significant after the correction.
+In ObjectSearch, touch did not make the policies that were tested robust to an appearance that they had not seen. Touch
+doubles success under the usual appearance: 23 of 50 episodes succeed with vision alone, 46 with TacFF and 48 with TacRGB.
+Under all changes together, one episode succeeds with each of the three. Light from another direction is enough for that: two
+or three episodes succeed with each. A camera that is turned by up to 2 degrees leaves 9 or 10, with touch as without.
+Brighter or darker light, other colours of the parts or of the table, and a table with another texture do not harm the policy
+with TacFF (45 or 46 episodes); that with TacRGB falls to 28 where the parts have other colours, and to 37 in brighter or
+darker light. A camera that is up to 3 mm from its place leaves 37 episodes with TacFF and 24 with TacRGB. With vision alone,
+no difference but those of the light's direction and of all changes is significant after the correction.
 
 In PegInsertion with TacFF, 23 of 50 episodes succeed under the usual appearance, and fewer under each change: five to 10 with
 another direction or level of the light or a turned camera, which is significant after the correction, and 13 to 15 with the

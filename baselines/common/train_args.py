@@ -51,7 +51,8 @@ class TrainArgs:
     """Form of the tool's pose: "quaternion" is the paper's, 7 numbers, with a sign that does not jump while the hand points
     down; "rotation_6d" has 9 numbers, the position and two columns of the rotation matrix."""
     tacrgb_weights: Path | None = None
-    """File of the weights with which the tactile representation starts: from its authors, or from pretrain.py."""
+    """File of the weights with which the tactile representation starts: from its authors, or from
+    `python -m baselines.tactile_representations.pretrain`."""
     num_demos: int | None = None
     """Number of training episodes; all of them if not given."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)

@@ -120,7 +120,7 @@ class Args:
 
     results: tuple[Path, ...]
     """Folders with result files, and with the logs of training if there are any."""
-    out: Path = Path("docs/results.md")
+    out: Path = Path("results.md")
     """Path of the Markdown page; its figures and their table go into the folder images beside it."""
     audit: Path | None = None
     """Page with the table that `manifeel audit` wrote, which then stands beside what touch adds to success."""
