@@ -9,7 +9,7 @@ from manifeel_ms3.tasks.registry import register_demonstrator
 from manifeel_ms3.tasks.screwing.base import WOUND_UP, ScrewingEnv
 from manifeel_ms3.tasks.screwing.bulb_installation import BulbInstallationEnv
 
-from .skills import DOWNWARD, Actions, Skills, above, perceived_position, position_rotation
+from .skills import DOWNWARD, Actions, Skills, above, aside, perceived_position, position_rotation
 
 STREAM = 17
 """Number beside the seed from which this demonstrator draws, so that its draws are not those of the task; arbitrary."""
@@ -258,9 +258,8 @@ class BulbExpert(ScrewingExpert):
 
     def _come_over(self, end: np.ndarray) -> Actions:
         skills, config = self.skills, self.config
-        angle, share = self._rng.uniform(0, 2 * np.pi), np.sqrt(self._rng.uniform())
-        aside = config.aim_error * share * np.array([np.cos(angle), np.sin(angle), 0.0])
-        yield from skills.reach(above(end, config.clear_height) + aside, self._facing(), config.travel_tolerance)
+        aim = above(end, config.clear_height) + aside(self._rng, config.aim_error)
+        yield from skills.reach(aim, self._facing(), config.travel_tolerance)
         while True:
             off = end - skills.tool[0]
             distance, height = np.linalg.norm(off[:2]), -off[2]

@@ -260,9 +260,14 @@ def perceived_position(actor: Actor, rng: np.random.Generator) -> np.ndarray:
 
     The true position is read from the simulator, and the error added to it.
     """
-    angle, radius = rng.uniform(0, 2 * np.pi), CONFIG.sight_error * np.sqrt(rng.uniform())
     position, _ = position_rotation(actor.pose.raw_pose)
-    return position + radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return position + aside(rng, CONFIG.sight_error)
+
+
+def aside(rng: np.random.Generator, largest: float) -> np.ndarray:
+    """A random horizontal vector (3,) of at most a length; its end is uniform in the disc."""
+    angle, length = rng.uniform(0, 2 * np.pi), largest * np.sqrt(rng.uniform())
+    return length * np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _require_motions(env: VisuotactileEnv) -> None:

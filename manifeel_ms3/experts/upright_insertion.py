@@ -10,7 +10,7 @@ from manifeel_ms3.tasks.registry import register_demonstrator
 
 from .insertion import STRAIGHT, InsertionExpert, InsertionExpertConfig
 from .leaning_insertion import LeaningGearExpert, LeaningInsertionExpert, LeaningPowerPlugExpert
-from .skills import Actions, above
+from .skills import Actions, above, aside
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class UprightInsertionExpert(InsertionExpert):
     def _enter(self) -> Actions:
         config, skills = self.config, self.skills
         hole = np.array([*self.socket[:2], self._rim])
-        aim = above(hole, config.hover_height) + np.array([*self._aim_error(), 0.0])
+        aim = above(hole, config.hover_height) + aside(self._rng, config.aim_error)
         start, facing = self._tool_for(self._end, aim, STRAIGHT)
         yield from skills.reach(start, facing, tolerance=config.approach_tolerance)
         while skills.load[2] <= config.touch:
@@ -78,15 +78,10 @@ class UprightInsertionExpert(InsertionExpert):
             if off[2] > config.lowering:
                 return
             distance = np.linalg.norm(off[:2])
-            aside = distance > max(config.near, -off[2] / config.slope)
-            down = 0.0 if aside else config.lowering_speed
+            is_aside = distance > max(config.near, -off[2] / config.slope)
+            down = 0.0 if is_aside else config.lowering_speed
             command, _ = skills.commanded
             yield skills.command(command + np.array([*config.centring * off[:2], -down]), facing)
-
-    def _aim_error(self) -> np.ndarray:
-        """A random point (2,), in m, of the disc of radius `aim_error`."""
-        angle, share = self._rng.uniform(0, 2 * np.pi), np.sqrt(self._rng.uniform())
-        return self.config.aim_error * share * np.array([np.cos(angle), np.sin(angle)])
 
     def _aside(self, load: np.ndarray) -> np.ndarray:
         config, faces = self.config, self._meeting_faces()
