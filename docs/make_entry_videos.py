@@ -6,9 +6,9 @@ entry's results anew deletes its video (`baselines.studies.publish`).
 
 from pathlib import Path
 
-from manifeel_ms3.evaluation.entries import ABOUT, VIDEO_SUFFIX, VIDEOS
+from manifeel_ms3.evaluation.entries import ABOUT, VIDEO_SUFFIX, VIDEOS, published_checkpoints
 from manifeel_ms3.evaluation.result import read_result
-from manifeel_ms3.paths import CHECKPOINTS, leaderboard_dir
+from manifeel_ms3.paths import leaderboard_dir
 from manifeel_ms3.videos.__main__ import Args
 from manifeel_ms3.videos.__main__ import main as make_video
 
@@ -20,7 +20,7 @@ FRAMES, FPS = 40, 5
 
 def main() -> None:
     """Make the videos."""
-    for checkpoint in sorted(leaderboard_dir().glob(f"*/**/{CHECKPOINTS}/*")):
+    for checkpoint in published_checkpoints(leaderboard_dir()):
         result = checkpoint.parents[1] / f"{checkpoint.name}.json"
         out = video_of(result)
         if not out.is_file():

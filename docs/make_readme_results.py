@@ -14,7 +14,7 @@ import numpy as np
 
 from manifeel_ms3.analysis.condition import condition_of
 from manifeel_ms3.analysis.estimates import SIGNIFICANT, difference, has_enough_seeds, holm
-from manifeel_ms3.analysis.markdown import markdown_table
+from manifeel_ms3.analysis.markdown import in_words, markdown_table
 from manifeel_ms3.analysis.paper import MODES, TABLE_I, VISION
 from manifeel_ms3.analysis.paper_comparison import gpu_of_training
 from manifeel_ms3.analysis.paper_tables import HEADINGS, overview_of_table_one
@@ -92,7 +92,7 @@ def block() -> str:
         seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
         tests=len(gains),
-        by_the_paper=f"{STRICTER} has {_in_words(_rates_by_the_paper(here))} %",
+        by_the_paper=f"{STRICTER} has {in_words(_rates_by_the_paper(here))} %",
         floor=_floor(),
     )
     raised = {place for place, p_holm in gains.items() if p_holm < SIGNIFICANT}
@@ -136,11 +136,6 @@ def _at_end(task: str, results: Results) -> str:
     """Success at the last step with each sensing, in percent."""
     rates = [results[task, mode].success_at_end for mode in MODES if (task, mode) in results]
     return ", ".join("?" if rate is None else f"{100 * rate:.0f}" for rate in rates) + " %"
-
-
-def _in_words(items: list[str]) -> str:
-    *others, last = items
-    return f"{', '.join(others)} and {last}" if others else last
 
 
 def _cells(task: str, results: Results, raised: set[tuple[str, str]]) -> Iterator[str]:

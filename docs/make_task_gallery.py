@@ -12,7 +12,8 @@ from rich.progress import track
 
 from manifeel_ms3.demonstrations.episode import demonstrate
 from manifeel_ms3.experts import make_expert
-from manifeel_ms3.tasks.registry import all_tasks, short_name
+
+from .make_task_cards import own_tasks
 
 IMAGES = Path(__file__).parent / "images"
 VIEWS = ("front", "side", "wrist", "tactile_left", "tactile_right")
@@ -47,9 +48,9 @@ def moment(task: str) -> np.ndarray:
 if __name__ == "__main__":
     IMAGES.mkdir(exist_ok=True)
     rows = []
-    for name in track(all_tasks(), "tasks"):
-        row = moment(name)
-        label = short_name(name)
+    for spec in track(own_tasks(), "tasks"):
+        row = moment(spec.env_id)
+        label = spec.name
         cv2.rectangle(row, (0, 0), (180, 24), (20, 20, 20), cv2.FILLED)
         cv2.putText(row, label, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.55, (255, 255, 255), 1, cv2.LINE_AA)
         rows.append(row)

@@ -151,7 +151,10 @@ find_python() { # the first Python for which requirements.lock names packages
 # the CPU and for CUDA are different files, so that one lock with hashes cannot name both; the latter itself names the exact
 # versions of NVIDIA's packages that it needs.
 install_python_packages() {
-  [ -x .venv/bin/python ] || { find_python && "$PYTHON" -m venv .venv; }
+  if [ ! -x .venv/bin/python ]; then # no `||`, in which a failure would not end the script
+    find_python
+    "$PYTHON" -m venv .venv
+  fi
   # nothing is compiled in advance: a module is compiled at its first import, and most modules are never imported
   local pip=(.venv/bin/python -m pip --disable-pip-version-check install --quiet --no-compile)
   say "Installing the packages of requirements.lock"

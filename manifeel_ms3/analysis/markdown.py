@@ -33,6 +33,12 @@ def markdown_tables(text: str) -> Iterator[list[list[str]]]:
         yield [head, *rows]
 
 
+def in_words(items: Iterable[str]) -> str:
+    """One or more items as they are listed in a sentence, such as "a, b and c"."""
+    *others, last = items
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def shown(text: str) -> str:
     """A text of a result in Markdown: as it is if that is safe, or else with its characters escaped, and cut if it is long."""
     return text if PLAIN.fullmatch(text) else markdown_text(text)

@@ -31,7 +31,7 @@ from .estimates import difference, p_text
 from .figures import save_figure
 from .gentle_success import draw_success_under_force
 from .information_audit import audited
-from .markdown import markdown_table, shown
+from .markdown import in_words, markdown_table, shown
 from .matching import Found
 from .paper_comparison import runtime_table, similarity_table
 from .paper_tables import Files, draw_sensing_by_task, tables_of_the_paper
@@ -285,8 +285,7 @@ def _table_of_floors() -> str:
         (spec.name, spec.revision, *(f"{here[name]} of {here[name].episodes}" if name in here else None for name in POLICIES))
         for spec, here in floors
     ]
-    *others, last = (f'"{name}" ({about})' for name, about in POLICIES.items())
-    policies = f"{', '.join(others)} and {last}"
+    policies = in_words(f'"{name}" ({about})' for name, about in POLICIES.items())
     return f"{FLOORS.format(policies=policies)}{markdown_table(('task', 'revision', *POLICIES), rows)}" if rows else ""
 
 

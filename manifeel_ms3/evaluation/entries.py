@@ -72,6 +72,11 @@ class Entry:
         )
 
 
+def published_checkpoints(board: Path) -> list[Path]:
+    """Folders of all checkpoints on a leaderboard, sorted."""
+    return sorted(board.glob(f"*/**/{CHECKPOINTS}/*"))
+
+
 def find_entry(name: str) -> Entry:
     """The entry with a given name.
 
@@ -90,7 +95,7 @@ def find_entry(name: str) -> Entry:
             f"{board} does not exist: only a copy of the repository has the entries; install the package from one with "
             "`pip install -e .`"
         )
-    known = {path.parents[2].relative_to(board).as_posix(): path for path in sorted(board.glob(f"*/**/{CHECKPOINTS}/*"))}
+    known = {path.parents[2].relative_to(board).as_posix(): path for path in published_checkpoints(board)}
     if not known:
         raise UnknownNameError(
             f"{board.resolve()} has no entries with checkpoints; run the command in a copy of the repository"

@@ -37,7 +37,8 @@ WEDGES = 16
 DEDENDUM = 1.25
 """Distance from the pitch circle to the root, in modules (ISO 53)."""
 RING_OVERLAP = 2e-4
-"""Distance by which the ring around the bore and the teeth overlap, in m, so that no gap is between them."""
+"""Distance by which the ring around the bore and the teeth overlap, in m, at the corners of the ring's pieces. Between the
+corners the ring is straight, and gaps of up to 0.26 mm are left in the large gear and 0.06 mm in the medium one."""
 NECK_RADIUS = 0.010
 """Radius of the ring between the medium gear and its handle, in m. Chosen by eye."""
 GEAR_FRICTION = 0.15

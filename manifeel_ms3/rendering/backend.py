@@ -41,7 +41,7 @@ def available_render_backend(asked: str = "auto") -> str:
     """The `render_backend` to use: "gpu", "cpu", "none", or what is asked for.
 
     A process that was forked from one with a renderer has none. Where there is no GPU, the CPU renders in its place, with a
-    warning, as in ManiSkill, whose tools ask for one.
+    warning, as in ManiSkill, whose tools ask for one. It does not where a certain GPU is asked for by its number or address.
 
     Args:
         asked: A name of ManiSkill's, such as "gpu", "cuda:1" or "cpu"; "none", or "auto" for the one that this process uses

@@ -60,9 +60,9 @@ def spacemouse() -> Iterator[Reading]:
 def gamepad() -> Iterator[Reading]:
     """Readings of the first gamepad, without end.
 
-    The left stick moves along x and y, the right stick along z and about yaw, the shoulder buttons turn about roll, and the
-    lowest button toggles the gripper. Sticks and buttons have the names of SDL's controllers, because their numbers differ
-    from gamepad to gamepad and between operating systems.
+    The left stick moves along x and y, the right stick along z and about yaw, the shoulder buttons turn about roll, the
+    directional pad about pitch, and the lowest button toggles the gripper. Sticks and buttons have the names of SDL's
+    controllers, because their numbers differ from gamepad to gamepad and between operating systems.
 
     Raises:
         DeviceError: No such device is plugged in, or its library is not installed.
@@ -84,10 +84,14 @@ def gamepad() -> Iterator[Reading]:
     def stick(name: str) -> float:
         return pad.get_axis(getattr(pygame, f"CONTROLLER_AXIS_{name}")) / STICK_RANGE
 
+    def buttons(up: str, down: str) -> float:
+        pressed = [pad.get_button(getattr(pygame, f"CONTROLLER_BUTTON_{name}")) for name in (up, down)]
+        return float(pressed[0] - pressed[1])
+
     while True:
         pygame.event.pump()
-        roll = pad.get_button(pygame.CONTROLLER_BUTTON_RIGHTSHOULDER) - pad.get_button(pygame.CONTROLLER_BUTTON_LEFTSHOULDER)
-        axes = dict(x=-stick("LEFTY"), y=-stick("LEFTX"), z=-stick("RIGHTY"), yaw=-stick("RIGHTX"), roll=float(roll))
+        axes = dict(x=-stick("LEFTY"), y=-stick("LEFTX"), z=-stick("RIGHTY"), yaw=-stick("RIGHTX"))
+        axes |= dict(roll=buttons("RIGHTSHOULDER", "LEFTSHOULDER"), pitch=buttons("DPAD_UP", "DPAD_DOWN"))
         yield Reading(axes, bool(pad.get_button(pygame.CONTROLLER_BUTTON_A)))
 
 
@@ -103,12 +107,16 @@ def follow(readings: Iterator[Reading], operator: Operator) -> threading.Thread:
     first = next(readings)
 
     def read() -> None:
-        was_down = first.gripper
+        was_down, moving = first.gripper, set[str]()
         try:
             for reading in readings:
                 for axis, value in reading.axes.items():
                     if abs(value) > DEAD_ZONE:
                         operator.push(axis, value)
+                        moving.add(axis)
+                    elif axis in moving:  # released: unlike a key, it need not be held on to
+                        operator.push(axis, 0.0)
+                        moving.discard(axis)
                 if reading.gripper and not was_down:
                     operator.toggle_gripper()
                 was_down = reading.gripper

@@ -11,7 +11,8 @@ from manifeel_ms3.agents.panda_gelsight import ACTION_AXES, LOCKED_AXES
 from manifeel_ms3.errors import InvalidArgumentError
 
 HOLD = 0.25
-"""Time in s for which one key press moves the arm; a key that is held down repeats faster, so that the arm keeps moving."""
+"""Time in s for which one key press moves the arm; a key that is held down repeats faster, so that the arm keeps moving. Most
+systems wait longer than this before the first repeat, so that the arm stops for a moment there; the page's buttons do not."""
 OPEN, CLOSED = 1.0, -1.0
 """Gripper commands that open the hand, and that close it as firmly as it can."""
 FIRST_SPEED = 0.5

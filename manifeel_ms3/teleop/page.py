@@ -1,6 +1,8 @@
 """The page in a browser (viser): it shows the observations, and has the keys and buttons to steer with."""
 
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -33,6 +35,9 @@ HOLD_HZ = 10.0
 """Rate in Hz at which a button that is held down repeats its push; `HOLD` needs at least 4 Hz."""
 SPEED_RANGE, SPEED_STEP = (0.05, 1.0), 0.05
 """Smallest and largest speed on the slider, and its step, as shares of the full speed."""
+KEY_PAUSE = 0.8
+"""Time in s without an event of a key after which it counts as pressed anew. It is longer than systems wait before they repeat
+a key that is held down."""
 KEYS = {
     "W": ("x", 1.0),
     "S": ("x", -1.0),
@@ -168,7 +173,7 @@ class Page:
         gui = self._server.gui
         with gui.add_folder("steer"):
             keys = [said for axis, said in KEYS_OF_AXES.items() if axis in self.operator.axes]
-            gui.add_markdown("Keys (hold them): " + " · ".join([*keys, *KEYS_OF_EPISODES]))
+            gui.add_markdown("Keys (hold those of motions): " + " · ".join([*keys, *KEYS_OF_EPISODES]))
             for axis in dict.fromkeys(axis for axis, _ in KEYS.values() if axis in self.operator.axes):
                 for sign, name in ((1.0, f"{axis} +"), (-1.0, f"{axis} -")):
                     push = self._if_pilot(partial(self.operator.push, axis, sign))
@@ -181,10 +186,10 @@ class Page:
             if axis in self.operator.axes:
                 self._key(f"{axis} {'+' if sign > 0 else '-'}", key, partial(self.operator.push, axis, sign))
         if "gripper" in self.operator.axes:
-            self._key("gripper", "G", self.operator.toggle_gripper)
-        self._key("start or pause", "space", self._start_or_pause)
-        self._key("save", "enter", partial(self.operator.command, EpisodeCommand.SAVE))
-        self._key("discard", "backspace", partial(self.operator.command, EpisodeCommand.DISCARD))
+            self._key("gripper", "G", once_a_press(self.operator.toggle_gripper))
+        self._key("start or pause", "space", once_a_press(self._start_or_pause))
+        self._key("save", "enter", once_a_press(partial(self.operator.command, EpisodeCommand.SAVE)))
+        self._key("discard", "backspace", once_a_press(partial(self.operator.command, EpisodeCommand.DISCARD)))
 
     def _buttons(self, label: str, named: dict[str, Callable[[], None]]) -> None:
         group = self._server.gui.add_button_group(label, tuple(named))
@@ -195,6 +200,24 @@ class Page:
 
     def _start_or_pause(self) -> None:
         self.operator.pause() if self.operator.mode is Mode.RUNNING else self.operator.start()
+
+
+def once_a_press(do: Callable[[], None], clock: Callable[[], float] = time.monotonic) -> Callable[[], None]:
+    """The callback of a key that does something once for each press, although the system repeats a key that is held down.
+
+    Args:
+        do: What is to be done.
+        clock: Function that returns the time in s.
+    """
+    last = -math.inf
+
+    def pressed() -> None:
+        nonlocal last
+        before, last = last, clock()
+        if last - before > KEY_PAUSE:
+            do()
+
+    return pressed
 
 
 def _mosaic(images: list[np.ndarray]) -> np.ndarray:

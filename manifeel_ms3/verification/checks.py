@@ -4,6 +4,7 @@ The bounds are chosen: what users may rely on, not what the sensor reaches at be
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -80,8 +81,10 @@ def checks_of(found: Measurements, config: TactileSensorConfig) -> list[Check]:
         *_centre("centre of pressure of balls against the ball's middle", balls),
         *_centre("centre of pressure of box, plate and rod against the force on the pad", others),
         Check("loading and unloading: area of the loop", 100 * loop_area(found.loop), 100 * LOOP_BOUND, "%"),
-        Check("depth of a ball against the law of the gel layer", 1e3 * float(depth.max()), 1e3 * DEPTH_BOUND, "mm"),
     ]
+    if len(depth):
+        law = "depth of a ball against the law of the gel layer"
+        checks.append(Check(law, 1e3 * float(depth.max()), 1e3 * DEPTH_BOUND, "mm"))
     if has_published_colours(config):
         similarity = Check(
             "colours against the published calibration, SSIM", worst_similarity(config), SIMILARITY_BOUND, "", True
@@ -123,4 +126,5 @@ def loop_area(loop: np.ndarray) -> float:
 def has_published_colours(config: TactileSensorConfig) -> bool:
     """Whether the sensor has the colours of the only published table at hand, that of the GelSight R1.5."""
     default = OpticsConfig()
-    return config.optics.lights is None and config.optics.calibration == default.calibration
+    given = Path(config.optics.calibration).resolve()
+    return config.optics.lights is None and given == Path(default.calibration).resolve()

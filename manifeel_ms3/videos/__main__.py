@@ -133,7 +133,7 @@ def main(args: Args) -> Path:
             f"{', '.join(given)} without a result of an evaluation: trajectory files hold their own actions; leave it out"
         )
     takes = [_take(source, args) for source in sources]
-    write_video([list(video_frames(take)) for take in takes], args.out, args.fps, args.width)
+    write_video(map(video_frames, takes), args.out, args.fps, args.width)
     return args.out
 
 

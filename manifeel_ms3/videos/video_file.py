@@ -1,6 +1,6 @@
 """Writing of videos: H.264 in mp4, animated WebP, and GIF."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,13 @@ def check_video(path: Path, fps: int) -> None:
         raise InvalidArgumentError(f"--fps {fps} is not possible in a GIF, which has {rates}; or write a .webp or .mp4")
 
 
-def write_video(episodes: Iterable[list[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:
+def write_video(episodes: Iterable[Iterable[Image.Image]], path: Path, fps: int, width: int | None = None) -> None:
     """Write the frames of some episodes, one after the other, as one video that stops for a moment after each episode.
 
+    A frame is only taken when it is written, so that a long video needs no memory for all of them.
+
     Args:
-        episodes: Frames of each episode.
+        episodes: Frames of each episode, of which there is at least one.
         path: Path of the video; its suffix decides the format.
         fps: Frames per second.
         width: Width of the video in pixels; that of the frames if not given.
@@ -53,12 +55,20 @@ def write_video(episodes: Iterable[list[Image.Image]], path: Path, fps: int, wid
     Raises:
         FileWriteError: The video cannot be written.
     """
-    frames = [_resized(frame, width) for episode in episodes for frame in episode + episode[-1:] * round(END_SECONDS * fps)]
+    frames = (_resized(frame, width) for episode in episodes for frame in _with_end(episode, round(END_SECONDS * fps)))
     with atomic_write(path) as partial:
         if path.suffix.lower() == ".mp4":
             partial.write_bytes(encode_mp4(map(np.asarray, frames), fps, BLOCK))
         else:
             _write_animation(frames, partial, path.suffix.lower()[1:].upper(), fps)
+
+
+def _with_end(episode: Iterable[Image.Image], repeats: int) -> Iterator[Image.Image]:
+    """The frames of an episode, the last one several times more."""
+    last: Any = None
+    for last in episode:
+        yield last
+    yield from [last] * repeats
 
 
 def _resized(frame: Image.Image, width: int | None) -> Image.Image:
@@ -67,7 +77,6 @@ def _resized(frame: Image.Image, width: int | None) -> Image.Image:
     return frame.resize((width // BLOCK * BLOCK, height // BLOCK * BLOCK), Image.Resampling.LANCZOS)
 
 
-def _write_animation(frames: list[Image.Image], path: Path, kind: str, fps: int) -> None:
+def _write_animation(frames: Iterator[Image.Image], path: Path, kind: str, fps: int) -> None:
     options: dict[str, Any] = dict(quality=WEBP_QUALITY, method=WEBP_EFFORT) if kind == "WEBP" else {}
-    first, *others = frames
-    first.save(path, kind, save_all=True, append_images=others, duration=round(1000 / fps), loop=0, **options)
+    next(frames).save(path, kind, save_all=True, append_images=frames, duration=round(1000 / fps), loop=0, **options)

@@ -26,6 +26,13 @@ def test_a_device_pushes_beyond_its_dead_zone():
     assert operator.action() == pytest.approx([0.5 * operator.speed, 0, 0, 0, 0, 0, -1.0])
 
 
+def test_a_device_that_is_released_stops_the_robot_at_once():
+    operator = Operator(AXES, clock=lambda: 0.0)
+    readings = [Reading(dict(x=x, roll=roll), gripper=False) for x, roll in ((0.5, 1.0), (0.5, 1.0), (0.02, 0.0))]
+    follow(iter(readings), operator).join()
+    assert not operator.action()[:6].any()
+
+
 @pytest.mark.parametrize(("device", "library"), [("spacemouse", "pyspacemouse"), ("gamepad", "pygame")])
 def test_a_device_whose_library_is_missing(monkeypatch, device, library):
     monkeypatch.setitem(sys.modules, library, None)
@@ -36,10 +43,11 @@ def test_a_device_whose_library_is_missing(monkeypatch, device, library):
 # -------------------------------------------------------------------- gamepad
 
 
-# numbers in SDL: kinds of joysticks; sticks of a virtual gamepad; its lowest button, and its right shoulder button
+# numbers in SDL: kinds of joysticks; sticks of a virtual gamepad; its lowest button, its right shoulder button, and
+# the lower end of its directional pad
 GAMEPAD, WHEEL = 1, 2
 LEFT_ASIDE, LEFT_BACK, RIGHT_ASIDE, RIGHT_BACK = range(4)
-LOWEST, RIGHT_SHOULDER = 0, 10
+LOWEST, RIGHT_SHOULDER, PAD_DOWN = 0, 10, 12
 
 
 @pytest.fixture
@@ -59,20 +67,20 @@ def sdl():
 
 
 def plug_in(sdl: ctypes.CDLL, kind: int) -> ctypes.c_void_p:
-    assert sdl.SDL_JoystickAttachVirtual(kind, 6, 11, 0) == 0
+    assert sdl.SDL_JoystickAttachVirtual(kind, 6, 15, 0) == 0
     return ctypes.c_void_p(sdl.SDL_JoystickOpen(0))
 
 
 def test_a_gamepad(sdl):
     pad = plug_in(sdl, GAMEPAD)
     readings = gamepad()
-    assert next(readings) == Reading(dict(x=0, y=0, z=0, yaw=0, roll=0), gripper=False)
+    assert next(readings) == Reading(dict(x=0, y=0, z=0, yaw=0, roll=0, pitch=0), gripper=False)
     for axis, value in {LEFT_ASIDE: 0.5, LEFT_BACK: -1.0, RIGHT_ASIDE: -0.25, RIGHT_BACK: 0.75}.items():
         assert sdl.SDL_JoystickSetVirtualAxis(pad, axis, ctypes.c_int16(round(32767 * value))) == 0
-    for button in (LOWEST, RIGHT_SHOULDER):
+    for button in (LOWEST, RIGHT_SHOULDER, PAD_DOWN):
         assert sdl.SDL_JoystickSetVirtualButton(pad, button, 1) == 0
     reading = next(readings)
-    assert reading.axes == pytest.approx(dict(x=1.0, y=-0.5, z=-0.75, yaw=0.25, roll=1.0), abs=1e-4)
+    assert reading.axes == pytest.approx(dict(x=1.0, y=-0.5, z=-0.75, yaw=0.25, roll=1.0, pitch=-1.0), abs=1e-4)
     assert reading.gripper
 
 

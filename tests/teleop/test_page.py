@@ -48,6 +48,16 @@ def listening_addresses(port: int) -> set[str]:
     return {host for host, number in local if int(number, 16) == port}
 
 
+def test_a_key_that_is_held_down_counts_once():
+    page = pytest.importorskip("manifeel_ms3.teleop.page")
+    now, pressed = [0.0], []
+    key = page.once_a_press(lambda: pressed.append(now[0]), clock=lambda: now[0])
+    for moment in (0.0, 0.6, 0.63, 0.66, 2.0):  # a press, its repeats after the usual delay, and another press
+        now[0] = moment
+        key()
+    assert pressed == [0.0, 2.0]
+
+
 def test_a_person_records_an_episode(address, tmp_path):
     path, port = tmp_path / "human.h5", urlsplit(address).port
     wait_until(lambda: listening_addresses(port), 120)

@@ -79,8 +79,9 @@ struct Surface {
   float roughness;
 };
 
-// Light that a surface sends to the camera from a light in a direction: Lambert's law and a GGX lobe with the cheap
-// visibility term of Lazarov, "Physically Based Lighting in Call of Duty: Black Ops", 2011.
+// Light that a surface sends to the camera from a light in a direction: Lambert's law and a GGX lobe whose visibility and
+// Fresnel terms are joined in one cheap factor, as real-time engines do on mobile devices. There the roughness in
+// (4 roughness + 2) is squared; here it is not, which makes highlights of rough surfaces weaker.
 vec3 lit(Surface surface, vec3 toLight, vec3 emission) {
   float cosine = dot(surface.normal, toLight);
   if (cosine <= 0) {

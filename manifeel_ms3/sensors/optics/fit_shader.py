@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import tyro
 
+from manifeel_ms3.arguments import require_file
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError, InvalidFileError
 from manifeel_ms3.files import read_npz
@@ -261,6 +262,7 @@ def _read_image(path: Path) -> np.ndarray:
 
 def main(args: Table | Presses | Pack) -> None:
     """Fit a shader and write it."""
+    require_file("--out", args.out, "shader.npz")
     if isinstance(args, Table):
         shader = fit_table(read_table(args.table), args.image_shape)
     else:
