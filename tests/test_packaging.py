@@ -48,6 +48,11 @@ def test_the_wheel_holds_all_that_the_packages_hold(wheel):
     assert {f"manifeel_ms3/data/{path.name}" for path in (REPOSITORY / "data").iterdir() if path.is_file()} <= inside
 
 
+def test_the_source_archive_is_that_of_a_package_and_not_of_the_whole_repository(wheel):
+    (archive,) = wheel.parent.glob("*.tar.gz")
+    assert archive.stat().st_size < 5e6  # with the leaderboard's checkpoints it has 114 MB, and PyPI takes at most 100
+
+
 def dependency(name: str) -> Requirement:
     """The requirement on a package in pyproject.toml."""
     (asked,) = re.findall(rf'"({name}[<>=][^"]*)"', (REPOSITORY / "pyproject.toml").read_text())
