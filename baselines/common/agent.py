@@ -24,6 +24,10 @@ from .policy import VisuotactilePolicy
 MAX_SETTING = 1_000_000
 """Largest number that the settings of a policy may hold, so that the config of a stranger's checkpoint cannot ask for networks
 of any size; the largest number in the paper's settings is 2048."""
+LAYERS = "mlp_blocks"
+"""Setting that is a number of layers, of which each takes milliseconds and megabytes to make, as the entries of lists do."""
+MAX_LAYERS = 1000
+"""Largest number of layers, and of entries of a list, in such settings; the paper's lists have three."""
 
 TRIAL_STEPS = 3
 """Number of generation steps of a trial, and number of trials, in which a traced network must agree with the original; set
@@ -57,8 +61,12 @@ def _from_json(cls: type, value: Any) -> Any:
         types = typing.get_type_hints(cls)
         if unknown := set(value) - {f.name for f in fields(cls)}:
             raise TypeError(f"{cls.__name__} has no fields {sorted(unknown)}")
+        if (layers := value.get(LAYERS, 0)) > MAX_LAYERS:
+            raise ValueError(f"{LAYERS}={layers} is larger than {MAX_LAYERS}")
         return cls(**{name: _from_json(types[name], part) for name, part in value.items()})
     numbers = value if isinstance(value, list) else [value]
+    if len(numbers) > MAX_LAYERS:
+        raise ValueError(f"a list of {len(numbers)} entries is longer than {MAX_LAYERS}")
     if any(isinstance(number, int | float) and not abs(number) <= MAX_SETTING for number in numbers):
         raise ValueError(f"{value} is larger than {MAX_SETTING}")
     return tuple(value) if typing.get_origin(cls) is tuple else value

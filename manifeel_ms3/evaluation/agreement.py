@@ -10,12 +10,14 @@ FORCES = ("peak_contact_force", "force_until_success")
 """Entries of an episode that are forces."""
 COMPARED = ("success_once", "success_at_end", "fail_once", "fail_at_end", "first_success", "episode_len", *FORCES)
 """Entries of an episode that must agree when it is run again."""
+NOT_IN_OLD_RESULTS = "success_paper"
+"""Entry that must agree, too, in an episode that has it."""
 
 
 def differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
     """What differs between an episode of a result and the same episode run again, as sentences; [] where they agree."""
     found, again = [], outcome_as_json(outcome)
-    for name in COMPARED:
+    for name in (*COMPARED, *[NOT_IN_OLD_RESULTS] * (episode.get(NOT_IN_OLD_RESULTS) is not None)):
         tolerance = FORCE_TOLERANCE if name in FORCES else 0
         before, now = episode.get(name), again.get(name)
         differs = before is not now if before is None or now is None else abs(before - now) > tolerance

@@ -29,6 +29,8 @@ SIMULATOR = ("mani-skill", "sapien")
 """Packages whose minor version must be the one that is installed here."""
 NOT_OF_A_SUBMISSION = {"sim_config", "num_envs", "render_mode", "human_render_camera_configs"}
 """Arguments of an environment with which running an episode again could take any time or memory."""
+ON_THE_CPU = (None, "auto", "physx_cpu", "cpu")
+"""Values of the argument `sim_backend` with which the CPU simulates a single environment."""
 SENSOR_SETTINGS = ("sensor_configs", "tactile")
 """Arguments of an environment that hold settings of cameras and pads."""
 MOST_PIXELS = 2048
@@ -179,6 +181,11 @@ def _faults_of_the_task(result: dict[str, Any]) -> list[str]:
         faults.append(f"its env_kwargs have a time limit of {limit} steps, the task ends after {most}; evaluate without it")
     if given := sorted(NOT_OF_A_SUBMISSION & result["env_kwargs"].keys()):
         faults.append(f"its env_kwargs have {given}, which change the simulator or what is rendered; evaluate without them")
+    if (simulator := result["env_kwargs"].get("sim_backend")) not in ON_THE_CPU:
+        faults.append(
+            f"its env_kwargs have sim_backend {simulator!r}, with which the initial states are others; evaluate with "
+            "'physx_cpu'"
+        )
     for name in SENSOR_SETTINGS:
         if _largest_number(result["env_kwargs"].get(name)) > MOST_PIXELS:
             faults.append(f"its {name} hold a number above {MOST_PIXELS}; evaluate with smaller images")

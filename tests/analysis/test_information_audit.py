@@ -6,12 +6,14 @@ import shutil
 import h5py
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from manifeel_ms3.analysis import information_audit
 from manifeel_ms3.analysis.probes import register_probe
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.recording import observed_file
 from manifeel_ms3.errors import UnknownNameError
+from manifeel_ms3.geometry import bulb_and_holder, nut_and_bolt
 from manifeel_ms3.tasks.registry import all_tasks, task_spec
 
 pytest.importorskip("sklearn")
@@ -216,3 +218,81 @@ def test_audit_says_what_is_missing(recorded, tmp_path):
     path.with_suffix(".json").write_text(json.dumps(header | dict(episodes=header["episodes"][:3])))
     with pytest.raises(DemonstrationError, match="3 episodes, at least"):
         information_audit.main(information_audit.Args(recorded, tmp_path / "out"))
+
+
+def probe(task: str, question: str):
+    (found,) = [one for one in task_spec(f"ManiFeel-{task}-v1").probes if question in one.question]
+    return lambda episode: list(found.samples(episode))
+
+
+def poses(position, rotation, steps: int = 12) -> np.ndarray:
+    return np.tile([*position, *rotation.as_quat(scalar_first=True), *np.zeros(6)], (steps, 1))
+
+
+def test_the_pitch_of_a_peg_is_its_turn_about_the_closing_axis_of_the_hand():
+    hand = Rotation.from_euler("z", 40, degrees=True) * Rotation.from_quat([1, 0, 0, 0])
+    held = hand * Rotation.from_euler("y", -7, degrees=True) * Rotation.from_euler("x", 2, degrees=True)
+    episode = {"env_states/actors": ["peg"], "env_states/actors/peg": poses((0, 0, 0), held)}
+    episode["obs/extra/tcp_pose"] = poses((0, 0, 0), hand)[:, :7]
+    assert [t for t, _ in probe("PegInsertion", "pitch")(episode)] == [1, 4, 7]
+    assert [answer for _, answer in probe("PegInsertion", "pitch")(episode)] == pytest.approx([-7.0] * 3, abs=0.1)
+
+
+@pytest.mark.parametrize("task", ["NutBoltAssembly", "BulbInstallation"])
+def test_a_screwed_part_is_asked_about_after_the_step_whose_force_it_feels(task):
+    """The part is over the thread, or out of its seat, at even observations, and in it at odd ones."""
+    nut, bulb = nut_and_bolt(), bulb_and_holder()
+    out, within, held, fixed = dict(
+        NutBoltAssembly=(nut.engaged + 1e-4, nut.engaged - 1e-4, "nut", "bolt"),
+        BulbInstallation=(bulb.seated + 1e-4, bulb.seated - 4e-4, "bulb", "holder"),
+    )[task]
+    heights = np.where(np.arange(13) % 2, within, out)
+    part = np.zeros((13, 13))
+    part[:, 2] = heights
+    force = np.full(12, 5.0)
+    force[11] = 0.0  # the weight
+    episode = {"contact_force": force, f"env_states/actors/{held}": part, f"env_states/actors/{fixed}": np.zeros((13, 13))}
+    samples = probe(task, "thread engaged" if task.startswith("Nut") else "tight")(episode)
+    stride = 4 if task.startswith("Nut") else 3
+    expected = [(t + 1, float((t + 1) % 2)) for t in range(0, 11, stride)]
+    assert samples == expected
+
+
+def test_a_moment_is_answered_from_the_observation_of_that_moment(tmp_path, monkeypatch):
+    """The field of one observation alone tells the answer."""
+    spec = task_spec("ManiFeel-ObjectSearch-v1")
+    monkeypatch.setattr(spec, "probes", [])
+
+    @register_probe(spec.env_id, question="odd")
+    def odd(episode):
+        yield 5, float(episode["actions"][0, 0])
+
+    rng = np.random.default_rng(0)
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        for i in range(24):
+            group = file.create_group(f"traj_{i}")
+            group["actions"] = np.full((8, 7), i % 2)
+            field = rng.normal(size=(9, 10, 14, 3)).astype(np.float32)
+            field[5] += 3.0 * (i % 2)
+            picture = rng.integers(100, 110, (9, 32, 32, 3), dtype=np.uint8)
+            picture[5] += 100 * np.uint8(i % 2)
+            sensors = group.create_group("obs/sensor_data")
+            sensors["tactile_right/force_field"], sensors["tactile_right/rgb"], sensors["front/rgb"] = field, picture, picture
+    episodes = [dict(episode_id=i, episode_seed=i, elapsed_steps=8, success=True) for i in range(24)]
+    about = dict(env_info=dict(env_id=spec.gym_id, env_kwargs=dict(obs_mode="tacrgb+tacff")), episodes=episodes)
+    (tmp_path / "t.json").write_text(json.dumps(about))
+    (asked,) = spec.probes
+    assert [found.score for found in information_audit.run_probe(asked, spec.env_id, tmp_path / "t.h5")] == [1.0] * 3
+
+
+def test_the_interval_of_a_score_is_that_of_episodes_and_not_of_their_moments():
+    """All moments of an episode are answered alike: the interval is that of 30 episodes, however many moments each has."""
+    rng = np.random.default_rng(0)
+    right = rng.random(30) < 0.7
+    truth = np.tile([0.0, 1.0], 300)
+    episodes = np.repeat(np.arange(30), 20)
+    predicted = np.where(right[episodes], truth, 1 - truth)
+    score, low, high = information_audit._score(truth, predicted, episodes, numeric=False)
+    half = 1.96 * np.sqrt(right.mean() * (1 - right.mean()) / 30)
+    assert score == pytest.approx(right.mean())
+    assert (high - low) / 2 == pytest.approx(half, rel=0.15)

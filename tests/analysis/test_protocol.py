@@ -379,3 +379,14 @@ def test_results_from_before_a_setting_existed_are_of_the_condition_with_its_def
     assert condition("rgb+tacrgb", before) == condition("rgb+tacrgb", now)
     assert condition("rgb+tacrgb", other) != condition("rgb+tacrgb", now)
     assert condition("rgb", other) == condition("rgb", now)  # nothing to scale
+
+
+def test_episodes_are_matched_by_their_seeds_in_whatever_order_a_file_has_them(tmp_path):
+    write(tmp_path, 0, 10, [True, False, False])
+    write(tmp_path, 1, 10, [True, False, False])
+    path = tmp_path / "1/00000010.json"
+    result = json.loads(path.read_text())
+    path.write_text(json.dumps(result | dict(episodes=result["episodes"][::-1])))
+    (found,) = collect(results_in(tmp_path)).values()
+    assert found.success.tolist() == [[[1, 0, 0]], [[1, 0, 0]]]
+    assert [episode["seed"] for episode in found.episodes] == 2 * found.episode_seeds

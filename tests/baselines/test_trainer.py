@@ -290,8 +290,9 @@ def test_a_weight_with_two_names_is_saved_under_both(trainer_args):
     second = Trainer(dataclasses.replace(trainer_args, resume=True), TiedPolicy, Processes("cpu"))
     own, other = first.policy.state_dict(), second.policy.state_dict()
     assert all(torch.equal(own[name], other[name]) for name in own)
-    averaged = dict(zip(second.policy.parameters(), second.ema.shadow_params, strict=True))
-    assert all(torch.equal(saved[name], averaged[weight]) for name, weight in second.policy.named_parameters())
+    for trainer in (first, second):
+        averaged = dict(zip(trainer.policy.parameters(), trainer.ema.shadow_params, strict=True))
+        assert all(torch.equal(saved[name], averaged[weight]) for name, weight in trainer.policy.named_parameters())
 
 
 def test_a_run_has_the_settings_that_it_was_given(trainer_args, demos):
@@ -407,3 +408,24 @@ def test_an_evaluation_does_not_outlive_a_training_that_fails(trainer_args, monk
         trainer.run()
     (evaluation,) = evaluations
     assert not evaluation.is_running()
+
+
+def test_a_step_of_training_sees_crops_at_random_places(trainer_args):
+    encoder = EncoderConfig("small_cnn", image_features=8, crop=24)
+    images = dict(demos=(observed_sample(PEG),), obs_mode="rgb", cameras=("wrist",), image_size=32, tactile_image_size=32)
+    args = dataclasses.replace(trainer_args, **images, policy=dataclasses.replace(trainer_args.policy, encoder=encoder))
+    trainer, seen = Trainer(args, diffusion.DiffusionPolicy, Processes("cpu")), []
+    trainer.policy.encoder.images[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    trainer.order.take = lambda count: torch.arange(count)
+    for _ in range(2):
+        trainer.take_step()
+    assert seen[0].shape[2:] == (24, 24)
+    assert not torch.equal(*seen)
+
+
+def test_each_training_seed_has_an_order_of_samples_of_its_own(trainer_args, tmp_path):
+    orders = []
+    for seed in (0, 1):
+        args = dataclasses.replace(trainer_args, seed=seed, run_dir=tmp_path / str(seed))
+        orders.append(Trainer(args, diffusion.DiffusionPolicy, Processes("cpu")).order.take(20).tolist())
+    assert orders[0] != orders[1]

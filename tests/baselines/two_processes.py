@@ -51,6 +51,7 @@ def _resume_and_compare(args: TrainArgs, processes: Processes) -> None:
     _take_steps(resumed, 2)
     for (name, own), other in zip(resumed.policy.named_parameters(), whole.policy.parameters(), strict=True):
         assert torch.equal(own, other), name
+    assert all(map(torch.equal, resumed.ema.shadow_params, whole.ema.shadow_params))
     _require_apart(resumed, processes)
 
 

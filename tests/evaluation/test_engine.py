@@ -447,3 +447,13 @@ def test_gymnasium_makes_a_vector_of_spawned_processes(wrappers):
     _, rewards, *_ = envs.step(envs.action_space.sample())
     envs.close()
     assert np.isfinite(rewards).all()
+
+
+def test_a_seed_of_the_policy_gives_other_noise(tmp_path):
+    checkpoint, (request,) = save_tiny_checkpoint(tmp_path / "1"), requests(1)
+    first, other, again = (
+        PolicySource(checkpoint, kwargs=kwargs, device="cpu", batch_size=1).make().answer([request])[0]
+        for kwargs in ("{}", '{"seed": 5}', '{"seed": 0}')
+    )
+    assert not np.allclose(first, other, atol=1e-3)
+    np.testing.assert_array_equal(first, again)

@@ -19,7 +19,7 @@ from manifeel_ms3.leaderboard import __main__ as leaderboard
 from manifeel_ms3.leaderboard.__main__ import Build, Submit, main
 from manifeel_ms3.leaderboard.checks import check
 from manifeel_ms3.leaderboard.page import rows_of, rows_on
-from manifeel_ms3.leaderboard.rerun import policy_sources
+from manifeel_ms3.leaderboard.rerun import draw, policy_sources, run_again
 from manifeel_ms3.leaderboard.submission import SubmissionError, read_submission
 from manifeel_ms3.tasks.registry import task_spec
 from tests.browser import browser_program
@@ -95,6 +95,10 @@ def change(folder: Path, edit) -> None:
         (
             lambda r: r["env_kwargs"].update(sim_config=dict(sim_freq=10**9), num_envs=1),
             r"its env_kwargs have \['num_envs', 'sim_config'\], which change the simulator",
+        ),
+        (
+            lambda r: r["env_kwargs"].update(sim_backend="physx_cuda"),
+            "its env_kwargs have sim_backend 'physx_cuda'",
         ),
         (
             lambda r: r["env_kwargs"].update(tactile={"image_shape": [20000, 20000], "pixel_size": 1e-6}),
@@ -310,3 +314,12 @@ def test_no_leaderboard_is_built_where_there_is_none(tmp_path):
     with pytest.raises(InvalidArgumentError, match="is no folder; give that of a leaderboard"):
         main(Build(tmp_path / "leaderboard"))
     assert not list(tmp_path.iterdir())
+
+
+def test_the_episodes_that_are_run_again_are_those_that_were_drawn(submission):
+    read = read_submission(submission)
+    (path,) = read.results
+    seeds = [episode["seed"] for episode in read.results[path]["episodes"]]
+    seed, drawn = next((seed, found) for seed in range(100) if min(found := draw(read, 2, seed)[path]) > 1)
+    ran = run_again(read, policy_sources(read, POLICY, "{}"), 2, seed)
+    assert ran.files[path.as_posix()].episodes == [seeds[k] for k in drawn]

@@ -7,6 +7,7 @@ import torch
 import trimesh
 
 from manifeel_ms3.sensors.mechanics.contact import depth_below_face, solve_indentation
+from manifeel_ms3.sensors.mechanics.wrench import WrenchGauge
 from manifeel_ms3.sensors.registry import SENSORS
 from manifeel_ms3.verification.press import PadBench, Press, indenter
 from tests.sensors.shapes import thread_mesh
@@ -273,3 +274,17 @@ def test_same_state_and_history_same_output():
     assert runs[0].keys() == {"rgb", "force_field", "penetration"}
     for name, value in runs[0].items():
         assert torch.equal(value, runs[1][name]), name
+
+
+def test_the_wrench_in_another_frame_is_that_of_the_same_load(make_env):
+    env = make_env(obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.full(6, 0.3))
+    agent = env.unwrapped.agent
+    frame = sapien.Pose([0.003, -0.005, 0.02], [0.5, 0.5, -0.5, 0.5])
+    turn = frame.to_transformation_matrix()[:3, :3]
+    own, other = (WrenchGauge(agent.robot, agent.gels["right"], at).read()[0].numpy() for at in (None, frame))
+    assert np.abs(own[:3]).min() > 0.01
+    assert other[:3] == pytest.approx(turn.T @ own[:3], abs=1e-5)
+    assert other[3:] == pytest.approx(turn.T @ (own[3:] - np.cross(frame.p, own[:3])), abs=1e-6)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import sapien
 import torch
+import trimesh
 
 from manifeel_ms3.sensors import GelConfig, TactileSensorConfig, grids_for, with_options
 from manifeel_ms3.sensors.depth.raycast import MeshRays
@@ -131,3 +132,34 @@ def test_only_what_is_asked_for_is_computed():
     assert looked == [69 * 91]  # cells, no pixels
     picture = TouchModel(CONFIG, 1, CPU, ("rgb",)).observe(depth, LOADS[:1])
     assert picture.keys() == {"rgb"}
+
+
+def test_gel_and_light_are_drawn_anew_for_the_reset_pads_alone():
+    drawn = {"stiffness": 0.3, "friction": 0.2, "gain": 0.2, "light_phase": 0.5}
+    pads, others = (model(3, **{f"randomization.{name}": amount for name, amount in drawn.items()}) for _ in range(2))
+    load, balls = LOADS[:1].repeat(3, 1), pressed([meshes()[0]] * 3)
+    load[:, 0] = 9.0  # more shear than friction holds
+    pads.reset(torch.tensor([1]), np.array([7]))
+    seen, expected = pads.observe(balls, load), others.observe(balls, load)
+    for name, values in seen.items():
+        assert torch.equal(values[[0, 2]], expected[name][[0, 2]]), name
+        assert not torch.allclose(values[1].double(), expected[name][1].double(), rtol=0.01), name
+
+
+@pytest.mark.parametrize(("x", "y"), [(4e-3, 0.0), (-3e-3, 7e-3), (3e-3, -6e-3)])
+def test_picture_and_force_field_show_a_touch_where_it_is(x, y, figure):
+    """A ball of 10 mm that presses with 3 N at (x, y) of the pad frame, x along rows and y along columns."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.005).apply_translation([x, y, 0.005])
+    load = torch.tensor([[0, 0, -3.0, -3.0 * y, 3.0 * x, 0]], dtype=torch.float64)
+    seen = model(1).observe(pressed([ball]), load)
+    flat = model(1).observe(pressed([None]), torch.zeros(1, 6, dtype=torch.float64))["rgb"]
+    change = (seen["rgb"][0].double() - flat[0].double()).abs().sum(-1)
+    change[change < 20] = 0.0  # grey levels, of all colours
+    for name, shown, pitch in (
+        ("TacRGB", change, CONFIG.pixel_size),
+        ("TacFF", seen["force_field"][0, ..., 0].double(), CONFIG.taxel_pitch),
+    ):
+        rows, cols = ((torch.arange(n, dtype=torch.float64) - (n - 1) / 2) * pitch for n in shown.shape)
+        centre = torch.stack([shown.sum(1) @ rows, shown.sum(0) @ cols]) / shown.sum()
+        off = (centre - torch.tensor([x, y], dtype=torch.float64)).abs().max().item()
+        figure(f"a touch in {name} beside where it is, mm", 1e3 * off, at_most=0.7)

@@ -299,3 +299,19 @@ def test_the_instruction_is_that_of_the_goal(make_env):
 def test_unknown_goal_is_refused(make_env):
     with pytest.raises(ValueError, match="goal='basket'"):
         make_env(SORTING, obs_mode="none", render_backend="none", goal="basket")
+
+
+def test_success_comes_with_the_fifth_step_at_the_goal_in_a_row(make_env):
+    env = make_env(SEARCH, obs_mode="none", render_backend="none")
+    env.reset(seed=0)
+    base = env.unwrapped
+    base.battery._bodies[0].set_disable_gravity(True)
+    down = base.battery.pose.raw_pose.clone()
+    up = down + down.new_tensor([[0.0, 0.0, 0.15, 0.0, 0.0, 0.0, 0.0]])
+    still, seen = np.zeros(env.action_space.shape, np.float32), []
+    for lifted in [True] * 4 + [False] + [True] * 6:
+        base.battery.set_pose(Pose.create(up if lifted else down))
+        base.battery.set_linear_velocity(torch.zeros(1, 3))
+        base.battery.set_angular_velocity(torch.zeros(1, 3))
+        seen.append(bool(env.step(still)[-1]["success"]))
+    assert seen == [False] * 9 + [True] * 2

@@ -62,6 +62,18 @@ def test_a11_a_checkpoint_runs_nothing_that_its_config_names(config, tmp_path, m
     assert "gadget" not in sys.modules
 
 
+@pytest.mark.parametrize(
+    "huge",
+    [dict(action_network="mlp", mlp_blocks=10**6), dict(down_dims=[8] * 10**5), dict(down_dims=[8, 10**7])],
+    ids=["many layers", "a long list", "a wide layer"],
+)
+def test_a_checkpoint_whose_config_asks_for_a_huge_network_is_refused_before_it_is_made(huge, tmp_path):
+    save_tiny_checkpoint(tmp_path)
+    rewrite_json(tmp_path / "config.json", lambda own: own["policy"].update(huge))
+    with pytest.raises(CheckpointError, match=r"(larger|longer) than 1000"):
+        load_policy(tmp_path)
+
+
 # ------------------------------------------------------------------ environment ids of files
 
 
