@@ -26,7 +26,7 @@ from .sensing import SensingEnv
 from .viewpoints import looking_at, looking_down
 
 LIGHTING = {"normal": 1.0, "dim": 0.05}
-"""Share of the normal light; the paper gives no figure for its dim light."""
+"""Share of the normal light. The paper gives no figure for its dim light; its public code multiplies pixels by 0.5 or 0.1."""
 QUALITIES = tuple(SHADOWS)
 """Qualities of the policy's images."""
 VIDEO_CAMERA_AT, VIDEO_CAMERA_LOOKS_AT = (0.85, -0.40, 0.32), (0.48, 0.0, 0.08)

@@ -32,6 +32,7 @@ def test_only_the_golf_ball_lifted_alone_counts(make_env, golf, tennis, goal):
     lift(base.golf, golf)
     lift(base.tennis, tennis)
     assert bool(base.goal_reached(base.measure())) is goal
+    assert bool(base.paper_goal_reached(base.measure())) is (golf > 0.1)  # the public code does not look at the other ball
 
 
 def test_a_table_tennis_ball_that_was_pushed_aside_has_left_its_seat(make_env):

@@ -186,6 +186,10 @@ class BallSortingEnv(VisuotactileEnv):
             return self._is_in_bowl("golf") & self._is_in_bowl("tennis")
         return (measures["golf_height"] > LIFTED) & (measures["tennis_away"] < IN_PLACE)
 
+    def paper_goal_reached(self, measures):
+        """The golf ball is lifted; the public code does not look at the other one."""
+        return measures["golf_height"] > LIFTED if self.goal == "lift" else None
+
     def failed(self, measures):
         lowest = torch.minimum(self.golf.pose.p[:, 2], self.tennis.pose.p[:, 2])
         return lowest < BALL_RADIUS + ON_TABLE
