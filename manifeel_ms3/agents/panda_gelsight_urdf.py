@@ -42,6 +42,7 @@ SMOOTH_ANGLE = np.deg2rad(35)  # rad: sharper edges stay sharp; chosen by eye
 NORMAL_CANDIDATES = 8  # vertices of the full mesh among which a normal is chosen; chosen by eye
 ROUGHNESS = 0.35  # roughness of the arm's painted and plastic surfaces; chosen by eye
 LIBRARIES = ("mani-skill", "trimesh", "fast-simplification", "scipy", "numpy")  # that the meshes come from, or are made by
+version = cache(metadata.version)  # takes 2 ms; each reset asks for 20, as ManiSkill asks for the robot's path four times
 
 _SOURCE = Path(PACKAGE_ASSET_DIR) / "robots/panda"
 _FINGERS = {"left": ("panda_leftfinger", 1.0), "right": ("panda_rightfinger", -1.0)}
@@ -56,23 +57,15 @@ def panda_gelsight_urdf(visuals: bool = True, finger: Finger | None = None) -> s
         finger: Sizes of the fingers; those of the GelSight R1.5 if not given.
     """
     finger = finger or Finger()
-    folder = cache_dir() / f"panda_gelsight-{_key(finger)}"
+    # the key covers everything the files are made from: the modules (that of the gel has the shape of its face), the libraries
+    # (ManiSkill's holds the meshes), the finger, the package's URDF, and where it lies
+    modules = b"".join(Path(file).read_bytes() for file in (__file__, fingers.__file__, config.__file__))
+    given = [*map(version, LIBRARIES), repr(finger), str(_SOURCE)]
+    recipe = modules + "\n".join(given).encode() + (_SOURCE / "panda_v2.urdf").read_bytes()
+    folder = cache_dir() / f"panda_gelsight-{hashlib.sha256(recipe).hexdigest()[:12]}"
     if not (folder / "panda.urdf").is_file():
         _build_into(folder, finger)
     return str(folder / ("panda.urdf" if visuals else "panda_bare.urdf"))
-
-
-@cache
-def _key(finger: Finger) -> str:
-    """Hash of everything that the files are made from.
-
-    These are the modules (that of the gel has the shape of its face), the libraries (ManiSkill's holds the meshes), the finger,
-    the package's URDF, and where it lies.
-    """
-    modules = b"".join(Path(file).read_bytes() for file in (__file__, fingers.__file__, config.__file__))
-    given = [*map(metadata.version, LIBRARIES), repr(finger), str(_SOURCE)]
-    recipe = modules + "\n".join(given).encode() + (_SOURCE / "panda_v2.urdf").read_bytes()
-    return hashlib.sha256(recipe).hexdigest()[:12]
 
 
 def _build_into(folder: Path, finger: Finger) -> None:
