@@ -43,10 +43,10 @@ ROWS = {
 """First cells of the rows, in the order of the table."""
 LEAD = """
 **What touch adds, in numbers:** success rates (at any step of an episode) of Diffusion Policy with small networks, with the
-standard deviation (±) over {seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks,
-demonstrations by people, another simulator and a looser success. Bold rates are significantly above those of vision alone.
-Policies that have learnt nothing solve {floor} in each of these tasks; in ObjectSearch and BallSortingDim, choosing one of
-the two places or balls at random would give 50 %.
+standard deviation (±) over two or three training seeds and, in brackets, the paper's rates, which come from much larger
+networks, demonstrations by people, another simulator and a looser success. Bold rates are significantly above those of vision
+alone. Policies that have learnt nothing solve {floor} in each of these tasks; in ObjectSearch and BallSortingDim, choosing
+one of the two places or balls at random would give 50 %.
 """
 DETAILS = """
 Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core that other work often shared{on_gpu}, with
@@ -57,7 +57,7 @@ trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is t
 `cpu_noisy_pose` noise hides from it where the hand is. Each row shows one preset. Of the presets with which vision, TacRGB
 and TacFF were all run, those with most training seeds are taken, and of these the last in the order `cpu`, `cpu_long`,
 `cpu_noisy_pose`, `cpu_targets`. Which presets got a second and a third seed was decided when the results of the first were
-known. Rows without ± have one training seed: however large their differences are, another seed may change them.
+known. Rates without ± have one training seed: however large their differences are, another seed may change them.
 "Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds. The last column has
 the success at the last step of the episode with vision, TacRGB and TacFF. It is far lower where demonstrations end soon after
 the success, so that policies have not learnt to keep it.
@@ -89,7 +89,6 @@ def block() -> str:
         slowest=max(minutes),
         on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {math.ceil(max(on_gpu))} minutes)" if on_gpu else "",
         episodes=min(len(ours.episode_seeds) for ours in here.values()),
-        seeds=max(len(ours.success) for ours in here.values()),
         p=SIGNIFICANT,
         tests=len(gains),
         by_the_paper=f"{STRICTER} has {in_words(_rates_by_the_paper(here))} %",
