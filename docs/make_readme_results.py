@@ -43,10 +43,10 @@ ROWS = {
 """First cells of the rows, in the order of the table."""
 LEAD = """
 **What touch adds, in numbers:** success rates (at any step of an episode) of Diffusion Policy with small networks, with the
-standard deviation (±) over two or three training seeds and, in brackets, the paper's rates, which come from much larger
-networks, demonstrations by people, another simulator and a looser success. Bold rates are significantly above those of vision
-alone. Policies that have learnt nothing solve {floor} in each of these tasks; in ObjectSearch and BallSortingDim, choosing
-one of the two places or balls at random would give 50 %.
+standard deviation (±) over {seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks,
+demonstrations by people, another simulator and a looser success. Bold rates are significantly above those of vision alone.
+Policies that have learnt nothing solve {floor} in each of these tasks; in ObjectSearch and BallSortingDim, choosing one of
+the two places or balls at random would give 50 %.
 """
 DETAILS = """
 Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core that other work often shared{on_gpu}, with
@@ -89,6 +89,7 @@ def block() -> str:
         slowest=max(minutes),
         on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {math.ceil(max(on_gpu))} minutes)" if on_gpu else "",
         episodes=min(len(ours.episode_seeds) for ours in here.values()),
+        seeds=" or ".join(map(str, sorted({len(ours.success) for ours in here.values()} - {1}))),
         p=SIGNIFICANT,
         tests=len(gains),
         by_the_paper=f"{STRICTER} has {in_words(_rates_by_the_paper(here))} %",

@@ -17,7 +17,8 @@ NOT_IN_OLD_RESULTS = "success_paper"
 def differences(episode: dict[str, Any], outcome: EpisodeOutcome) -> list[str]:
     """What differs between an episode of a result and the same episode run again, as sentences; [] where they agree."""
     found, again = [], outcome_as_json(outcome)
-    for name in (*COMPARED, *[NOT_IN_OLD_RESULTS] * (episode.get(NOT_IN_OLD_RESULTS) is not None)):
+    is_old = episode.get(NOT_IN_OLD_RESULTS) is None
+    for name in COMPARED if is_old else (*COMPARED, NOT_IN_OLD_RESULTS):
         tolerance = FORCE_TOLERANCE if name in FORCES else 0
         before, now = episode.get(name), again.get(name)
         differs = before is not now if before is None or now is None else abs(before - now) > tolerance
