@@ -8,8 +8,10 @@ from typing import Any
 
 from latex2mathml.converter import convert
 
+from manifeel_ms3.files import write_text
+from manifeel_ms3.leaderboard.page import PAGE, leaderboard_page, rows_on
+
 REPOSITORY = Path(__file__).parents[1]
-PUBLISHED = (".html", ".json")
 NOTEBOOK = "examples/quickstart.ipynb"
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
@@ -31,9 +33,11 @@ def _mathml(found: re.Match[str]) -> str:
 
 
 def on_post_build(config: Any) -> None:
-    """Copy the leaderboard and the notebook beside the pages of the built site."""
-    board = (path for path in (REPOSITORY / "leaderboard").rglob("*") if "checkpoints" not in path.parts)
-    for path in (REPOSITORY / NOTEBOOK, *(path for path in board if path.suffix in PUBLISHED)):
-        copy = Path(config["site_dir"]) / path.relative_to(REPOSITORY)
+    """Make the leaderboard's page in the built site, and copy the results that it links, and the notebook, beside it."""
+    site, board = Path(config["site_dir"]), REPOSITORY / "leaderboard"
+    results = (path for path in board.rglob("*.json") if "checkpoints" not in path.parts)
+    for path in (REPOSITORY / NOTEBOOK, *results):
+        copy = site / path.relative_to(REPOSITORY)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, copy)
+    write_text(site / board.name / PAGE, leaderboard_page(rows_on(board)))

@@ -137,6 +137,9 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert all('<div class="formula"><math' in html for html in formulas)  # it can be scrolled where it is wider than the page
     assert ".formula { overflow-x: auto; }" in (tmp_path / "site/site.css").read_text()
     assert not dead_links(tmp_path / "site")
+    first = (tmp_path / "site/index.html").read_text()
+    assert '<a href="leaderboard/index.html"' in first
+    assert 'src="data:video/mp4;' in (tmp_path / "site/leaderboard/index.html").read_text()
 
 
 # -------------------------------------------------------------------- run, page by page

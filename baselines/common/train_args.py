@@ -95,11 +95,11 @@ class TrainArgs:
     run_dir: Path | None = None
     """Folder of log.jsonl, tensorboard events, checkpoints and evaluations; runs/<exp_name> if not given."""
     save_freq: Annotated[int, arg(aliases=["--save-every"])] = 5000
-    """Number of gradient steps between checkpoints; the last step always has one."""
+    """Number of gradient steps between checkpoints; steps that are evaluated, and the last one, have one, too."""
     keep: int = 10
     """Number of checkpoints that are kept."""
     eval_freq: int | None = None
-    """Number of gradient steps between evaluations, which is a multiple of `save_freq`; every checkpoint is evaluated if not
+    """Number of gradient steps between evaluations, each of a checkpoint of that step; every checkpoint is evaluated if not
     given. The last one always is."""
     num_eval_episodes: Annotated[int, arg(aliases=["--eval-episodes"])] = 0
     """Number of the task's seeds on which a checkpoint is evaluated, in other processes; no evaluation if 0."""
@@ -187,10 +187,6 @@ def check_run(args: TrainArgs) -> None:
     if args.resume and ((args.run_dir is None and args.exp_name is None) or args.overwrite):
         raise InvalidArgumentError(
             "--resume needs --run-dir or --exp-name, the folder or the name of the run to continue, and excludes --overwrite"
-        )
-    if args.eval_freq is not None and args.eval_freq % args.save_freq:
-        raise InvalidArgumentError(
-            f"--eval-freq {args.eval_freq} must be a multiple of --save-freq {args.save_freq}, as checkpoints are evaluated"
         )
     if not args.demos:
         raise InvalidArgumentError("no demonstrations are given; give --demo-path FILE, which `manifeel record` makes")

@@ -181,7 +181,7 @@ class Trainer:
             task = bar.add_task("training", total=self.total_steps, completed=self.step)
             while self.step < self.total_steps:
                 self.take_step()
-                due = self.step % self.args.save_freq == 0 or self.step == self.total_steps
+                due = self.step % self.args.save_freq == 0 or self._is_evaluated(self.step) or self.step == self.total_steps
                 if self.losses.full or due:  # the only place that waits for the device
                     bar.update(task, description=f"training, loss {self._log_loss():.4f}")
                 if due:

@@ -63,14 +63,30 @@ class ConditionResults:
     @property
     def success_at_end(self) -> float | None:
         """Share of the episodes in which the task is solved at the last step; None where some ended at success."""
-        solved = [episode.get("success_at_end") for episode in self.episodes]
-        return None if not solved or None in solved else float(np.array(solved, float).mean())
+        solved = self._solved_at_end()
+        return None if solved is None else float(solved.mean())
 
     @property
     def seed_deviation(self) -> float | None:
         """Standard deviation of the success over the training seeds; None for a single one."""
-        rates = self.success.mean((1, 2))
-        return float(rates.std(ddof=1)) if len(rates) > 1 else None
+        return _deviation(self.success)
+
+    @property
+    def seed_deviation_at_end(self) -> float | None:
+        """The same of the success at the last step; None where that is not known, too."""
+        solved = self._solved_at_end()
+        return None if solved is None else _deviation(solved)
+
+    def _solved_at_end(self) -> np.ndarray | None:
+        """1 where an episode is solved at its last step, else 0, as `success`; None where some ended at success."""
+        solved = [episode.get("success_at_end") for episode in self.episodes]
+        return None if not solved or None in solved else np.array(solved, float).reshape(self.success.shape)
+
+
+def _deviation(solved: np.ndarray) -> float | None:
+    """Standard deviation over the training seeds of the rate of (training seeds, checkpoints, episodes)."""
+    rates = solved.mean((1, 2))
+    return float(rates.std(ddof=1)) if len(rates) > 1 else None
 
 
 def collect(results: Mapping[Path, dict[str, Any]], last: int = LAST) -> dict[Condition, ConditionResults]:

@@ -56,16 +56,17 @@ An episode is a success if the task was solved at any step. A rate is the mean o
 most {last}) and the evaluation episodes, with its 95 % interval over training seeds and initial states, or over initial
 states alone where there is one seed; "of" gives the number of each. "Std" is the standard deviation over training seeds. "At
 the end" is the share of the episodes in which the task is solved at the last step, too. It is often lower: demonstrations end
-soon after success, so that policies have not learnt to stay there. "Gentle success" counts the episodes that succeed before
+at the first success, so that policies hardly see what comes after it. "Gentle success" counts the episodes that succeed before
 the contact force exceeds the task's limit, which is given in newtons ([how it is set](evaluation.md#what-is-measured)).
 "Floor" is the highest success of policies that have learnt nothing, where it was measured on this revision of the task. "By
-the paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)), which is
-less strict and enters no comparison; older results lack it. "TacRGB encoder" is the network for tactile images: `fine_cnn` is
-the small one of the preset `cpu`, trained from scratch. "Settings" names the preset of the policy and what differs from it,
-and "id" is a hash of everything that defines the condition. Presets were chosen by trials on these same initial states,
-mostly with one training seed, which is the first of those here ([trials](trials.md)): rates on other states may be lower.
-"Cost" is the time of training, summed over the seeds, and "on" the machine. It is the time on the clock, so that a job that
-shared its machine with other work, or was paused, shows more than it needs.
+the paper's threshold" is the success by the threshold of the paper's public code ([where it is known](tasks.md)). It is less
+strict in nearly every episode, and enters no comparison; older results lack it, so that a row may have it for fewer seeds than
+its success. "TacRGB encoder" is the network for tactile images: `fine_cnn` is the small one of the preset `cpu`, trained from
+scratch. "Settings" names the preset of the policy and what differs from it, and "id" is a hash of everything that defines the
+condition. Presets were chosen by trials on these same initial states, mostly with one training seed, which is the first of
+those here ([trials](trials.md)): rates on other states may be lower. "Cost" is the time of training, summed over the seeds,
+and "on" the machine. It is the time on the clock, so that a job that shared its machine with other work, or was paused, shows
+more than it needs.
 """
 CHART = """
 ![Success by task and sensing, with 95 % intervals, and the paper's rates]({figure})

@@ -142,13 +142,16 @@ def leaderboard_table(rows: list[Row]) -> str:
     return head + markdown_table((*what, *measured), cells)
 
 
+def leaderboard_page(rows: list[Row]) -> str:
+    """The leaderboard as one file of HTML, which links the results beside it."""
+    template = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True)
+    return template.render(rows=[_for_page(row) for row in rows], full=FULL, plotly=Markup(plotly.offline.get_plotlyjs()))
+
+
 def write_page(rows: list[Row], board: Path) -> Path:
     """Write the page and the table into the leaderboard's folder, and return the path of the page."""
     write_text(board / TABLE, leaderboard_table(rows))
-    page = jinja2.Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True).render(
-        rows=[_for_page(row) for row in rows], full=FULL, plotly=Markup(plotly.offline.get_plotlyjs())
-    )
-    write_text(board / PAGE, page)
+    write_text(board / PAGE, leaderboard_page(rows))
     return board / PAGE
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from diffusers.optimization import get_cosine_schedule_with_warmup
 
-from baselines.common.checkpoint import TRAINING_STATE, WEIGHTS, prune, read_tensors
+from baselines.common.checkpoint import TRAINING_STATE, WEIGHTS, prune, read_tensors, saved_checkpoints
 from baselines.common.dataset import SampleOrder, read_episodes
 from baselines.common.encoders import EncoderConfig, field_encoder, register_tacrgb_encoder
 from baselines.common.observation import TAXEL_SHAPE, observation_spec
@@ -68,7 +68,6 @@ def test_a_length_in_epochs_counts_unless_that_is_fewer_steps_than_wanted_or_ste
         (dict(num_eval_episodes=-1), "--num-eval-episodes -1 must be at least 1"),
         (dict(inference_steps=0), "--inference-steps 0 must be at least 1"),  # else the first evaluation fails, hours later
         (dict(log_freq=0), "--log-freq 0 must be at least 1"),
-        (dict(save_freq=4, eval_freq=6), "--eval-freq 6 must be a multiple of --save-freq 4"),
         (dict(seed=-1), "--seed -1 must be at least 0"),
         (dict(lr=-0.1), "--lr -0.1 must be a number of at least 0"),
         (dict(lr=float("nan")), "--lr nan must be a number of at least 0"),
@@ -323,13 +322,21 @@ def test_a_run_has_the_settings_that_it_was_given(trainer_args, demos):
         assert torch.equal(normalizer.high, values.amax(0)), key
 
 
-@pytest.mark.parametrize(("given", "evaluated"), [(dict(), [2, 4, 6, 7]), (dict(eval_freq=4), [4, 7])])
-def test_checkpoints_are_evaluated_as_often_as_asked_and_the_last_one_always(trainer_args, monkeypatch, given, evaluated):
+@pytest.mark.parametrize(
+    ("given", "evaluated", "saved"),
+    [
+        (dict(), [2, 4, 6, 7], [2, 4, 6, 7]),
+        (dict(eval_freq=4), [4, 7], [2, 4, 6, 7]),
+        (dict(eval_freq=3), [3, 6, 7], [2, 3, 4, 6, 7]),  # no multiple of save_freq
+    ],
+)
+def test_checkpoints_are_evaluated_as_often_as_asked_and_at_the_end(trainer_args, monkeypatch, given, evaluated, saved):
     args = dataclasses.replace(trainer_args, **dict(steps=7, save_freq=2, num_eval_episodes=1) | given)
     trainer, submitted = Trainer(args, diffusion.DiffusionPolicy, Processes("cpu")), []
     monkeypatch.setattr(trainer.evaluation, "submit", submitted.append)
     trainer.run()
     assert [int(checkpoint.name) for checkpoint in submitted] == evaluated
+    assert [int(checkpoint.name) for checkpoint in saved_checkpoints(trainer.checkpoints)] == saved
 
 
 def test_two_processes_resume_bit_for_bit(trainer_args):
