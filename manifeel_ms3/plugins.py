@@ -1,4 +1,4 @@
-"""Plug-ins: tasks, policies, sensors and commands that installed packages add through entry points (`importlib.metadata`).
+"""Plug-ins that installed packages add through entry points (`importlib.metadata`): tasks, policies, encoders, sensors, commands.
 
 A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows one of each group:
 
@@ -22,6 +22,8 @@ POLICIES = "manifeel.policies"
 """Objects with a method `load(checkpoint, **kwargs)` that returns a `manifeel_ms3.evaluation.Policy`."""
 SENSORS = "manifeel.sensors"
 """Functions that take the names of a pad and of its link, and return a `manifeel_ms3.sensors.TactileSensorConfig`."""
+ENCODERS = "manifeel.encoders"
+"""Functions that make a network over TacRGB images, as `baselines.common.encoders.register_tacrgb_encoder` takes them."""
 COMMANDS = "manifeel.commands"
 """`Command` objects."""
 

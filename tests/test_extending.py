@@ -104,6 +104,15 @@ def test_a_policy_is_trained_and_evaluated_and_its_result_is_taken(site, checkpo
     done(site, "leaderboard", "submit", folder, "--checkpoint", checkpoint, "--rerun", 1, "--check-only")
 
 
+def test_a_policy_of_this_package_is_trained_and_evaluated_with_the_encoder(site, demos):
+    flags = ["--demos", demos, "--env-id", TASK, "--obs-mode", "tacrgb", "--run-dir", site / "run_of_another"]
+    flags += ["--steps", 2, "--batch-size", 2, "--policy.encoder.tacrgb", "flat"]
+    done(site, "train", "diffusion_policy", "cpu", *flags)
+    checkpoint, result = site / "run_of_another/checkpoints/last", site / "of_another.json"
+    done(site, "eval", "--checkpoint", checkpoint, "--episodes", 1, "--env-kwargs", SHORT, "--out", result)
+    assert [episode["error"] for episode in json.loads(result.read_text())["episodes"]] == [None]
+
+
 @needs_renderer
 def test_a_study_plans_a_task_and_a_policy(site):
     (site / "study.yaml").write_text(STUDY)
@@ -115,15 +124,14 @@ def test_a_study_plans_a_task_and_a_policy(site):
 
 def test_a_policy_learns(site, monkeypatch):
     monkeypatch.syspath_prepend(site)
-    from baselines.common import encoders
+    from my_package.regression import RegressionPolicy  # pyright: ignore[reportMissingImports]
+
+    from baselines.common.encoders import EncoderConfig
     from baselines.common.observation import POSE, observation_spec
     from baselines.common.policy import PolicyConfig
 
-    monkeypatch.setattr(encoders, "TACRGB_ENCODERS", dict(encoders.TACRGB_ENCODERS))  # put back what the page adds
-    from my_package.regression import RegressionPolicy  # pyright: ignore[reportMissingImports]
-
     spec = observation_spec("tacrgb+tacff", (), ("right",), 32)
-    encoder = encoders.EncoderConfig(tacrgb="flat", force_field="small")
+    encoder = EncoderConfig(tacrgb="small_cnn", force_field="small")
     torch.manual_seed(0)
     policy = RegressionPolicy(PolicyConfig(encoder=encoder, down_dims=(32, 64)), spec, 6)
     optimizer = torch.optim.Adam(policy.parameters(), 3e-3)

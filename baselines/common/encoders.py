@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 import torch.nn as nn
 
+from manifeel_ms3 import plugins
 from manifeel_ms3.arguments import require_at_least
 from manifeel_ms3.errors import InvalidArgumentError, UnknownNameError
 from manifeel_ms3.files import file_hash
@@ -255,7 +256,7 @@ IMAGE_ENCODERS: dict[str, MakeImageEncoder] = {
 }
 """Networks over camera images."""
 TACRGB_ENCODERS: dict[str, MakeImageEncoder] = dict(IMAGE_ENCODERS)
-"""Networks over TacRGB images; other packages add theirs with `register_tacrgb_encoder`."""
+"""Networks over TacRGB images that were registered; those of installed packages are plug-ins (`tacrgb_encoder_names`)."""
 FIELD_ENCODERS: dict[str, Callable[[tuple[int, int], int], nn.Module]] = {
     "resnet18": _pooled,  # as in the paper: the force field is a small image, which ResNet-18 shrinks to a single place
     "small": SmallFieldNet,
@@ -265,7 +266,9 @@ features)."""
 
 
 def register_tacrgb_encoder(name: str, make: MakeImageEncoder) -> None:
-    """Add a network for TacRGB images that every policy can use.
+    """Add a network for TacRGB images that every policy of this process can use.
+
+    An installed package names its networks as entry points instead (`docs/extending.md`), so that every process finds them.
 
     Args:
         name: Name by which `EncoderConfig.tacrgb` chooses it.
@@ -280,6 +283,23 @@ def register_tacrgb_encoder(name: str, make: MakeImageEncoder) -> None:
     TACRGB_ENCODERS[name] = make
 
 
+def tacrgb_encoder_names() -> tuple[str, ...]:
+    """Names of the networks over TacRGB images, those of other packages included."""
+    return tuple(sorted({*TACRGB_ENCODERS, *plugins.registered(plugins.ENCODERS)}))
+
+
+def _tacrgb_encoder(name: str) -> MakeImageEncoder:
+    """The function that makes the network over TacRGB images of this name.
+
+    Raises:
+        UnknownNameError: No network has this name.
+        PluginError: The plug-in that makes it does not import.
+    """
+    if name not in (known := tacrgb_encoder_names()):
+        raise UnknownNameError(f"encoder {name!r} is unknown; choose from {list(known)}")
+    return TACRGB_ENCODERS[name] if name in TACRGB_ENCODERS else plugins.load(plugins.ENCODERS, name)
+
+
 def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.Module:
     """The network of one camera or TacRGB image.
 
@@ -291,7 +311,7 @@ def image_encoder(config: EncoderConfig, spec: ObservationSpec, key: str) -> nn.
     if not is_tactile(key):
         return by_name(IMAGE_ENCODERS, config.image)(size, config.image_features)
     try:
-        encoder = by_name(TACRGB_ENCODERS, config.tacrgb)(size, config.tactile_features)
+        encoder = _tacrgb_encoder(config.tacrgb)(size, config.tactile_features)
     except ImageSizeError as error:
         uncropped = " --policy.encoder.tactile-crop 0" if size < spec.size_of(key) else ""
         raise ImageSizeError(f"{error}{uncropped}") from None

@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from baselines.common.encoders import TACRGB_ENCODERS
+from baselines.common.encoders import tacrgb_encoder_names
 from baselines.common.policy import PolicyConfig
 from baselines.common.train_args import TrainArgs
 from baselines.registry import policy_spec
@@ -251,7 +251,7 @@ def _check_sensing(grid: Grid) -> None:
     """Check the names of what the policies observe, and of the encoders of TacRGB."""
     for task in grid.tasks:
         several_of("cameras", grid.cameras, ("policy", *CAMERAS, *task_spec(task).env_class.own_cameras))
-    several_of("encoders", grid.encoders, ("", *TACRGB_ENCODERS))
+    several_of("encoders", grid.encoders, ("", *tacrgb_encoder_names()))
     for mode in grid.obs_modes:
         split_obs_mode(mode)
         several_of(f"obs_modes: a part of {mode!r}", mode.split("+"), OBS_MODE.split("+"))
