@@ -1,4 +1,4 @@
-"""Plug-ins that installed packages add through entry points (`importlib.metadata`): tasks, policies, encoders, sensors, commands.
+"""Plug-ins that installed packages add through entry points (`importlib.metadata`): tasks, policies, encoders and others.
 
 A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows one of each group:
 
