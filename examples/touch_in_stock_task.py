@@ -22,7 +22,7 @@ class TouchPickCubeEnv(PickCubeEnv):
 
     def _initialize_episode(self, env_idx, options):
         super()._initialize_episode(env_idx, options)
-        self.touch.reset(env_idx)
+        self.touch.reset(env_idx, self._episode_seed[env_idx.cpu().numpy()])
 
     def _get_obs_extra(self, info):
         self.touch.capture()  # of all environments: docs/sensor.md says what is needed where some of several are reset

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from mani_skill.utils import common
 
+from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.evaluation.policy import Ask, EpisodePolicy, PolicyRequest
 
 from .observation import POSE, ObservationSpec, prepare
@@ -80,4 +81,10 @@ class ActionChunks(EpisodePolicy):
         value: Any = obs
         for part in key.split("/"):
             value = value[part]
-        return prepare(key, common.to_numpy(value), self.spec)[0]
+        prepared = prepare(key, common.to_numpy(value), self.spec)[0]
+        if key in self.spec.force_fields and prepared.shape[:2] != self.spec.taxel_shape:
+            raise InvalidArgumentError(
+                f"{key} has {prepared.shape[:2]} rows and columns of taxels, but the policy learnt from "
+                f"{self.spec.taxel_shape}; evaluate it with the sensor of its demonstrations"
+            )
+        return prepared

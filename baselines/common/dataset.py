@@ -12,7 +12,7 @@ import torch
 from manifeel_ms3.demonstrations import DemonstrationError
 from manifeel_ms3.demonstrations.formats import Demonstration, format_of
 from manifeel_ms3.demonstrations.formats.demonstration_format import require_form
-from manifeel_ms3.evaluation.variant import BACKENDS, SENSING
+from manifeel_ms3.evaluation.variant import BACKENDS, OF_A_RECORDER, SENSING
 from manifeel_ms3.nested_settings import differing
 from manifeel_ms3.progress import progress_bar
 
@@ -126,7 +126,7 @@ def recorded_env_kwargs(files: Iterable[Path]) -> dict[str, Any]:
 
 
 def _of_task(recorded: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in recorded.items() if name not in (*SENSING, *BACKENDS)}
+    return {name: value for name, value in recorded.items() if name not in (*SENSING, *BACKENDS, *OF_A_RECORDER)}
 
 
 class SequenceDataset:

@@ -56,8 +56,8 @@ class Args:
     trajectory.<obs_mode>.<control_mode>.<sim_backend>.h5 with observations."""
     obs_mode: str = "rgb+tacrgb+tacff"
     """Observations to record, joined by "+"; "none" records states and actions alone."""
-    cameras: tuple[str, ...] = CAMERAS
-    """Cameras to record."""
+    cameras: tuple[str, ...] | None = None
+    """Cameras to record; all of the task if not given."""
     tactile_sensors: tuple[str, ...] = SIDES
     """Sides of the tactile sensors to record."""
     sensor: str | None = None
@@ -79,7 +79,8 @@ class Args:
         Raises:
             InvalidArgumentError: `env_kwargs` is not a json object.
         """
-        sensing: dict[str, Any] = dict(cameras=list(self.cameras), tactile_sensors=list(self.tactile_sensors))
+        cameras = (*CAMERAS, *task_spec(self.env_id).env_class.own_cameras) if self.cameras is None else self.cameras
+        sensing: dict[str, Any] = dict(cameras=list(cameras), tactile_sensors=list(self.tactile_sensors))
         if self.sensor is not None:
             sensing["sensor"] = self.sensor
         return dict(obs_mode=self.obs_mode, sim_backend="physx_cpu") | sensing | json_object("--env-kwargs", self.env_kwargs)

@@ -13,6 +13,8 @@ SENSING = ("obs_mode", "cameras", "tactile_sensors")
 other arguments, with which the demonstrations were recorded."""
 BACKENDS = ("sim_backend", "render_backend")
 """Arguments of an environment that say what computes it; they do not make another variant."""
+OF_A_RECORDER = ("num_envs", "render_mode", "reward_mode", "human_render_camera_configs")
+"""Further arguments that tools such as ManiSkill's `replay_trajectory` write into a trajectory file: how it was run."""
 
 
 def variant_of(env_id: str, env_kwargs: dict[str, Any]) -> str:

@@ -97,6 +97,15 @@ def test_the_arguments_of_the_recorded_task_are_known(demos):
         recorded_env_kwargs([demos, observed_sample(PEG)])
 
 
+def test_how_another_tool_ran_the_task_is_no_argument_of_it(demos, tmp_path):
+    """ManiSkill's replay_trajectory writes all arguments with which it made the environment."""
+    replayed = Path(shutil.copy(demos, tmp_path / "replayed.h5"))
+    header = json.loads(demos.with_suffix(".json").read_text())
+    header["env_info"]["env_kwargs"] |= dict(num_envs=1, render_mode="rgb_array", reward_mode=None)
+    replayed.with_suffix(".json").write_text(json.dumps(header))
+    assert recorded_env_kwargs([demos, replayed]) == recorded_env_kwargs([demos])
+
+
 def test_number_of_demonstrations(demos):
     assert len(read_episodes([demos], PEG, SPEC, 1)) == 1
     recorded = [len(episode["actions"]) for episode in read_demonstrations(demos, [])]

@@ -100,6 +100,14 @@ def test_a_prediction_is_asked_for_with_the_last_observations_the_seed_and_the_s
     assert (requests[-1].seed, requests[-1].step) == (0, 0)
 
 
+def test_a_force_field_of_another_sensor_is_refused():
+    spec = observation_spec("tacff", (), ("right",), 16)
+    episode = ActionChunks(spec, 1, lambda request: np.zeros((1, 6)))
+    touch = dict(tactile_right=dict(force_field=np.zeros((1, 7, 9, 3), np.float32)))
+    with pytest.raises(InvalidArgumentError, match=r"force_field has \(7, 9\) rows and columns of taxels.* from \(10, 14\)"):
+        episode.act(dict(extra=dict(tcp_pose=pose_at(0)[None]), sensor_data=touch))
+
+
 def test_the_first_request_of_a_policy_with_few_steps_is_answered(tmp_path):
     """Its network is tried out before it is traced, with no more steps than it has."""
     agent = load_policy(save_tiny_checkpoint(tmp_path / "1", diffusion_steps=2))
