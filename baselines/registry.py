@@ -93,13 +93,12 @@ class PolicySpec:
 
 
 def all_policies() -> dict[str, PolicySpec]:
-    """Every registered policy that these baselines can train, by its name.
+    """Every registered policy that these baselines can train, by its name; plug-ins that do not import are left out.
 
     Raises:
-        PluginError: A plug-in cannot be imported, is registered under another name than its own, or shares its class of
-            arguments with another policy.
+        PluginError: A policy is registered under another name than its own, or two policies share a class of arguments.
     """
-    plugged = {name: plugins.load(plugins.POLICIES, name) for name in plugins.registered(plugins.POLICIES)}
+    plugged, _ = plugins.load_all(plugins.POLICIES)
     specs = {name: spec for name, spec in plugged.items() if isinstance(spec, PolicySpec)}
     require_distinct(specs)
     return specs
@@ -130,7 +129,10 @@ def policy_spec(name: str) -> PolicySpec:
 
     Raises:
         UnknownNameError: No policy of this name can be trained; the message lists those that can.
+        PluginError: The plug-in of this name does not import.
     """
+    if name in plugins.registered(plugins.POLICIES):
+        plugins.load(plugins.POLICIES, name)
     if name not in (known := all_policies()):
         raise UnknownNameError(f"the policy {name!r} is not registered; registered are {list(known)}")
     return known[name]

@@ -10,6 +10,7 @@ import tyro
 
 from baselines.common.train_args import TrainArgs
 from baselines.registry import PolicySpec, all_policies, next_step
+from manifeel_ms3 import plugins
 from manifeel_ms3.arguments import meant
 from manifeel_ms3.command_line import run
 from manifeel_ms3.errors import InvalidArgumentError
@@ -45,10 +46,13 @@ def check_arguments(arguments: list[str]) -> None:
     Raises:
         InvalidArgumentError: The name of the policy or of the preset is missing or misspelt, or a flag is one that only
             ManiSkill's scripts have.
+        PluginError: The policy's plug-in does not import.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
     if {"-h", "--help"} & set(arguments) or policy.startswith("__tyro"):
         return
+    if policy in plugins.registered(plugins.POLICIES):
+        plugins.load(plugins.POLICIES, policy)  # says why a broken one does not import
     if (spec := all_policies().get(policy)) is None:
         raise InvalidArgumentError(
             f"`manifeel train` needs the name of a policy before that of a preset; choose from {list(all_policies())}"

@@ -8,6 +8,7 @@ A package registers a plug-in in its `pyproject.toml`; `docs/extending.md` shows
 Only what an installed package registers is ever imported: never a module that a file or a checkpoint names.
 """
 
+import logging
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -16,6 +17,7 @@ from typing import Any
 from .command_line import missing_extras_named
 from .errors import MissingExtraError, PluginError, UnknownNameError
 
+log = logging.getLogger(__name__)
 TASKS = "manifeel.tasks"
 """Modules that register tasks when they are imported (`manifeel_ms3.tasks.registry.register_task`)."""
 POLICIES = "manifeel.policies"
@@ -78,6 +80,19 @@ def load(group: str, name: str) -> Any:
             f"the plug-in {name!r} of {_described(points[name])} cannot be loaded ({type(error).__name__}: {error}); repair "
             f"or uninstall it. Registered in {group} are {list(points)}"
         ) from error
+
+
+@cache
+def load_all(group: str) -> tuple[dict[str, Any], list[str]]:
+    """The objects of a group's plug-ins by name, and the names of those that do not import; the log says why."""
+    loaded, broken = {}, []
+    for name in registered(group):
+        try:
+            loaded[name] = load(group, name)
+        except PluginError as error:
+            log.warning("%s", error)
+            broken.append(name)
+    return loaded, broken
 
 
 def _described(point: EntryPoint) -> str:

@@ -170,6 +170,9 @@ def test_a_policy_or_a_command_that_does_not_import_is_one_line(tmp_path):
     said = refusal(tmp_path / "policy", "train", "broken")
     assert "the plug-in 'broken' of broken:SPEC (my_package) cannot be loaded (KeyError: 'what')" in said
     assert "Registered in manifeel.policies are ['broken', 'diffusion_policy'" in said
+    others = manifeel(tmp_path / "policy", "train", "diffusion_policy", "cpu", "--num-demos", 0, "--demo-path", "peg.h5")
+    assert "--num-demos 0 must be at least 1" in others.stderr
+    assert "the plug-in 'broken' of broken:SPEC (my_package) cannot be loaded" in others.stderr
     install(tmp_path / "command", files=broken, entry_points="[manifeel.commands]\nbroken = broken:COMMAND\n")
     said = refusal(tmp_path / "command", "broken")
     assert "the plug-in 'broken' of broken:COMMAND (my_package) cannot be loaded" in said

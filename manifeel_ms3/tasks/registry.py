@@ -11,11 +11,9 @@ tasks are found through the entry point group `manifeel.tasks`.
 """
 
 import inspect
-import logging
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from functools import cache
 from typing import Any, TypeVar
 
 import gymnasium as gym
@@ -26,7 +24,6 @@ from manifeel_ms3.arguments import is_number, meant
 from manifeel_ms3.errors import InvalidArgumentError, ManifeelError, PluginError, UnknownNameError
 from manifeel_ms3.typed_modules import MODULES
 
-log = logging.getLogger(__name__)
 Class = TypeVar("Class", bound=type)
 Demonstrator = TypeVar("Demonstrator", bound=Callable[..., Any])
 FIRST_EVALUATION_SEED = 100_000
@@ -289,22 +286,14 @@ def _known(env_id: str) -> TaskSpec:
     return _SPECS[env_id]
 
 
-@cache
-def _load_plugins() -> dict[str, str]:
-    """Import the task modules of other packages; a broken one is left out, and the reason kept by its name."""
-    failed = {}
-    for name in plugins.registered(plugins.TASKS):
-        try:
-            plugins.load(plugins.TASKS, name)
-        except PluginError as error:
-            log.warning("%s", error)
-            failed[name] = str(error)
-    return failed
+def _load_plugins() -> list[str]:
+    """Import the task modules of other packages, and return the names of the broken ones, which are left out."""
+    return plugins.load_all(plugins.TASKS)[1]
 
 
 def _left_out() -> str:
-    failed = _load_plugins()
-    return f" (plug-ins that do not import: {', '.join(failed)})" if failed else ""
+    broken = _load_plugins()
+    return f" (plug-ins that do not import: {', '.join(broken)})" if broken else ""
 
 
 def _qualified(kind: Any) -> str:
