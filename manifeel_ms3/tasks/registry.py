@@ -227,8 +227,9 @@ def make_env(env_id: str, /, **kwargs: Any) -> gym.Env:
     except ManifeelError:
         raise
     except Exception as error:  # ManiSkill and SAPIEN raise errors of many types for arguments that they pass on
+        said = str(error).partition(" was raised from the environment creator")[0]  # gymnasium adds the arguments
         raise InvalidArgumentError(
-            f"{spec.env_id} cannot be made with the arguments {kwargs} ({type(error).__name__}: {error}); change one of them"
+            f"{spec.env_id} cannot be made with the arguments {kwargs} ({type(error).__name__}: {said}); change one of them"
         ) from error
 
 
