@@ -42,7 +42,7 @@ from .redaction import redacted
 from .result import as_published, provenance, published_config, read_result, result_of, write_result
 from .rollout import EpisodeOutcome, failed_outcome
 from .seed_list import read_seeds
-from .variant import BACKENDS, SENSING, default_arguments
+from .variant import BACKENDS, LENGTHS_OF_RECORDINGS, SENSING, default_arguments
 
 log = logging.getLogger(__name__)
 BACKEND = dict(sim_backend="physx_cpu")
@@ -305,7 +305,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
         config |= dict(policy_kwargs=own)
     env_id = task_spec(config["env_id"]).env_id
     _require_own(args, config | dict(env_id=env_id))
-    trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name != "max_episode_steps"}
+    trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name not in LENGTHS_OF_RECORDINGS}
     sensing = {name: config[name] for name in SENSING}
     if args.sensor not in (None, learnt := trained.get("sensor", DEFAULT_SENSOR)):
         raise InvalidArgumentError(

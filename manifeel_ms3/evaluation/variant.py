@@ -13,6 +13,8 @@ SENSING = ("obs_mode", "cameras", "tactile_sensors")
 other arguments, with which the demonstrations were recorded."""
 BACKENDS = ("sim_backend", "render_backend")
 """Arguments of an environment that say what computes it; they do not make another variant."""
+LENGTHS_OF_RECORDINGS = ("max_episode_steps", "hold_seconds")
+"""Arguments that make demonstrations longer; the evaluation of a policy that learnt from them does not take them over."""
 OF_A_RECORDER = ("num_envs", "render_mode", "reward_mode", "human_render_camera_configs")
 """Further arguments that tools such as ManiSkill's `replay_trajectory` write into a trajectory file: how it was run."""
 

@@ -14,7 +14,7 @@ from mani_skill.utils.structs.types import GPUMemoryConfig, SceneConfig, SimConf
 
 from manifeel_ms3.agents import PandaGelSight
 from manifeel_ms3.agents.fingers import Finger
-from manifeel_ms3.arguments import by_name, checked_action, one_of
+from manifeel_ms3.arguments import by_name, checked_action, one_of, require_amount
 from manifeel_ms3.errors import InvalidArgumentError
 from manifeel_ms3.rendering.backend import available_render_backend, restrict_torch_after_fork
 from manifeel_ms3.rendering.presentation import drawn_sizes
@@ -42,7 +42,7 @@ FORCE_DECIMALS = 3
 CAMERAS = ("front", "side", "wrist")
 SIDES = ("left", "right")
 HOLD_SECONDS = 0.5
-"""Time for which a goal must hold until the episode is a success, in s. Our choice."""
+"""Time for which a goal must hold until the episode is a success unless another is asked for, in s. Our choice."""
 SETTLE_SECONDS = 0.2
 """Time in which the grip settles before the first observation, in s. Set once; not tuned."""
 GPU_MEMORY = GPUMemoryConfig(max_rigid_contact_count=2**21, max_rigid_patch_count=2**19, collision_stack_size=2**26)
@@ -67,9 +67,9 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
       taxel, and `penetration` float32 (N, 10, 14), m (see `TactileSensor`); sizes of the default sensor;
     - `extra["tcp_pose"]` float32 (N, 7): m and wxyz, in the robot's base frame. Privileged state is in the state modes alone.
 
-    `info` holds `success` (the goal has held for 0.5 s), `success_paper` where the goal of the paper's public code is known
-    (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step of
-    the last control step, of both pads together on the held object, its weight and inertia included) and the task's own
+    `info` holds `success` (the goal has held for `hold_seconds`), `success_paper` where the goal of the paper's public code is
+    known (its threshold was met at any step of the episode), `fail`, `contact_force` (N; the largest force, in any physics step
+    of the last control step, of both pads together on the held object, its weight and inertia included) and the task's own
     measures. The `info` of a reset also holds `language_instruction`, the task as a sentence for each environment.
 
     Subclasses define `Randomization`, `_load_task`, `_initialize_task`, `measure`, `goal_reached`, `failed`, and rewards.
@@ -92,6 +92,8 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             "imperfections" of `info` holds what the episode drew of them, by pad.
         lighting: "normal" or "dim" (5 %).
         quality: Quality of the cameras' images: "normal", or "fast", which leaves out the shadow.
+        hold_seconds: Time for which the goal must hold until the episode is a success, in s. Demonstrations end at success, so
+            that those of a larger one show how to stay at the goal.
         occlusion: Whether the task's occluder hides its interior, as it does by default where there is one.
         randomization: Fields of the task's `Randomization` to override, by name.
         visual_randomization: Fields of `VisualRandomization` to override, by name: `dict(light_level=0.3)`. Looks are drawn
@@ -142,6 +144,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         imperfections: Mapping[str, Any] | None = None,
         lighting: str = "normal",
         quality: str = "normal",
+        hold_seconds: float = HOLD_SECONDS,
         occlusion: bool | None = None,
         randomization: dict[str, float] | None = None,
         visual_randomization: dict[str, float] | None = None,
@@ -163,6 +166,8 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         self._tactile_configs = {names[side]: configs[side] for side in self._sides}
         self._finger = self._finger_of([configs[side] for side in self._sides or SIDES])
         self._set_looks(lighting, quality, visual_randomization or {}, simulates_on_gpu(kwargs))
+        require_amount("hold_seconds=", hold_seconds)
+        self._hold_seconds = hold_seconds
         one_of("occlusion", occlusion, (None, False, True))
         if occlusion and not self.has_occluder:
             raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
@@ -370,7 +375,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
 
     def evaluate(self) -> dict:
         measures, self._measured = self._measured or self.measure(), None
-        held = self._steps_at_goal >= round(HOLD_SECONDS * self._control_freq)
+        held = self._steps_at_goal >= max(1, round(self._hold_seconds * self._control_freq))
         info = dict(success=held, fail=self.failed(measures), contact_force=self._contact_force.clone(), **measures)
         info["elapsed_steps"] = self._elapsed_steps.clone()  # instead of ManiSkill's counter itself, which counts on
         if self.paper_goal_reached(measures) is not None:
