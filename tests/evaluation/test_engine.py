@@ -348,12 +348,12 @@ def test_numbers_with_which_no_episode_could_succeed_are_refused(given, said):
 
 
 def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_otherwise(checkpoint, tmp_path, caplog):
-    trained = dict(fit="tight", lighting="dim", max_episode_steps=999)
+    trained = dict(fit="tight", lighting="dim", max_episode_steps=999, hold_seconds=2.0)
     folder = config_with(checkpoint, tmp_path, env_kwargs=trained)
     with caplog.at_level(logging.WARNING):
         evaluation = evaluation_from_args(Args(folder))
         assert (evaluation.env_kwargs["fit"], evaluation.env_kwargs["lighting"]) == ("tight", "dim")
-        assert "max_episode_steps" not in evaluation.env_kwargs
+        assert not {"max_episode_steps", "hold_seconds"} & set(evaluation.env_kwargs)
         assert not evaluation.stop_at_success
         assert evaluation_from_args(Args(folder, stop_at_success=True)).stop_at_success
         assert not caplog.messages

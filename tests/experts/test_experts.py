@@ -11,6 +11,7 @@ from manifeel_ms3.sensors.depth.surfaces import RELIEF
 from manifeel_ms3.tasks.registry import all_tasks
 from tests.tasks_and_marks import PEG
 
+SEARCH = "ManiFeel-ObjectSearch-v1"
 LONG_TASKS = ("ManiFeel-NutBoltAssembly-v1", "ManiFeel-BulbInstallation-v1")  # demonstrations of about 400 steps
 
 
@@ -29,6 +30,18 @@ def test_expert_succeeds_gently_within_the_action_limits(make_env, fit):
     for seed in range(6):
         actions = gentle_success(env, PEG, seed)
         assert len(actions) < 250  # at most one second attempt
+
+
+def test_a_goal_that_must_hold_for_longer_makes_demonstrations_that_stay_there(make_env):
+    usual, longer = (
+        demonstrate(make_env(SEARCH, obs_mode="none", render_backend="none", **given), SEARCH, seed=0)
+        for given in (dict(), dict(hold_seconds=2.0))
+    )
+    first = len(usual.arrays["actions"])
+    assert len(longer.arrays["actions"]) == first + 15  # 1.5 s at 10 Hz
+    np.testing.assert_array_equal(longer.arrays["actions"][:first], usual.arrays["actions"])
+    for episode in (usual, longer):
+        assert np.flatnonzero(episode.arrays["success"]).tolist() == [len(episode.arrays["actions"]) - 1]
 
 
 def test_a_demonstrator_sees_a_part_up_to_a_millimetre_and_a_half_beside_its_place(make_env):

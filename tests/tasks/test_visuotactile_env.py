@@ -131,6 +131,8 @@ def test_touch_without_a_pad_is_missing_with_a_warning(make_env, caplog):
         (dict(sensor_configs=dict(wrist=dict(shader_pack="fast"))), r"'wrist'.*shader_pack.*'fast' is unknown.*'default'"),
         (dict(sensor_configs=dict(shader_pack="fast")), r"sensor_configs\['shader_pack'\]='fast' is unknown.*'default'"),
         (dict(occlusion=True), "nothing that could occlude"),
+        (dict(hold_seconds=-1), "hold_seconds=-1 must be a number of at least 0"),
+        (dict(hold_seconds="2 s"), "hold_seconds=2 s must be a number"),
         (dict(fit="snug"), "tight"),
         (dict(randomisation={}), r"no arguments \['randomisation'\]; choose from .*'fit'.*'randomization'.*'reward_mode'"),
         (dict(randomization=dict(colour=1.0)), "socket_xy"),
