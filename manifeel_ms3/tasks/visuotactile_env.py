@@ -168,10 +168,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         self._set_looks(lighting, quality, visual_randomization or {}, simulates_on_gpu(kwargs))
         require_amount("hold_seconds=", hold_seconds)
         self._hold_seconds = hold_seconds
-        one_of("occlusion", occlusion, (None, False, True))
-        if occlusion and not self.has_occluder:
-            raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
-        self.occlusion = self.has_occluder if occlusion is None else occlusion
+        self.occlusion = self._checked_occlusion(occlusion)
         self.randomization = checked_randomization(
             type(self).__name__, self.Randomization, randomization or {}, self._largest_ranges()
         )
@@ -190,6 +187,13 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
+
+    def _checked_occlusion(self, occlusion: bool | None) -> bool:
+        """Whether the task's occluder hides its interior."""
+        one_of("occlusion", occlusion, (None, False, True))
+        if occlusion and not self.has_occluder:
+            raise InvalidArgumentError(f"occlusion=True: {type(self).__name__} has nothing that could occlude; leave it False")
+        return self.has_occluder if occlusion is None else occlusion
 
     def _finger_of(self, pads: list[TactileSensorConfig]) -> Finger:
         """The finger that carries the pads; both fingers are alike."""
