@@ -43,7 +43,7 @@ ROWS = {
 """First cells of the rows, in the order of the table."""
 LEAD = """
 **What touch adds, in numbers:** success rates (at any step of an episode) of Diffusion Policy with small networks, with the
-standard deviation (±) over {seeds} training seeds and, in brackets, the paper's rates, which come from much larger networks,
+standard deviation (±) over three training seeds and, in brackets, the paper's rates, which come from much larger networks,
 demonstrations by people, another simulator and a looser success. Bold rates are significantly above those of vision alone.
 Policies that have learnt nothing solve {floor} in each of these tasks; in ObjectSearch and BallSortingDim, choosing one of
 the two places or balls at random would give 50 %.
@@ -57,7 +57,7 @@ trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is t
 `cpu_noisy_pose` noise hides from it where the hand is. Each row shows one preset. Of the presets with which vision, TacRGB
 and TacFF were all run, those with most training seeds are taken, and of these the last in the order `cpu`, `cpu_long`,
 `cpu_noisy_pose`, `cpu_targets`. Which presets got a second and a third seed was decided when the results of the first were
-known. Rates without ± have one training seed: however large their differences are, another seed may change them.
+known. Rates without ± have one or two training seeds: however large their differences are, others may change them.
 "Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds. The last column has
 the success at the last step of the episode with vision, TacRGB and TacFF. Demonstrations end at the first success, so that
 policies hardly see what comes after it: in some tasks, the policy of one training seed nearly always stays there, and that of
@@ -90,7 +90,6 @@ def block() -> str:
         slowest=max(minutes),
         on_gpu=f" ({len(on_gpu)} of {len(trained)} on a GPU, in at most {math.ceil(max(on_gpu))} minutes)" if on_gpu else "",
         episodes=min(len(ours.episode_seeds) for ours in here.values()),
-        seeds=" or ".join(map(str, sorted({len(ours.success) for ours in here.values()} - {1}))),
         p=SIGNIFICANT,
         tests=len(gains),
         by_the_paper=f"{STRICTER} has {in_words(_rates_by_the_paper(here))} %",
@@ -136,7 +135,7 @@ def _floor() -> str:
 def _at_end(task: str, results: Results) -> str:
     """Success at the last step with each sensing, in percent."""
     here = [results[task, mode] for mode in MODES if (task, mode) in results]
-    return ", ".join(_percent(ours.success_at_end, ours.seed_deviation_at_end) for ours in here) + " %"
+    return ", ".join(_percent(ours, ours.success_at_end, ours.seed_deviation_at_end) for ours in here) + " %"
 
 
 def _cells(task: str, results: Results, raised: set[tuple[str, str]]) -> Iterator[str]:
@@ -147,14 +146,15 @@ def _cells(task: str, results: Results, raised: set[tuple[str, str]]) -> Iterato
 
 
 def _rate(ours: ConditionResults) -> str:
-    return f"{_percent(ours.success.mean(), ours.seed_deviation)} %"
+    return f"{_percent(ours, ours.success.mean(), ours.seed_deviation)} %"
 
 
-def _percent(rate: float | None, deviation: float | None) -> str:
-    """A rate and its standard deviation over training seeds in percent, without the sign."""
+def _percent(ours: ConditionResults, rate: float | None, deviation: float | None) -> str:
+    """A rate in percent, without the sign, and its standard deviation over training seeds where these are enough."""
     if rate is None:
         return "?"
-    return f"{100 * rate:.0f}" if deviation is None else f"{100 * rate:.0f} ± {100 * deviation:.0f}"
+    spread = f" ± {100 * deviation:.0f}" if deviation is not None and has_enough_seeds(ours) else ""
+    return f"{100 * rate:.0f}{spread}"
 
 
 def main() -> None:
