@@ -107,6 +107,16 @@ def test_unknown_observations_are_refused_before_anything_is_recorded(tmp_path, 
     assert not list(tmp_path.iterdir())
 
 
+def test_a_tasks_own_camera_is_recorded_unless_others_are_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(task_spec(PEG).env_class, "own_cameras", ("above",))
+    assert record.Args(PEG).all_env_kwargs["cameras"] == ["front", "side", "wrist", "above"]
+    assert record.Args(PEG, cameras=("side",)).all_env_kwargs["cameras"] == ["side"]
+    with pytest.raises(
+        InvalidArgumentError, match=r"--cameras='foo' is unknown; choose from \['front', 'side', 'wrist', 'above'\]"
+    ):
+        dataset.main(dataset.Args(tmp_path / "set", (PEG,), num=1, cameras=("foo",)))
+
+
 def test_negative_numbers_of_what_may_be_left_out_are_refused(folder):
     states = folder / PEG / STATES
     with pytest.raises(InvalidArgumentError, match="--replay -1 must be at least 0"):
