@@ -20,7 +20,6 @@ from manifeel_ms3.files import SHOWN_LENGTH
 from manifeel_ms3.tasks.checks import check_argument_names, check_seed
 from manifeel_ms3.tasks.obs_modes import in_usual_order, split_obs_mode
 from manifeel_ms3.tasks.registry import task_spec, tasks_of_table
-from manifeel_ms3.tasks.visuotactile_env import CAMERAS
 
 Kind = Literal["record", "pretrain", "train", "evaluate"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -250,7 +249,7 @@ def _check_encoders(grid: Grid, place: str) -> None:
 def _check_sensing(grid: Grid) -> None:
     """Check the names of what the policies observe, and of the encoders of TacRGB."""
     for task in grid.tasks:
-        several_of("cameras", grid.cameras, ("policy", *CAMERAS, *task_spec(task).env_class.own_cameras))
+        several_of("cameras", grid.cameras, ("policy", *task_spec(task).env_class.known_cameras()))
     several_of("encoders", grid.encoders, ("", *tacrgb_encoder_names()))
     for mode in grid.obs_modes:
         split_obs_mode(mode)

@@ -80,7 +80,7 @@ def main(args: Args) -> Path:
     require_positive(num_demos=args.num, num_procs=args.workers, image_size=args.image_size)
     split_obs_mode(args.obs_mode)
     for task in map(task_spec, args.tasks):
-        several_of("--cameras", args.cameras, (*CAMERAS, *task.env_class.own_cameras))
+        several_of("--cameras", args.cameras, task.env_class.known_cameras())
     several_of("--tactile-sensors", args.tactile_sensors, SIDES)
     with owned(args.out / MANIFEST_FILE):
         return _record_all(args)

@@ -20,7 +20,7 @@ from manifeel_ms3.errors import InvalidArgumentError, WorkFailedError
 from manifeel_ms3.experts import require_demonstrator
 from manifeel_ms3.progress import episode_counter
 from manifeel_ms3.tasks.registry import FIRST_EVALUATION_SEED, task_spec
-from manifeel_ms3.tasks.visuotactile_env import CAMERAS, SIDES
+from manifeel_ms3.tasks.visuotactile_env import SIDES
 from manifeel_ms3.workers import WorkerPool
 
 from .episode import demonstrate
@@ -79,7 +79,7 @@ class Args:
         Raises:
             InvalidArgumentError: `env_kwargs` is not a json object.
         """
-        cameras = (*CAMERAS, *task_spec(self.env_id).env_class.own_cameras) if self.cameras is None else self.cameras
+        cameras = task_spec(self.env_id).env_class.known_cameras() if self.cameras is None else self.cameras
         sensing: dict[str, Any] = dict(cameras=list(cameras), tactile_sensors=list(self.tactile_sensors))
         if self.sensor is not None:
             sensing["sensor"] = self.sensor

@@ -154,7 +154,7 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
         self._full_obs_mode, self.sensor = obs_mode or "state", sensor
         own_mode, self._tactile_outputs = split_obs_mode(self._full_obs_mode)
         asked = self.policy_cameras if cameras is None else cameras
-        self.camera_names = cameras_to_observe(self._full_obs_mode, asked, (*CAMERAS, *self.own_cameras))
+        self.camera_names = cameras_to_observe(self._full_obs_mode, asked, self.known_cameras())
         self._sides = pads_to_observe(self._full_obs_mode, tactile_sensors, SIDES)
         names = {side: PAD + side for side in SIDES}
         camera_configs, own = split_sensor_configs(sensor_configs or {}, self.camera_names, [names[s] for s in self._sides])
@@ -187,6 +187,11 @@ class VisuotactileEnv(RestorableEnv, SceneryEnv):
             human_render_camera_configs=drawn_sizes(human_render_camera_configs or {}),
             **kwargs,
         )
+
+    @classmethod
+    def known_cameras(cls) -> tuple[str, ...]:
+        """Names of the cameras that the task can render."""
+        return (*CAMERAS, *cls.own_cameras)
 
     def _checked_occlusion(self, occlusion: bool | None) -> bool:
         """Whether the task's occluder hides its interior."""

@@ -35,7 +35,7 @@ from manifeel_ms3.evaluation.video import act_again, replayed
 from manifeel_ms3.paths import CHECKPOINTS
 from manifeel_ms3.progress import progress_bar
 from manifeel_ms3.tasks.registry import task_spec
-from manifeel_ms3.tasks.visuotactile_env import CAMERAS, CONTROL_FREQ, SIDES
+from manifeel_ms3.tasks.visuotactile_env import CONTROL_FREQ, SIDES
 
 from .shots import Shot, Take, View, shot_images, shown_steps, video_env
 
@@ -183,7 +183,7 @@ def _take(source: Source, args: Args) -> Take:
         DemonstrationError: The recorded actions now fail where they succeeded before, or the other way round.
     """
     spec = task_spec(source.env_id)
-    one_of("--camera", args.camera, (None, *CAMERAS, *spec.env_class.own_cameras))
+    one_of("--camera", args.camera, (None, *spec.env_class.known_cameras()))
     view = View(args.camera or spec.policy_camera, args.pad)
     kind = "policy" if source.is_result else "demonstration"
     take = Take(f"{spec.name}, {kind}, seed {source.seed}", spec.force_limit)
