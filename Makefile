@@ -1,6 +1,6 @@
 # make setup            Install what the project needs.
 # make demo             Record, train and evaluate one visuotactile policy, and write its report.
-# make data             Record the paper's number of demonstrations of every task, in hours; it continues where it was stopped.
+# make data             Record as many demonstrations of every task as the paper, in hours; it continues where it was stopped.
 # make benchmark-smoke  Run the whole benchmark with two tasks and tiny networks.
 # make test             Run the test suite.   make lint types docs  Run the checks of the code and build the site.
 # make results          Make the pages with published results anew, from the result files in leaderboard/ and docs/.

@@ -34,8 +34,9 @@ under changes of the [appearance](rendering.md#visual-randomization), which are 
 itself is not changed. All rows of a policy were evaluated on the same processor. Each difference, in percentage points, has a
 95 % interval from a bootstrap over initial states; p is that of McNemar's exact test, and "p, Holm" is corrected for all rows
 of the policy (Holm 1979). One policy of each kind was tested: nothing here tells how other training seeds or tasks behave.
-The study `configs/perturbation.yaml` trains and evaluates policies of four tasks, with vision alone, TacRGB and TacFF.
-GearAssembly and BallSorting, and PegInsertion with vision alone and TacRGB, have not been run.
+The rows were made from published checkpoints of the preset `cpu`, by the command at the end of this page. GearAssembly and
+BallSorting, and PegInsertion with vision alone and TacRGB, were not evaluated. The study `configs/perturbation.yaml` does the
+same with the preset `paper` in these four tasks; it has not been run.
 
 In ObjectSearch, touch did not make the policies that were tested robust to an appearance that they had not seen. Touch
 doubles success under the usual appearance: 23 of 50 episodes succeed with vision alone, 46 with TacFF and 48 with TacRGB.

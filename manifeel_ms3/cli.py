@@ -34,7 +34,7 @@ COMMANDS = {
     "doctor": Command("manifeel_ms3.doctor", "Check what this machine can do, and how to repair what it cannot."),
     "record": Command("manifeel_ms3.demonstrations.record", "Record a scripted demonstrator."),
     "teleop": Command("manifeel_ms3.teleop.__main__", "Record demonstrations by hand, in a browser."),
-    "dataset": Command("manifeel_ms3.demonstrations.dataset", "Record the paper's number of demonstrations of every task."),
+    "dataset": Command("manifeel_ms3.demonstrations.dataset", "Record as many demonstrations of every task as the paper."),
     "replay": Command("manifeel_ms3.demonstrations.replay", "Run recorded actions again."),
     "render-observations": Command("manifeel_ms3.demonstrations.render_observations", "Add observations to recorded states."),
     "validate": Command("manifeel_ms3.demonstrations.validate", "Check recorded files for errors."),
@@ -46,7 +46,7 @@ COMMANDS = {
     "report": Command("manifeel_ms3.evaluation.report", "Write a page about one training run."),
     "results": Command("manifeel_ms3.analysis.results_page", "Write a page of all results beside the paper's numbers."),
     "claims": Command("manifeel_ms3.analysis.claims", "Test the paper's claims on your results."),
-    "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Check a submission, or build the leaderboard's page."),
+    "leaderboard": Command("manifeel_ms3.leaderboard.__main__", "Hash or check a submission, or build the leaderboard's page."),
     "verify-sensor": Command("manifeel_ms3.verification.__main__", "Verify a tactile sensor by known loads."),
     "similarity": Command("manifeel_ms3.analysis.sim_real_similarity", "Measure how similar simulated and real touch are."),
     "audit": Command(

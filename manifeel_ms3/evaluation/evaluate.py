@@ -305,7 +305,8 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
         config |= dict(policy_kwargs=own)
     env_id = task_spec(config["env_id"]).env_id
     _require_own(args, config | dict(env_id=env_id))
-    trained = {name: value for name, value in config.get("env_kwargs", {}).items() if name not in LENGTHS_OF_RECORDINGS}
+    recorded = config.get("env_kwargs", {})
+    trained = {name: value for name, value in recorded.items() if name not in LENGTHS_OF_RECORDINGS}
     sensing = {name: config[name] for name in SENSING}
     if args.sensor not in (None, learnt := trained.get("sensor", DEFAULT_SENSOR)):
         raise InvalidArgumentError(
@@ -313,7 +314,7 @@ def _of_checkpoint(args: Args, kwargs: dict[str, Any], given: dict[str, Any]) ->
             f'--env-kwargs \'{{"sensor": "{args.sensor}"}}\' if another sensor is meant'
         )
     check_obs_mode("--env-kwargs", given, config["obs_mode"])
-    _name_differences(env_id, trained | sensing, given)
+    _name_differences(env_id, recorded | sensing, given)
     device = checked_device(args.device)
     if args.batch_size is not None and args.batch_size < 1:
         raise InvalidArgumentError(f"--batch-size {args.batch_size} is less than 1; leave it out, or give 1 or more")
@@ -346,6 +347,12 @@ def _name_differences(env_id: str, trained: dict[str, Any], given: dict[str, Any
     for name, value in given.items():
         if name in learnt and json.dumps(learnt[name], default=str) != json.dumps(value):
             log.warning("--env-kwargs: %s is %r here, but %r in the demonstrations of the policy", name, value, learnt[name])
+    if (limit := trained.get("max_episode_steps")) and "max_episode_steps" not in given:
+        log.warning(
+            "the demonstrations of the policy had max_episode_steps %r; the evaluation has the task's own limit, "
+            "unless --env-kwargs gives another",
+            limit,
+        )
 
 
 def _flags(names: list[str]) -> str:

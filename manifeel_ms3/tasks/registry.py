@@ -48,7 +48,7 @@ class TaskSpec:
     """Time limit of an episode, in control steps: at least twice the mean length of the paper's number of demonstrations, and
     1.5 times that of the longest of them."""
     paper_demos: int
-    """Number of demonstrations in the paper; `manifeel dataset` records as many."""
+    """Number of demonstrations that the paper recorded, as does `manifeel dataset`; its Table I trains on 50 at most."""
     instruction: str = ""
     """The task as one plain English sentence that tells a robot what to do, for policies that take language; "" if none."""
     goal_instructions: Mapping[str, str] = field(default_factory=dict)

@@ -8,7 +8,7 @@ import numpy as np
 import sapien
 
 DOWNWARD_ANGLE = np.deg2rad(30)
-"""Angle of the front and side cameras' optical axes below the horizon, in rad; the wrist camera has the same."""
+"""Angle of the front and side cameras' optical axes below the horizon, in rad."""
 FAR_FRONT_CAMERA_AT, FAR_SIDE_CAMERA_AT = (0.80, 0.0, 0.15), (0.5, -0.4, 0.17)
 """Positions of the front and side cameras of the exploration tasks, in m, base frame: further away than in
 the other tasks. The side camera's is that of the paper's public code."""

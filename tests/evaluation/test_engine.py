@@ -356,10 +356,20 @@ def test_a_policy_is_evaluated_on_the_task_of_its_demonstrations_unless_told_oth
         assert not {"max_episode_steps", "hold_seconds"} & set(evaluation.env_kwargs)
         assert not evaluation.stop_at_success
         assert evaluation_from_args(Args(folder, stop_at_success=True)).stop_at_success
-        assert not caplog.messages
-        evaluation = evaluation_from_args(Args(folder, env_kwargs='{"fit": "paper", "lighting": "dim"}'))
-    assert evaluation.env_kwargs["fit"] == "paper"
-    assert caplog.messages == ["--env-kwargs: fit is 'paper' here, but 'tight' in the demonstrations of the policy"]
+        own_limit = (
+            "the demonstrations of the policy had max_episode_steps 999; the evaluation has the task's own limit, "
+            "unless --env-kwargs gives another"
+        )
+        assert set(caplog.messages) == {own_limit}
+        caplog.clear()
+        evaluation = evaluation_from_args(
+            Args(folder, env_kwargs='{"fit": "paper", "lighting": "dim", "max_episode_steps": 500}')
+        )
+    assert (evaluation.env_kwargs["fit"], evaluation.env_kwargs["max_episode_steps"]) == ("paper", 500)
+    assert caplog.messages == [
+        "--env-kwargs: fit is 'paper' here, but 'tight' in the demonstrations of the policy",
+        "--env-kwargs: max_episode_steps is 500 here, but 999 in the demonstrations of the policy",
+    ]
 
 
 def test_an_argument_that_the_demonstrations_left_at_its_default_is_compared_with_it(checkpoint, tmp_path, caplog):
