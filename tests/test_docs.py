@@ -132,7 +132,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     assert done.returncode == 0, done.stderr
     page = (tmp_path / "site/api/sensors/index.html").read_text()
     assert "TactileSensor" in page
-    formulas = [(tmp_path / f"site/{name}/index.html").read_text() for name in ("sensor", "evaluation")]
+    formulas = [(tmp_path / f"site/{name}/index.html").read_text() for name in ("sensor", "submitting")]
     assert all("<math" in html and "arithmatex" not in html for html in formulas)
     assert all('<div class="formula"><math' in html for html in formulas)  # it can be scrolled where it is wider than the page
     assert ".formula { overflow-x: auto; }" in (tmp_path / "site/site.css").read_text()

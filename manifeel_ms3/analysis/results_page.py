@@ -107,7 +107,7 @@ CLAIMS = """
 ## The paper's claims
 
 Each claim is tested as the difference between two conditions on the same initial states, with its 95 % interval
-([method](evaluation.md#the-papers-protocol-and-claims)). Except for what the claim compares, both conditions have the same
+([method](protocol.md#the-papers-protocol)). Except for what the claim compares, both conditions have the same
 preset and the paper's number of demonstrations. A preset is not the same for all policies: that of the small networks gives the
 Equivariant Diffusion Policy smaller images and half as many gradient steps ([policies](policies.md)), so that claim 5 compares
 these networks, too. Claim 4 may be an artefact of the public code, which trains Flow Matching

@@ -123,7 +123,7 @@ def leaderboard_table(rows: list[Row]) -> str:
         '([limits](../docs/evaluation.md#what-is-measured)). "Std" is the standard deviation over training seeds; "floor" is '
         'the success of policies that have learnt nothing, where it was measured. "Run again" is the number of episodes that '
         "the leaderboard ran again with the same outcome "
-        "([what this proves](../docs/evaluation.md#what-running-episodes-again-proves)). The page of "
+        "([what this proves](../docs/submitting.md#what-running-episodes-again-proves)). The page of "
         "[results](../docs/results.md) also has training seeds whose checkpoints were not kept. They are missing here, so that "
         'its rates differ where "of" says fewer than three training seeds.\n\n'
     )

@@ -1,6 +1,6 @@
 """Running episodes of a submission again, drawn at random from all of its results, with the checkpoints that it names.
 
-`docs/evaluation.md` says what this proves and what it does not.
+`docs/submitting.md` says what this proves and what it does not.
 """
 
 import hashlib
