@@ -1,6 +1,7 @@
 """Train any registered policy: `manifeel train diffusion_policy cpu --demo-path peg.h5`."""
 
 import sys
+from collections.abc import Mapping
 from functools import reduce
 from operator import or_
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from baselines.common.train_args import TrainArgs
-from baselines.registry import PolicySpec, all_policies, next_step
+from baselines.registry import PolicySpec, Preset, all_policies, next_step
 from manifeel_ms3 import plugins
 from manifeel_ms3.arguments import meant
 from manifeel_ms3.command_line import run
@@ -37,8 +38,8 @@ ONLY_IN_MANISKILL = {
 """Flags of the scripts of ManiSkill's baselines that training does not take, and why."""
 
 
-def check_arguments(arguments: list[str]) -> None:
-    """Check that the command begins with the names of a policy and a preset; tyro would list the flags of all presets instead.
+def parse(arguments: list[str]) -> TrainArgs:
+    """The settings of a command line, read with the flags of its policy and preset alone; tyro would list those of all presets.
 
     Args:
         arguments: The command line after `manifeel train`.
@@ -49,26 +50,31 @@ def check_arguments(arguments: list[str]) -> None:
         PluginError: The policy's plug-in does not import.
     """
     policy, preset = ([name.replace("-", "_") for name in arguments] + ["", ""])[:2]
-    if {"-h", "--help"} & set(arguments) or policy.startswith("__tyro"):
-        return
+    asks_for_help = bool({"-h", "--help"} & set(arguments))
+    if policy.startswith("__tyro") or (asks_for_help and preset not in _presets_of(policy)):
+        return tyro.cli(Args, prog="manifeel train", args=arguments)
     if policy in plugins.registered(plugins.POLICIES):
         plugins.load(plugins.POLICIES, policy)  # says why a broken one does not import
-    if (spec := all_policies().get(policy)) is None:
+    if policy not in all_policies():
         raise InvalidArgumentError(
             f"`manifeel train` needs the name of a policy before that of a preset; choose from {list(all_policies())}"
             f"{meant(policy, all_policies())}"
         )
-    if preset in spec.presets:
-        for argument in arguments:
-            name = argument.partition("=")[0].replace("_", "-")
-            if name in ONLY_IN_MANISKILL:
-                raise InvalidArgumentError(
-                    f"{name} is a flag of ManiSkill's baselines; leave it out: {ONLY_IN_MANISKILL[name]}"
-                )
-        return
-    choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in spec.presets.items())
-    wrong = f"has no preset {preset!r}" if preset.strip("_") == preset != "" else "needs the name of a preset before its flags"
-    raise InvalidArgumentError(f"`manifeel train {policy}` {wrong}; choose from {choices}{meant(preset, spec.presets)}")
+    if preset not in (presets := _presets_of(policy)):
+        choices = "; ".join(f"{name} ({about.about.rstrip('.')})" for name, about in presets.items())
+        is_name = preset.strip("_") == preset != ""
+        wrong = f"has no preset {preset!r}" if is_name else "needs the name of a preset before its flags"
+        raise InvalidArgumentError(f"`manifeel train {policy}` {wrong}; choose from {choices}{meant(preset, presets)}")
+    for name in (argument.partition("=")[0].replace("_", "-") for argument in arguments):
+        if name in ONLY_IN_MANISKILL:
+            raise InvalidArgumentError(f"{name} is a flag of ManiSkill's baselines; leave it out: {ONLY_IN_MANISKILL[name]}")
+    chosen = presets[preset]
+    names = f"manifeel train {policy} {preset}"
+    return tyro.cli(type(chosen.args), default=chosen.args, prog=names, description=chosen.about, args=arguments[2:])
+
+
+def _presets_of(policy: str) -> Mapping[str, Preset]:
+    return spec.presets if (spec := all_policies().get(policy)) else {}
 
 
 def main(args: TrainArgs) -> Path:

@@ -59,6 +59,8 @@ class Args:
     """Arguments of the task as json. By default the task is easier than the paper's (see EASY) and its episodes are short."""
     obs_mode: str = "state+tacff"
     """Observation mode."""
+    control_mode: str | None = None
+    """Control mode; the task's own if not given."""
     exp_name: str = "ppo"
     """Name of the run, whose log and weights are in runs/<exp_name>."""
     seed: int = 1
@@ -106,12 +108,20 @@ class Args:
     """Number of minibatches of an epoch."""
     update_epochs: int = 8
     """Number of epochs of an update."""
+    norm_adv: bool = True
+    """Whether the advantages of a minibatch are normalised."""
     clip_coef: float = 0.2
     """Largest difference of the probability ratio from 1 before it is clipped."""
+    clip_vloss: bool = False
+    """Whether a value is clipped to `clip_coef` around the one of the rollout in the loss of the critic."""
+    ent_coef: float = 0.0
+    """Weight of the entropy of the actions, which is to be large."""
     vf_coef: float = 0.5
     """Weight of the loss of the critic."""
     max_grad_norm: float = 0.5
     """Largest norm of a gradient."""
+    reward_scale: float = 1.0
+    """Factor on the rewards of the training."""
     target_kl: float = 0.04
     """Largest Kullback-Leibler divergence between the policy and the one that collected the data; beyond it an update ends."""
 
@@ -175,7 +185,8 @@ def make_env(args: Args, ignore_terminations: bool = False, videos: Path | None 
     """One environment with flat observations; its episodes are filmed where a folder of videos is given."""
     torch.set_num_threads(1)
     rendering = dict(render_backend="none") if videos is None else FILMED
-    env = gym.make(args.env_id, obs_mode=args.obs_mode, **rendering, **json.loads(args.env_kwargs))
+    control = {} if args.control_mode is None else dict(control_mode=args.control_mode)
+    env = gym.make(args.env_id, obs_mode=args.obs_mode, **control, **rendering, **json.loads(args.env_kwargs))
     for wrapper in WRAPPERS:
         env = wrapper(env)
     if videos is not None:
@@ -244,7 +255,9 @@ class Rollout:
         for t in reversed(range(args.num_steps)):
             following = next_value if t == args.num_steps - 1 else self.values[t + 1]
             alive = 1 - self.dones[t]
-            delta = self.rewards[t] + args.gamma * (alive * following + self.final_values[t]) - self.values[t]
+            delta = (
+                args.reward_scale * self.rewards[t] + args.gamma * (alive * following + self.final_values[t]) - self.values[t]
+            )
             advantages[t] = last = delta + args.gamma * args.gae_lambda * alive * last
         return advantages
 
@@ -263,11 +276,19 @@ def update(args: Args, agent: Agent, optimizer: torch.optim.Optimizer, rollout: 
             divergence = ((ratio - 1) - logratio).mean().item()
             if divergence > args.target_kl:
                 return losses
-            advantage = (advantages[batch] - advantages[batch].mean()) / (advantages[batch].std() + ADVANTAGE_EPS)
+            advantage = advantages[batch]
+            if args.norm_adv:
+                advantage = (advantage - advantage.mean()) / (advantage.std() + ADVANTAGE_EPS)
             clipped = ratio.clamp(1 - args.clip_coef, 1 + args.clip_coef)
             policy_loss = -torch.min(advantage * ratio, advantage * clipped).mean()
-            value_loss = 0.5 * (agent.value(obs[batch]) - returns[batch]).square().mean()
-            loss = policy_loss + args.vf_coef * value_loss
+            value, old = agent.value(obs[batch]), rollout.values.flatten()[batch]
+            errors = (value - returns[batch]).square()
+            if args.clip_vloss:
+                near = old + (value - old).clamp(-args.clip_coef, args.clip_coef)
+                errors = torch.max(errors, (near - returns[batch]).square())
+            value_loss = 0.5 * errors.mean()
+            entropy = distribution.entropy().sum(1).mean()
+            loss = policy_loss + args.vf_coef * value_loss - args.ent_coef * entropy
             optimizer.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(agent.parameters(), args.max_grad_norm)

@@ -102,8 +102,7 @@ def _run(arguments: list[str]) -> Any:
         return None
     if arguments and (command := _command(name := arguments[0])):
         module = _module_of(command)
-        getattr(module, "check_arguments", lambda _: None)(arguments[1:])
-        args = tyro.cli(module.Args, prog=f"manifeel {name}", description=command.about, args=arguments[1:])
+        args = module.parse(arguments[1:]) if hasattr(module, "parse") else _parsed(command, name, arguments[1:])
         import_typed_tasks(args)
         answer = module.main(args)
         if hasattr(module, "next_step"):
@@ -124,6 +123,10 @@ def _run(arguments: list[str]) -> Any:
     choice: Any = reduce(or_, forms)
     tyro.cli(choice, prog="manifeel", args=arguments)  # prints the list, a completion, or an error
     return None
+
+
+def _parsed(command: Command, name: str, arguments: list[str]) -> Any:
+    return tyro.cli(_module_of(command).Args, prog=f"manifeel {name}", description=command.about, args=arguments)
 
 
 def command_module(name: str) -> Any:

@@ -313,6 +313,12 @@ def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):
         cli.main(["record", PEG, "--obs-moed", "tacff"])
     said = " ".join(re.sub(r"[^\w.-]+", " ", capsys.readouterr().err).split())
     assert "Perhaps you meant --obs-mode" in said
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["train", "diffusion_policy", "cpu", "--demo-path", "x.h5", "--total-iter", "5"])
+    said = " ".join(re.sub(r"[^\w.-]+", " ", capsys.readouterr().err).split())
+    assert "--total-iters" in said.partition("Perhaps you meant")[2]
+    assert "manifeel train diffusion_policy cpu --help" in said
+    assert "cpu_long" not in said
     assert cli.main(["recrod", PEG]) == 1
     said = capsys.readouterr().err
     assert "'recrod' is not a command; choose from ['tasks'" in said
@@ -324,13 +330,15 @@ def test_names_that_are_not_known_are_refused_and_the_nearest_is_named(capsys):
 
 
 def test_flags_have_maniskills_names_and_their_old_ones():
-    parse = partial(tyro.cli, cli.command_module("train").Args)
+    train = cli.command_module("train")
+    parse = partial(tyro.cli, train.Args)
     theirs = "--demo-path a.h5 --total-iters 7 --save-freq 3 --log-freq 2 --num-eval-episodes 4 --num-eval-envs 2 --track"
     ours = "--demos a.h5 --steps 7 --save-every 3 --log-every 2 --eval-episodes 4 --eval-workers 2 --track"
     named = "--exp-name x --num-demos 5 --eval-freq 6 --wandb-project-name y --wandb-entity z --capture-video"
     theirs += f" {named} --obs-horizon 3 --act-horizon 5 --pred-horizon 12"
     ours += f" {named} --policy.obs-horizon 3 --policy.action-horizon 5 --policy.pred-horizon 12"
     assert parse(args=["flow_matching", "cpu", *theirs.split()]) == parse(args=["flow_matching", "cpu", *ours.split()])
+    assert train.parse(["flow_matching", "cpu", *theirs.split()]) == parse(args=["flow_matching", "cpu", *theirs.split()])
     evaluate = partial(tyro.cli, cli.command_module("eval").Args)
     assert evaluate(args=["--num-eval-episodes", "3", "--num-eval-envs", "2"]) == evaluate(
         args=["--episodes", "3", "--workers", "2"]

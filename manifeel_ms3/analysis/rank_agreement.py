@@ -35,8 +35,8 @@ TEXT = """
 
 Whether our results rank the paper's conditions as the paper does, by Kendall's tau (1: the same order, -1: the reverse) and
 the mean maximum rank violation (MMRV; 0: the same order), with 95 % intervals from a bootstrap over our training seeds and
-initial states; conditions with one training seed add no variation over training to it, and there is no interval where all
-have one. "Within tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
+initial states; conditions with one training seed add no variation over training to it, and there is no interval where most
+have only one. "Within tasks" compares only conditions of the same task, so that the agreement does not merely reflect how
 difficult the tasks are.
 
 """
@@ -89,7 +89,7 @@ def agreement_of(ranked: Sequence[Ranked], groups: Sequence[Sequence[int]]) -> t
     """
     paper = np.array([one.paper for one in ranked])
     ours = np.array([one.results.success.mean() for one in ranked])
-    if all(len(one.results.success) == 1 for one in ranked):  # nothing says how much they vary with the training seed
+    if 2 * sum(len(one.results.success) == 1 for one in ranked) > len(ranked):  # little says how much they vary with the seed
         values = mean_tau(paper, ours, groups), rank_violation(paper, ours, groups)
         return Agreement(values[0], *NO_INTERVAL), Agreement(values[1], *NO_INTERVAL)
     drawn = resampled_success([(one.condition.env_id, one.results) for one in ranked], RESAMPLES)

@@ -1,6 +1,7 @@
 """Time and force limits of tasks, from demonstrations: `python -m manifeel_ms3.evaluation.limits data/demos/*/trajectory.h5`.
 
-The registration of each task (`max_episode_steps`, `force_limit`) holds the numbers that this prints, and `demo_steps`.
+The registration of each task (`max_episode_steps`, `force_limit`, `demo_steps`) holds such numbers. Most limits were computed
+from earlier demonstrators and are kept, so that results stay comparable (docs/evaluation.md).
 """
 
 import math

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from manifeel_ms3 import plugins
-from manifeel_ms3.arguments import by_name
+from manifeel_ms3.arguments import by_name, meant
 from manifeel_ms3.errors import InvalidArgumentError, MachineError, ManifeelError, ServerError, UnknownNameError
 from manifeel_ms3.files import file_hash
 from manifeel_ms3.typed_modules import look_in_working_folder
@@ -314,4 +314,7 @@ def import_name(name: str) -> Any:
     """
     look_in_working_folder()
     module, _, attribute = name.partition(":")
-    return getattr(importlib.import_module(module), attribute)
+    imported = importlib.import_module(module)
+    if not hasattr(imported, attribute):
+        raise AttributeError(f"{module!r} has no {attribute!r}{meant(attribute, vars(imported))}")
+    return getattr(imported, attribute)

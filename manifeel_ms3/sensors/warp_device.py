@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import logging
 import math
 import os
 from collections.abc import Iterator
@@ -12,6 +13,9 @@ from pathlib import Path
 import torch
 import warp as wp
 
+log = logging.getLogger(__name__)
+
+COMPILING = "compiling the kernels of the tactile sensor: this takes 10 to 30 s, once on this machine"
 STDERR = 2  # number of the file descriptor of the standard error
 MIN_SPLIT_SIZE = 4_000  # threads of a launch: smaller ones are not split, since that would take longer (chosen)
 
@@ -26,7 +30,13 @@ def _start_warp() -> None:
         wp.config.log_level = wp.LOG_ERROR
     if torch.cuda.is_available():
         wp.init()
-        return
+    else:
+        _init_in_silence()
+    if not any(Path(wp.config.kernel_cache_dir).glob(f"wp_{__package__}*")):
+        log.warning(COMPILING)
+
+
+def _init_in_silence() -> None:
     shown = os.dup(STDERR)
     try:
         with Path(os.devnull).open("wb") as nowhere:

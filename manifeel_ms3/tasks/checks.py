@@ -226,7 +226,7 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
 
     Args:
         given: Fields to change of one sensor, as a dict by its name, and fields to change of every camera. Fields of a pad are
-            nested dicts or have dotted names.
+            nested dicts or have dotted names; `width` and `height` together are its `image_shape`.
         cameras: Names of the cameras.
         pads: Names of the pads.
 
@@ -241,7 +241,7 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
     of_cameras, of_pads = {}, {}
     for name, value in by_name("sensor_configs", given, example).items():
         if name in pads:
-            of_pads[name] = dict(_dotted(by_name(f"sensor_configs[{name!r}]", value, example)))
+            of_pads[name] = _pad_fields(by_name(f"sensor_configs[{name!r}]", value, example))
         elif name in cameras:
             of_cameras[name] = dict(by_name(f"sensor_configs[{name!r}]", value, example))  # a copy, which ManiSkill changes
             if unknown := [key for key in value if key not in fields]:
@@ -258,6 +258,14 @@ def split_sensor_configs(given: Any, cameras: Collection[str], pads: Collection[
             )
     _check_shader_pack("sensor_configs", of_cameras)
     return of_cameras, of_pads
+
+
+def _pad_fields(given: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a pad by dotted name, with the size of its image in the pad's own words instead of ManiSkill's."""
+    fields = dict(_dotted(given))
+    if {"width", "height"} <= fields.keys():
+        fields["image_shape"] = (fields.pop("height"), fields.pop("width"))
+    return fields
 
 
 def _check_shader_pack(argument: str, fields: Mapping[str, Any]) -> None:

@@ -173,6 +173,8 @@ def test_a_policy_that_cannot_be_made_stops_the_run(tmp_path):
         evaluated("CannotBeMade", tmp_path)
     with pytest.raises(PolicyError, match="give module:Class"):
         evaluated("Nobody", tmp_path)
+    with pytest.raises(PolicyError, match="has no 'CannotBeMad'; did you mean 'CannotBeMade'"):
+        evaluated("CannotBeMad", tmp_path)
     assert not (tmp_path / "evaluation.json").exists()
 
 

@@ -71,6 +71,12 @@ def test_sensor_configs_reach_pads_as_well(make_env):
     assert (config.units, config.optics.noise) == ("tacsl", 2.0)
 
 
+def test_a_pad_takes_the_width_and_height_of_maniskills_cameras(make_env):
+    env = make_env(obs_mode="tacrgb", sensor_configs=dict(tactile_right=dict(width=160, height=120)))
+    obs, _ = env.reset(seed=0)
+    assert obs["sensor_data"]["tactile_right"]["rgb"].shape == (1, 120, 160, 3)
+
+
 def test_pads_on_fingers_of_different_sizes_are_refused(make_env):
     options = dict(obs_mode="tacff", render_backend="none", sensor_configs=dict(tactile_left={"gel.size": (0.026, 0.034)}))
     with pytest.raises(InvalidArgumentError, match="both fingers are alike"):
