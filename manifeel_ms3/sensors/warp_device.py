@@ -32,7 +32,7 @@ def _start_warp() -> None:
         wp.init()
     else:
         _init_in_silence()
-    if not any(Path(wp.config.kernel_cache_dir).glob(f"wp_{__package__}*")):
+    if not any(Path(str(wp.config.kernel_cache_dir)).glob(f"wp_{__package__}*")):
         log.warning(COMPILING)
 
 
