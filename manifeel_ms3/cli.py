@@ -13,7 +13,7 @@ completion, which needs the flags of all commands.
 import logging
 import sys
 from dataclasses import dataclass
-from functools import cache, reduce
+from functools import cache, partial, reduce
 from importlib import import_module
 from importlib.metadata import version
 from operator import or_
@@ -102,7 +102,8 @@ def _run(arguments: list[str]) -> Any:
         return None
     if arguments and (command := _command(name := arguments[0])):
         module = _module_of(command)
-        args = module.parse(arguments[1:]) if hasattr(module, "parse") else _parsed(command, name, arguments[1:])
+        parse = getattr(module, "parse", partial(_parsed, name, command.about, module.Args))
+        args = parse(arguments[1:])
         import_typed_tasks(args)
         answer = module.main(args)
         if hasattr(module, "next_step"):
@@ -125,8 +126,8 @@ def _run(arguments: list[str]) -> Any:
     return None
 
 
-def _parsed(command: Command, name: str, arguments: list[str]) -> Any:
-    return tyro.cli(_module_of(command).Args, prog=f"manifeel {name}", description=command.about, args=arguments)
+def _parsed(name: str, about: str, form: Any, arguments: list[str]) -> Any:
+    return tyro.cli(form, prog=f"manifeel {name}", description=about, args=arguments)
 
 
 def command_module(name: str) -> Any:

@@ -9,10 +9,12 @@ import pytest
 import torch
 
 import manifeel_ms3  # noqa: F401
+from manifeel_ms3.sensors.warp_device import warp_device
 from tests.tasks_and_marks import PEG
 from tests.tiny_study import TINY
 
 torch.set_num_threads(1)
+warp_device(torch.device("cpu"))  # where touch was never computed, this says so: here, and in no test
 LONG = ("test_studies", "test_training", "test_end_to_end", "test_recorders", "test_experts", "test_engine", "test_record")
 """Names of files whose tests take minutes; they come in this order, so that none is left for the end."""
 

@@ -40,8 +40,9 @@ def test_a_step_with_images_says_nothing():
     """With the warnings that Python hides by default, too."""
     command = [sys.executable, "-W", "default", "-c", STEP_WITH_IMAGES]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stderr in ("", f"{COMPILING}\n")  # on a machine on which touch was never computed
-    assert done.stdout == ""
+    if COMPILING in done.stderr:  # touch was never computed on this machine, and warp's compiler has warnings of its own
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert (done.stderr, done.stdout) == ("", "")
 
 
 def test_a_notebook_without_widgets_shows_no_bars(monkeypatch, recwarn):
