@@ -341,7 +341,7 @@ def _require_own(args: Args, config: dict[str, Any]) -> None:
 
 
 def _name_differences(env_id: str, trained: dict[str, Any], given: dict[str, Any]) -> None:
-    """Warn of arguments of the task that differ from those of the demonstrations that a policy was trained on."""
+    """Warn of arguments that differ from those of a policy's demonstrations, and of a time limit that is not taken over."""
     defaults = {name: value for name, value in default_arguments(env_id).items() if name not in BACKENDS}
     learnt = defaults | trained
     for name, value in given.items():
